@@ -1,0 +1,304 @@
+"""The study file: one ``study.toml`` beside its data, typed and checked, units in the names.
+
+Relative paths are relative to the study file and must stay inside its folder's reach; results go to
+``results/`` beside it. ``load_study`` is the only way in: it names the file, the key and the remedy when
+something is wrong.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from .errors import StudyError
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
+TISSUES = ("skin", "muscle")
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class TissueParameters(_Table):
+    """Parameters of one tissue: long-term shear modulus, exponent, relaxation amplitude and time."""
+
+    c_kPa: Positive
+    m: Positive
+    gamma: Annotated[float, Field(ge=0)]
+    tau_s: Positive
+
+
+class StudyTable(_Table):
+    """What the study is called."""
+
+    name: str
+    description: str = ""
+
+
+class ImageTable(_Table):
+    """The image: a DICOM folder, NIfTI, NRRD or MHA; ``markers`` is the same limb with skin markers on."""
+
+    path: Path
+    series: str | None = None
+    markers: Path | None = None
+    markers_series: str | None = None
+
+
+class SegmentationTable(_Table):
+    """``labels``: a corrected label map (``.seg.nrrd`` or any image); it wins over the automatic one."""
+
+    labels: Path | None = None
+    bias_correction: bool = True
+    min_bone_volume_mm3: Positive = 1000.0
+
+
+class SurfacesTable(_Table):
+    """Closed surfaces as the way in, instead of an image."""
+
+    skin: Path
+    bones: dict[str, Path] = Field(default_factory=dict)
+    coordinates: Literal["LPS", "RAS"] = "LPS"
+
+
+class Plane(_Table):
+    """A plane by a point and the normal that points proximally."""
+
+    point: Vector
+    normal: Vector = (0.0, 0.0, 1.0)
+
+
+class GeometryTable(_Table):
+    """How surfaces become a model."""
+
+    skin_layer_mm: Positive = 3.0
+    bone_policy: Literal["trim-bone"] = "trim-bone"
+    bone_clearance_mm: Positive = 1.5
+    proximal_cut: Plane | None = None
+    amputation: Plane | None = None
+    amputation_pad_mm: Positive = 15.0
+    surface_edge_mm: Positive = 3.0
+
+
+class MeshTable(_Table):
+    """The mesh of each site: element and edge lengths near the indenter and far from it."""
+
+    element: Literal["tet4", "tet10"] = "tet10"
+    edge_near_mm: Positive = 3.5
+    edge_far_mm: Positive = 12.0
+    near_radius_mm: Positive = 16.0
+    growth: Positive = 0.35
+    time_limit_s: Positive = 600.0
+
+
+class IndenterTable(_Table):
+    """The rigid indenter; the paper's is a square of 20 mm."""
+
+    shape: Literal["square", "sphere", "cylinder"] = "square"
+    width_mm: Positive = 20.0
+    edge_radius_mm: Annotated[float, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def _edge_fits(self) -> IndenterTable:
+        if self.edge_radius_mm >= self.width_mm / 2:
+            raise ValueError("edge_radius_mm must be smaller than half of width_mm")
+        return self
+
+
+class TracesTable(_Table):
+    """Column names of the records, where they differ from the defaults; units are in the names."""
+
+    time_s: str = "time_s"
+    displacement_mm: str = "displacement_mm"
+    force_N: str = "force_N"
+    smoothing: Annotated[float, Field(ge=0)] | None = None
+
+
+class Site(_Table):
+    """An indentation site.
+
+    ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
+    ``axis`` (into the limb) and ``edge`` (one edge direction of the square) are found when not given.
+    """
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$")
+    region: str = ""
+    fitted: bool = False
+    trace: Path
+    position: Vector | None = None
+    near: Vector | None = None
+    axis: Vector | None = None
+    edge: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Site:
+        if (self.position is None) == (self.near is None):
+            raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
+        return self
+
+
+class MaterialTable(_Table):
+    """Start and bounds of the identification; the defaults are the paper's (section 2.3, table 1)."""
+
+    kappa_ratio: Positive = 100.0
+    start: TissueParameters = TissueParameters(c_kPa=4.7, m=3.0, gamma=1.2, tau_s=2.0)
+    lower: TissueParameters = TissueParameters(c_kPa=0.047, m=2.0, gamma=0.01, tau_s=0.01)
+    upper: TissueParameters = TissueParameters(c_kPa=47.0, m=20.0, gamma=10.0, tau_s=10.0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> MaterialTable:
+        for name in PARAMETERS:
+            if not getattr(self.lower, name) <= getattr(self.start, name) <= getattr(self.upper, name):
+                raise ValueError(f"start.{name} lies outside its bounds")
+            if not getattr(self.lower, name) < getattr(self.upper, name):
+                raise ValueError(f"lower.{name} is not below upper.{name}")
+        return self
+
+
+class CalibrationTable(_Table):
+    """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals."""
+
+    objective: Literal["pointwise", "paper"] = "pointwise"
+    relative_tolerance: Positive = 1e-3
+    max_iterations: Annotated[int, Field(ge=1, le=200)] = 25
+
+
+class SolverTable(_Table):
+    """Steps over loading and unloading before the solver adapts them."""
+
+    load_steps: Annotated[int, Field(ge=2, le=500)] = 10
+    unload_steps: Annotated[int, Field(ge=2, le=500)] = 8
+
+
+class ExecutionTable(_Table):
+    """Workers that simulate side by side, one thread each; 0 means one per core."""
+
+    workers: Annotated[int, Field(ge=0, le=1024)] = 0
+
+
+class Study(_Table):
+    """A checked study; ``folder`` is where it lives."""
+
+    study: StudyTable
+    image: ImageTable | None = None
+    segmentation: SegmentationTable = SegmentationTable()
+    surfaces: SurfacesTable | None = None
+    geometry: GeometryTable = GeometryTable()
+    mesh: MeshTable = MeshTable()
+    indenter: IndenterTable = IndenterTable()
+    traces: TracesTable = TracesTable()
+    sites: tuple[Site, ...]
+    material: MaterialTable = MaterialTable()
+    calibration: CalibrationTable = CalibrationTable()
+    solver: SolverTable = SolverTable()
+    execution: ExecutionTable = ExecutionTable()
+    file: Path = Field(default=Path("study.toml"), exclude=True)
+
+    @property
+    def folder(self) -> Path:
+        return self.file.parent
+
+    @property
+    def results(self) -> Path:
+        return self.folder / "results"
+
+    @property
+    def fitted(self) -> tuple[Site, ...]:
+        return tuple(site for site in self.sites if site.fitted)
+
+    def path(self, relative: Path) -> Path:
+        """A path of the study file as a path of this machine."""
+        return self.folder / relative
+
+    def site(self, name: str) -> Site:
+        for site in self.sites:
+            if site.name == name:
+                return site
+        raise StudyError(
+            f"no site is named {name!r}",
+            file=self.file,
+            place="sites",
+            remedy="the study has " + ", ".join(s.name for s in self.sites),
+        )
+
+    @field_validator("sites")
+    @classmethod
+    def _sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
+        names = [site.name for site in sites]
+        if not names:
+            raise ValueError("the study has no site")
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
+        return sites
+
+    @model_validator(mode="after")
+    def _one_door(self) -> Study:
+        if (self.image is None) == (self.surfaces is None):
+            raise ValueError("give either [image] or [surfaces]: geometry enters by one door")
+        if self.surfaces is not None or (self.image is not None and self.image.markers is None):
+            blind = [site.name for site in self.sites if site.position is None]
+            if blind:
+                raise ValueError(
+                    f"site {blind[0]}: 'near' needs image.markers; give 'position' where there are no markers"
+                )
+        return self
+
+
+def load_study(path: str | Path) -> Study:
+    """Read and check a study; ``path`` is the file or its folder.
+
+    Raises
+    ------
+    StudyError
+        With the file, the key and the remedy.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "study.toml"
+    if not file.is_file():
+        raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StudyError(f"not valid TOML: {error}", file=file) from None
+    content.pop("file", None)
+    try:
+        study = Study(**content, file=file)
+    except ValidationError as error:
+        raise _study_error(error, file) from None
+    _check_paths(study)
+    return study
+
+
+def _study_error(error: ValidationError, file: Path) -> StudyError:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"]) or None
+    more = len(error.errors()) - 1
+    what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        what = "unknown key"
+    remedy = "see docs/study.md for the keys" if first["type"] == "extra_forbidden" else None
+    return StudyError(what + (f" (and {more} more)" if more else ""), file=file, place=place, remedy=remedy)
+
+
+def _check_paths(study: Study) -> None:
+    """Every input that the study names must exist before anything runs."""
+    named: list[tuple[str, Path]] = [(f"sites.{s.name}.trace", s.trace) for s in study.sites]
+    if study.image is not None:
+        named.append(("image.path", study.image.path))
+        if study.image.markers is not None:
+            named.append(("image.markers", study.image.markers))
+    if study.segmentation.labels is not None:
+        named.append(("segmentation.labels", study.segmentation.labels))
+    if study.surfaces is not None:
+        named.append(("surfaces.skin", study.surfaces.skin))
+        named += [(f"surfaces.bones.{name}", path) for name, path in study.surfaces.bones.items()]
+    for place, path in named:
+        if not study.path(path).exists():
+            raise StudyError(f"{path} does not exist", file=study.file, place=place)
