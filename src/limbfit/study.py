@@ -124,12 +124,15 @@ class Site(_Table):
 
     ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
     ``axis`` (into the limb) and ``edge`` (one edge direction of the square) are found when not given.
+    Where there is no ``trace``, ``depth_mm`` and ``speed_mm_s`` plan an indentation to be simulated.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$")
     region: str = ""
     fitted: bool = False
-    trace: Path
+    trace: Path | None = None
+    depth_mm: Positive | None = None
+    speed_mm_s: Positive = 0.96
     position: Vector | None = None
     near: Vector | None = None
     axis: Vector | None = None
@@ -139,6 +142,10 @@ class Site(_Table):
     def _one_place(self) -> Site:
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
+        if (self.trace is None) == (self.depth_mm is None):
+            raise ValueError("give either trace (a record) or depth_mm (an indentation to be simulated)")
+        if self.fitted and self.trace is None:
+            raise ValueError("a fitted site needs a trace")
         return self
 
 
@@ -289,7 +296,9 @@ def _study_error(error: ValidationError, file: Path) -> StudyError:
 
 def _check_paths(study: Study) -> None:
     """Every input that the study names must exist before anything runs."""
-    named: list[tuple[str, Path]] = [(f"sites.{s.name}.trace", s.trace) for s in study.sites]
+    named: list[tuple[str, Path]] = [
+        (f"sites.{s.name}.trace", s.trace) for s in study.sites if s.trace is not None
+    ]
     if study.image is not None:
         named.append(("image.path", study.image.path))
         if study.image.markers is not None:
