@@ -1,0 +1,174 @@
+"""A study's site as a mechanical problem, and what is observed in it.
+
+``SiteModel`` is everything about one indentation but the parameters; it travels to worker processes as paths
+and numbers. ``simulate`` is the one function that every stage, executor and phantom calls.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fe import History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
+from .mesh import Mesh, read_vtu
+from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable
+
+Parameters = dict[str, dict[str, float]]
+Array = NDArray[np.float64]
+
+KPA = 1e-3  # MPa
+_FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
+# Flat order of the eight parameters, and the scale from the solver's units to the user's.
+FLAT = tuple((tissue, name) for tissue in TISSUES for name in PARAMETERS)
+_SCALE = np.array([KPA if name == "c_kPa" else 1.0 for _, name in FLAT])
+
+
+def to_vector(parameters: Parameters) -> Array:
+    """The eight numbers in flat order (c in kPa)."""
+    return np.array([parameters[tissue][name] for tissue, name in FLAT])
+
+
+def to_parameters(vector: Array) -> Parameters:
+    """The flat vector as ``{tissue: {name: value}}``."""
+    result: Parameters = {tissue: {} for tissue in TISSUES}
+    for (tissue, name), value in zip(FLAT, vector, strict=True):
+        result[tissue][name] = float(value)
+    return result
+
+
+@dataclass(frozen=True)
+class SiteModel:
+    """One indentation but for the material: mesh file, indenter and displacement history.
+
+    ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm`` are the piecewise linear
+    displacement since touch-down.
+    """
+
+    name: str
+    mesh: Path
+    mesh_digest: str
+    position: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    knots_s: tuple[float, ...]
+    knots_mm: tuple[float, ...]
+    edge: tuple[float, float, float] | None = None
+    indenter: IndenterTable = field(default_factory=IndenterTable)
+    kappa_ratio: float = 100.0
+    steps: SolverTable = field(default_factory=SolverTable)
+
+
+@dataclass(frozen=True)
+class SimulationJob:
+    """A simulation to be done: parameters (flat, kPa), the times at which the force is wanted."""
+
+    model: SiteModel
+    parameters: tuple[float, ...]
+    times_s: tuple[float, ...]
+    sensitivities: bool = True
+    store: str = "none"
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What came back: force (n,) N and its derivatives (n, 8) per kPa, -, -, s at the job's times."""
+
+    site: str
+    force_N: Array
+    jacobian: Array | None
+    completed: bool
+    reason: str
+    penetration_mm: float
+    facts: dict[str, Any]
+
+
+def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
+    """The two tissues for the solver, in MPa."""
+    return {
+        tissue: OgdenQLV(
+            c=values["c_kPa"] * KPA,
+            m=values["m"],
+            gamma=values["gamma"],
+            tau=values["tau_s"],
+            kappa_ratio=kappa_ratio,
+        )
+        for tissue, values in parameters.items()
+    }
+
+
+def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
+    """The site's boundary-value problem: bones and proximal cut fixed, skin in contact with the indenter.
+
+    Only skin near the indenter enters the contact: what it cannot reach costs time for nothing.
+    """
+    indenter = Indenter(
+        shape=model.indenter.shape,
+        width=model.indenter.width_mm,
+        edge_radius=model.indenter.edge_radius_mm,
+        centre=np.array(model.position),
+        axis=np.array(model.axis),
+        edge=None if model.edge is None else np.array(model.edge),
+    )
+    faces = mesh.face_sets["skin"]
+    reach = model.indenter.width_mm * 0.71 + max(model.knots_mm) + 8.0
+    near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
+    return Problem(
+        mesh=mesh,
+        materials=materials(parameters, model.kappa_ratio),
+        fixed=np.union1d(mesh.node_sets["fixed_bone"], mesh.node_sets["fixed_proximal"]),
+        contact_faces=faces[near],
+        indenter=indenter,
+        history=History(np.array(model.knots_s), np.array(model.knots_mm)),
+    )
+
+
+_KEPT = 6  # meshes and last results that a worker keeps: its share of the sites of one study
+_meshes: OrderedDict[str, Mesh] = OrderedDict()
+_last: OrderedDict[str, Result] = OrderedDict()
+
+
+def _keep(cache: OrderedDict, key: str, value: Any) -> Any:
+    cache[key] = value
+    cache.move_to_end(key)
+    while len(cache) > _KEPT:
+        cache.popitem(last=False)
+    return value
+
+
+def solve_site(
+    model: SiteModel, parameters: Parameters, *, sensitivities: bool = False, store: str = "peak"
+) -> Result:
+    """Simulate one indentation and return the solver's full result (see :class:`limbfit.fe.Result`)."""
+    mesh = _meshes.get(model.mesh_digest) or _keep(_meshes, model.mesh_digest, read_vtu(model.mesh))
+    steps = StepControl(load_steps=model.steps.load_steps, unload_steps=model.steps.unload_steps)
+    return solve(
+        build_problem(model, mesh, parameters), steps=steps, sensitivities=sensitivities, store=store
+    )
+
+
+def simulate(job: SimulationJob) -> Simulation:
+    """Simulate a job; a failure is a result with a reason, never an exception."""
+    result = solve_site(
+        job.model, to_parameters(np.array(job.parameters)), sensitivities=job.sensitivities, store=job.store
+    )
+    times = np.array(job.times_s)
+    return Simulation(
+        site=job.model.name,
+        force_N=result.force_at(times),
+        jacobian=_in_user_units(result, times) if job.sensitivities else None,
+        completed=result.completed,
+        reason=result.reason,
+        penetration_mm=float(result.penetration.max(initial=0.0)),
+        facts=result.statistics.as_dict(),
+    )
+
+
+def _in_user_units(result: Result, times: Array) -> Array:
+    """Sensitivities in flat order, per kPa where the parameter is a modulus."""
+    order = {name: i for i, name in enumerate(result.parameter_names)}
+    columns = [order[(tissue, _FE_NAME[name])] for tissue, name in FLAT]
+    return result.sensitivity_at(times)[:, columns] * _SCALE

@@ -1,0 +1,212 @@
+"""Stage folders on disk: what is done, what is stale, and writes that are never half done.
+
+A stage works in ``results/.work-<stage>-<key>`` and is renamed to ``results/<stage>`` when complete. The key is
+a digest of everything the stage depends on, so a run that was killed finds its own unfinished folder again and
+goes on in it, and a folder of other inputs is dropped.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from time import perf_counter
+from typing import Any, BinaryIO
+
+from ..errors import RunError
+
+try:
+    import fcntl
+except ImportError:  # Windows: no advisory lock there; the pid in the file still tells who runs
+    fcntl = None  # type: ignore[assignment]
+
+STAMP = "stage.json"
+
+
+def digest(*parts: Any) -> str:
+    """A short stable digest of JSON-like values."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of all files below a folder."""
+    sha = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            sha.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                sha.update(block)
+    return sha.hexdigest()
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, never half of it."""
+    text = json.dumps(content, indent=1, allow_nan=False, default=_plain)
+    with atomic(path) as stream:
+        stream.write(text.encode())
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _plain(value: Any) -> Any:
+    """NumPy scalars and arrays as what JSON knows."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[BinaryIO]:
+    """A binary stream whose content appears at ``path`` only when the block ends well."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            yield stream
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+@dataclass(frozen=True)
+class StageState:
+    """What the disk says of a stage: ``done``, ``stale`` (made from other inputs), ``begun`` or ``missing``."""
+
+    stage: str
+    state: str
+    seconds: float | None = None
+    finished: str | None = None
+
+
+class Store:
+    """The results folder of one study."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, stage: str) -> Path:
+        return self.folder / stage
+
+    def stamp(self, stage: str) -> dict[str, Any] | None:
+        file = self[stage] / STAMP
+        return read_json(file) if file.is_file() else None
+
+    def work_folder(self, stage: str, key: str) -> Path:
+        return self.folder / f".work-{stage}-{key}"
+
+    def state(self, stage: str, key: str) -> StageState:
+        stamp = self.stamp(stage)
+        if stamp and stamp["key"] == key:
+            return StageState(stage, "done", stamp["seconds"], stamp["finished"])
+        if self.work_folder(stage, key).is_dir():
+            return StageState(stage, "begun")
+        return StageState(stage, "stale" if stamp else "missing")
+
+    def make(self, stage: str, key: str, produce: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+        """Run ``produce(folder)`` in the stage's work folder and put the folder in its place.
+
+        ``produce`` returns facts for the stamp. Seconds add up over interrupted attempts.
+        """
+        work = self.work_folder(stage, key)
+        self._drop_others(stage, work)
+        with disk_errors(self.folder):
+            work.mkdir(parents=True, exist_ok=True)
+            clock = _Clock(work / ".seconds")
+            try:
+                facts = produce(work)
+            finally:
+                seconds = clock.stop()
+            clock.file.unlink(missing_ok=True)
+            stamp = {
+                "stage": stage,
+                "key": key,
+                "seconds": round(seconds, 3),
+                "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+                **facts,
+            }
+            write_json(work / STAMP, stamp)
+            self._put_in_place(work, self[stage])
+        return stamp
+
+    def _drop_others(self, stage: str, keep: Path) -> None:
+        for folder in self.folder.glob(f".work-{stage}-*"):
+            if folder != keep:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _put_in_place(self, work: Path, place: Path) -> None:
+        """Renames only: at each moment the old folder, none, or the new one stands there, never a mixture."""
+        old = self.folder / f".old-{place.name}"
+        shutil.rmtree(old, ignore_errors=True)
+        if place.exists():
+            place.rename(old)
+        work.rename(place)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+class _Clock:
+    """Seconds spent on a stage, kept on disk so that they add up over attempts."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.before = float(file.read_text()) if file.is_file() else 0.0
+        self.start = perf_counter()
+
+    def stop(self) -> float:
+        total = self.before + perf_counter() - self.start
+        if self.file.parent.is_dir():
+            self.file.write_text(f"{total:.3f}")
+        return total
+
+
+@contextmanager
+def disk_errors(folder: Path) -> Iterator[None]:
+    """Turn a full or read-only disk into one clear line."""
+    remedies = {
+        errno.ENOSPC: "the disk is full; free some space and run again: finished work is kept",
+        errno.EROFS: "the file system is read-only; copy the study to a folder that can be written",
+        errno.EACCES: "no permission to write; check the folder's owner and mode",
+        errno.EDQUOT: "the disk quota is used up; free some space and run again: finished work is kept",
+    }
+    try:
+        yield
+    except OSError as error:
+        if error.errno in remedies:
+            raise RunError(f"{folder}: {remedies[error.errno]}") from error
+        raise
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Hold a study for one run; a second run is refused while the first lives.
+
+    The lock is the operating system's, on ``results/.lock``, so it goes with the process however that ends.
+    """
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stream = (folder / ".lock").open("a+")
+    with stream:
+        if fcntl is not None:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                stream.seek(0)
+                holder = stream.read().strip() or "another process"
+                raise RunError(f"{folder}: {holder} is running this study; wait for it or stop it") from None
+        stream.seek(0)
+        stream.truncate()
+        stream.write(f"process {os.getpid()}")
+        stream.flush()
+        yield

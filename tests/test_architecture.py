@@ -1,0 +1,125 @@
+"""The house rule: arrows point down only, and no import hides inside a function."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import limbfit
+
+PACKAGE = Path(limbfit.__file__).parent
+# From the top floor to the ground; a room may import only rooms that stand below it.
+FLOORS = [
+    {"__main__"},
+    {"cli"},
+    {"pipeline"},
+    {"report", "phantom"},
+    {"indentation"},
+    {"study"},
+    {"identify", "execution", "traces", "anatomy", "fe"},
+    {"mesh"},
+    {"errors", "_version"},
+]
+HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
+# ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
+
+
+def room_of(module: str) -> str:
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def module_name(path: Path) -> str:
+    relative = path.relative_to(PACKAGE.parent).with_suffix("")
+    parts = [p for p in relative.parts if p != "__init__"]
+    return ".".join(parts)
+
+
+def imports(path: Path) -> list[tuple[str, int, bool]]:
+    """(absolute module, line, inside a function) of every limbfit import in a file."""
+    tree = ast.parse(path.read_text())
+    inside = {
+        id(child)
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        for child in ast.walk(node)
+        if child is not node
+    }
+    package = module_name(path).split(".")
+    if path.name != "__init__.py":
+        package = package[:-1]
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, node.lineno, id(node) in inside) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, node.module] if node.module else base)
+            names = [f"{stem}.{alias.name}" for alias in node.names]
+            found += [(name, node.lineno, id(node) in inside) for name in names]
+    return [entry for entry in found if entry[0].split(".")[0] == "limbfit"]
+
+
+def files() -> list[Path]:
+    return [p for p in sorted(PACKAGE.rglob("*.py")) if p != PACKAGE / "__init__.py"]
+
+
+def test_every_room_has_a_floor():
+    rooms = {room_of(module_name(path)) for path in files()}
+    assert rooms <= set(HEIGHT), f"rooms without a floor: {sorted(rooms - set(HEIGHT))}"
+
+
+def test_arrows_point_down():
+    wrong = []
+    for path in files():
+        here = room_of(module_name(path))
+        for target, line, _ in imports(path):
+            there = room_of(target)
+            if there in HEIGHT and there != here and HEIGHT[there] >= HEIGHT[here]:
+                wrong.append(f"{path.relative_to(PACKAGE)}:{line} imports {target}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_import_hides_in_a_function():
+    hidden = [
+        f"{path.relative_to(PACKAGE)}:{line} imports {target} inside a function"
+        for path in files()
+        for target, line, lazy in imports(path)
+        if lazy
+    ]
+    assert not hidden, "\n".join(hidden)
+
+
+def test_no_cycle_between_modules():
+    modules = {module_name(path): path for path in files()}
+    graph = {}
+    for name, path in modules.items():
+        targets = set()
+        for target, _, _ in imports(path):
+            while target and target not in modules:
+                target = target.rpartition(".")[0]
+            if target and target != name:
+                targets.add(target)
+        graph[name] = targets
+    done: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join((*trail[trail.index(name) :], name))
+        if name not in done:
+            for target in sorted(graph[name]):
+                visit(target, (*trail, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+def test_only_the_command_line_prints_and_exits():
+    wrong = []
+    for path in files():
+        if path.name in {"cli.py", "__main__.py"}:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "sys.exit", "exit"}:
+                wrong.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
+    assert not wrong, "\n".join(wrong)
