@@ -100,6 +100,10 @@ class Store:
     def __getitem__(self, stage: str) -> Path:
         return self.folder / stage
 
+    def read(self, stage: str, name: str) -> Any:
+        """A JSON artefact of a finished stage."""
+        return read_json(self[stage] / name)
+
     def stamp(self, stage: str) -> dict[str, Any] | None:
         file = self[stage] / STAMP
         return read_json(file) if file.is_file() else None

@@ -1,0 +1,41 @@
+"""What every stage is given: the study, where to store, what to run on, whom to tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from ..execution import Executor
+from ..study import Study
+from .store import Store
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of a stage: ``done`` of ``total`` (``total`` 0: not known), and what is going on in words."""
+
+    stage: str
+    done: float = 0.0
+    total: float = 0.0
+    text: str = ""
+
+
+Listener = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Context:
+    """One run of one study."""
+
+    study: Study
+    store: Store
+    executor: Executor
+    listener: Listener
+
+    def tell(self, stage: str, done: float, total: float, text: str = "") -> None:
+        self.listener(Progress(stage, done, total, text))
+
+    def stored(self, stage: str, name: str) -> Any:
+        """A JSON artefact of a finished stage."""
+        return self.store.read(stage, name)

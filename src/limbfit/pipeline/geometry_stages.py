@@ -1,0 +1,230 @@
+"""From image or surfaces to site meshes: the stages ``segment``, ``surfaces``, ``sites``, ``mesh``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..anatomy import sites as anatomy_sites
+from ..anatomy.amputation import amputate
+from ..anatomy.imaging import LabelMap, read_labels, read_volume, write_labels
+from ..anatomy.markers import find_markers, match_markers
+from ..anatomy.meshing import MeshSettings, mesh_site
+from ..anatomy.segmentation import body_mask, segment
+from ..anatomy.surfaces import (
+    Anatomy,
+    Surface,
+    build_anatomy,
+    check_anatomy,
+    extract_skin,
+    load_anatomy,
+    read_closed_surface,
+    read_surface,
+    save_anatomy,
+    write_surface,
+)
+from ..errors import SiteError
+from ..mesh import write_vtu
+from ..study import Site, Study
+from .context import Context
+from .store import read_json, write_json
+
+
+def run_segment(context: Context, folder: Path) -> dict[str, Any]:
+    """Image to label map; a corrected label map of the study wins over the automatic one."""
+    study = context.study
+    assert study.image is not None
+    context.tell("segment", 0, 3, "reading the image")
+    volume = read_volume(study.path(study.image.path), study.image.series)
+    context.tell("segment", 1, 3, "labelling tissues")
+    if study.segmentation.labels is not None:
+        labels, method = read_labels(study.path(study.segmentation.labels), volume), "corrected by hand"
+    else:
+        labels = segment(
+            volume,
+            bias_correction=study.segmentation.bias_correction,
+            min_bone_volume_mm3=study.segmentation.min_bone_volume_mm3,
+        )
+        method = "automatic"
+    write_labels(folder / "labels.seg.nrrd", labels)
+    if study.image.markers is not None:
+        context.tell("segment", 2, 3, "outlining the image with markers")
+        marked = read_volume(study.path(study.image.markers), study.image.markers_series)
+        write_labels(folder / "markers.seg.nrrd", body_mask(marked))
+    write_json(folder / "segment.json", {"method": method, "volumes_cm3": label_volumes(labels)})
+    return {}
+
+
+def label_volumes(labels: LabelMap) -> dict[str, float]:
+    """Volume of each label in cubic centimetres."""
+    voxel_cm3 = float(np.prod(labels.spacing)) / 1000
+    return {
+        name: round(float((labels.array == value).sum()) * voxel_cm3, 2) for value, name in labels.names.items()
+    }
+
+
+def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
+    """Label map or the study's own surfaces to a checked anatomy: closed skin, closed bones, proximal cut."""
+    study = context.study
+    context.tell("surfaces", 0, 2, "building surfaces")
+    if study.surfaces is not None:
+        anatomy = _given_anatomy(study)
+    else:
+        anatomy = _imaged_anatomy(context)
+        if study.image is not None and study.image.markers is not None:
+            context.tell("surfaces", 1, 2, "skin with markers")
+            marked = read_labels(context.store["segment"] / "markers.seg.nrrd")
+            write_surface(folder / "skin-markers.stl", extract_skin(marked))
+    check_anatomy(anatomy)
+    save_anatomy(folder, anatomy)
+    return {}
+
+
+def _imaged_anatomy(context: Context) -> Anatomy:
+    geometry = context.study.geometry
+    labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
+    if geometry.amputation is not None:
+        labels = amputate(
+            labels, geometry.amputation.point, geometry.amputation.normal, pad_mm=geometry.amputation_pad_mm
+        )
+    cut = geometry.proximal_cut
+    return build_anatomy(
+        labels,
+        edge_mm=geometry.surface_edge_mm,
+        proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
+    )
+
+
+def _given_anatomy(study: Study) -> Anatomy:
+    """The anatomy from closed surfaces; without a stated cut the most proximal (highest z) face of the skin."""
+    assert study.surfaces is not None
+    tables = study.surfaces
+    skin = read_closed_surface(study.path(tables.skin), "skin", tables.coordinates)
+    bones = {
+        name: read_closed_surface(study.path(path), name, tables.coordinates)
+        for name, path in tables.bones.items()
+    }
+    cut = study.geometry.proximal_cut
+    if cut is not None:
+        point, normal = np.array(cut.point), np.array(cut.normal)
+    else:
+        point, normal = np.array([0.0, 0.0, skin.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
+    return Anatomy(skin=skin, bones=bones, cut_point=point, cut_normal=normal / np.linalg.norm(normal))
+
+
+def run_sites(context: Context, folder: Path) -> dict[str, Any]:
+    """Where each indentation is: on the skin, with the indenter's axis; markers matched to names."""
+    study = context.study
+    anatomy = load_anatomy(context.store["surfaces"])
+    context.tell("sites", 0, 1, "placing sites")
+    markers = _matched_markers(context, anatomy)
+    placed = [_place(site, study, anatomy, markers) for site in study.sites]
+    write_json(folder / "sites.json", {"sites": placed})
+    return {}
+
+
+def _matched_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
+    hints = {site.name: np.array(site.near) for site in context.study.sites if site.near is not None}
+    if not hints:
+        return {}
+    marked: Surface = read_surface(context.store["surfaces"] / "skin-markers.stl")
+    return dict(match_markers(find_markers(marked, anatomy.skin), hints))
+
+
+def _place(site: Site, study: Study, anatomy: Anatomy, markers: dict[str, Any]) -> dict[str, Any]:
+    marker = markers.get(site.name)
+    wanted = np.array(site.position) if marker is None else marker.position
+    try:
+        point, off = anatomy_sites.project_to_skin(anatomy, wanted)
+        axis = site.axis or anatomy_sites.indenter_axis(anatomy.skin, point, study.indenter.width_mm)
+    except SiteError as error:
+        raise SiteError(
+            error.what, file=study.file, place=f"sites.{site.name}", remedy=error.remedy
+        ) from None
+    evidence = None
+    if marker is not None:
+        assert site.near is not None
+        distance = float(np.linalg.norm(marker.position - np.array(site.near)))
+        evidence = {"height_mm": round(float(marker.height), 3), "distance_to_hint_mm": round(distance, 3)}
+    unit = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    return {
+        "site": site.name,
+        "region": site.region,
+        "fitted": site.fitted,
+        "position_mm": [float(x) for x in point],
+        "axis": [float(x) for x in unit],
+        "off_skin_mm": round(float(off), 3),
+        "marker": evidence,
+    }
+
+
+@dataclass(frozen=True)
+class MeshJob:
+    """A site mesh to be made by a worker."""
+
+    site: str
+    surfaces: Path
+    position: tuple[float, ...]
+    axis: tuple[float, ...]
+    settings: MeshSettings
+    file: Path
+
+
+def make_mesh(job: MeshJob) -> dict[str, Any]:
+    """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
+    anatomy = load_anatomy(job.surfaces)
+    mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings)
+    write_vtu(mesh, job.file)
+    facts = report.as_dict()
+    write_json(job.file.with_suffix(".json"), facts)
+    return facts
+
+
+def mesh_settings(study: Study) -> MeshSettings:
+    table, geometry = study.mesh, study.geometry
+    return MeshSettings(
+        element=table.element,
+        edge_near_mm=table.edge_near_mm,
+        edge_far_mm=table.edge_far_mm,
+        near_radius_mm=table.near_radius_mm,
+        growth=table.growth,
+        time_limit_s=table.time_limit_s,
+        skin_layer_mm=geometry.skin_layer_mm,
+        bone_clearance_mm=geometry.bone_clearance_mm,
+    )
+
+
+def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
+    """One graded mesh per site, side by side; meshes of an interrupted run are kept."""
+    settings = mesh_settings(context.study)
+    sites = context.stored("sites", "sites.json")["sites"]
+    jobs = [
+        MeshJob(
+            site=site["site"],
+            surfaces=context.store["surfaces"],
+            position=tuple(site["position_mm"]),
+            axis=tuple(site["axis"]),
+            settings=settings,
+            file=folder / f"{site['site']}.vtu",
+        )
+        for site in sites
+    ]
+    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if _is_meshed(job)}
+    missing = [job for job in jobs if job.site not in facts]
+    context.tell("mesh", len(facts), len(jobs))
+    for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
+        facts[job.site] = made
+        context.tell("mesh", len(facts), len(jobs), f"site {job.site}: {made['nodes']} nodes")
+    write_json(
+        folder / "mesh.json", {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
+    )
+    for job in jobs:
+        job.file.with_suffix(".json").unlink()
+    return {}
+
+
+def _is_meshed(job: MeshJob) -> bool:
+    return job.file.is_file() and job.file.with_suffix(".json").is_file()

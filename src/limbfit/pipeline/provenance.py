@@ -1,0 +1,79 @@
+"""What a run was made with: versions, machine, settings and the digests of its inputs."""
+
+from __future__ import annotations
+
+import os
+import platform
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..study import Study
+from .store import digest, file_digest
+
+PACKAGE = Path(__file__).parents[1]
+LIBRARIES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "pypardiso",
+    "mkl",
+    "scikit-sparse",
+    "SimpleITK",
+    "vtk",
+    "pyvista",
+    "libigl",
+    "gpytoolbox",
+    "mmgpy",
+    "pydantic",
+)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the libraries that decide numbers; a library that is not installed is left out."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """The machine in figures, without its name or its user's."""
+    facts: dict[str, Any] = {
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "system": platform.system(),
+        "processor": platform.machine(),
+    }
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        facts["memory_GB"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
+    return facts
+
+
+@cache
+def code_digest(rooms: tuple[str, ...]) -> str:
+    """Digest of the source of some rooms: a stage is stale when the code that made it has changed."""
+    parts = []
+    for room in rooms:
+        place = PACKAGE / room
+        files = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+        parts += [(str(file.relative_to(PACKAGE)), file_digest(file)) for file in files]
+    return digest(__version__, parts)
+
+
+def input_files(study: Study) -> dict[str, list[Path]]:
+    """The study's input files and folders by the stage that reads them."""
+    files: dict[str, list[Path]] = {"segment": [], "surfaces": [], "traces": []}
+    if study.image is not None:
+        files["segment"] += [study.image.path, *filter(None, [study.image.markers])]
+    if study.segmentation.labels is not None:
+        files["segment"].append(study.segmentation.labels)
+    if study.surfaces is not None:
+        files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
+    files["traces"] += [site.trace for site in study.sites if site.trace is not None]
+    return files

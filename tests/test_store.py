@@ -1,0 +1,93 @@
+"""Stage folders: atomic, resumable, keyed by their inputs."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+
+import pytest
+
+from limbfit.errors import RunError
+from limbfit.pipeline.store import Store, disk_errors, file_digest, lock, read_json, write_json
+
+
+def test_stage_is_done_only_for_its_key(tmp_path):
+    store = Store(tmp_path)
+    assert store.state("mesh", "a").state == "missing"
+    store.make("mesh", "a", lambda folder: write_json(folder / "x.json", 1) or {"facts": 7})
+    assert store.state("mesh", "a").state == "done"
+    assert store.state("mesh", "b").state == "stale"
+    assert store.stamp("mesh")["facts"] == 7
+    assert store.read("mesh", "x.json") == 1
+
+
+def test_interrupted_stage_goes_on_in_its_folder(tmp_path):
+    store = Store(tmp_path)
+
+    def dies(folder):
+        write_json(folder / "first.json", 1)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store.make("mesh", "a", dies)
+    assert store.state("mesh", "a").state == "begun"
+    assert not store["mesh"].exists()
+
+    def goes_on(folder):
+        assert read_json(folder / "first.json") == 1
+        return {}
+
+    store.make("mesh", "a", goes_on)
+    assert store.state("mesh", "a").state == "done"
+    assert sorted(p.name for p in store["mesh"].iterdir()) == ["first.json", "stage.json"]
+
+
+def test_unfinished_work_of_other_inputs_is_dropped(tmp_path):
+    store = Store(tmp_path)
+    store.work_folder("mesh", "old").mkdir()
+    store.make("mesh", "new", lambda folder: {})
+    assert not store.work_folder("mesh", "old").exists()
+
+
+def test_failed_rewrite_leaves_the_old_file(tmp_path):
+    file = tmp_path / "x.json"
+    write_json(file, {"a": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(file, {"a": float("nan")})
+    assert read_json(file) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_file_digest_sees_names_and_contents(tmp_path):
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "1").write_text("x")
+    before = file_digest(tmp_path / "d")
+    (tmp_path / "d" / "1").rename(tmp_path / "d" / "2")
+    renamed = file_digest(tmp_path / "d")
+    (tmp_path / "d" / "2").write_text("y")
+    assert len({before, renamed, file_digest(tmp_path / "d")}) == 3
+
+
+def test_second_run_is_refused_while_the_first_lives(tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from limbfit.pipeline.store import lock\n"
+        "with lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    holder = subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert holder.stdout.readline().strip() == "held"
+    with pytest.raises(RunError, match=f"process {holder.pid} is running"), lock(tmp_path):
+        pass
+    holder.kill()
+    holder.wait()
+    with lock(tmp_path):
+        pass
+
+
+def test_full_disk_is_one_clear_line(tmp_path):
+    with pytest.raises(RunError, match="disk is full"), disk_errors(tmp_path):
+        raise OSError(errno.ENOSPC, "no space")
+    with pytest.raises(FileNotFoundError), disk_errors(tmp_path):
+        raise FileNotFoundError(errno.ENOENT, "gone")
