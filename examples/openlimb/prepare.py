@@ -49,7 +49,9 @@ def main(inputs: Path, folder: Path) -> None:
     (folder / "surfaces").mkdir(parents=True)
     for name in ("skin", "tibia", "fibula"):
         shutil.copyfile(inputs / f"{name}.stl", folder / "surfaces" / f"{name}.stl")
-    shutil.copytree(inputs / "traces", folder / "traces", copy_function=shutil.copyfile)
+    (folder / "traces").mkdir()
+    for trace in (inputs / "traces").glob("*.csv"):
+        shutil.copyfile(trace, folder / "traces" / trace.name)
     sites = [
         SITE.format(
             name=name,
