@@ -1,0 +1,258 @@
+"""The MRI of a phantom: ultra-short-echo-like contrast, and real DICOM series of it.
+
+Signal levels are relative to fat. Partial volume is the exact box average over a voxel of a locally flat
+interface, blurred to a Gaussian: ``Phi(-sqrt(12) d / w)`` with ``d`` the distance to the interface and ``w``
+the voxel's extent along its normal. Noise is Rician: the magnitude of a signal with complex Gaussian noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydicom.dataset import FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, MRImageStorage, generate_uid
+from pydicom.valuerep import format_number_as_ds
+from scipy.special import ndtr
+
+from .geometry import BONES, PROXIMAL_CUT_MM, Limb, rotation_about
+
+FAT, MUSCLE, MARROW, CORTEX, MARKER = 1.0, 0.5, 0.8, 0.12, 1.15
+FAT_THICKNESS_MM = 3.0
+CORTEX_MM = {"tibia": 3.2, "fibula": 2.4, "patella": 2.4, "femur": 2.8}
+MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
+NOISE = MUSCLE / 27.0
+BIAS = 0.2
+FULL_SCALE, RESCALE_SLOPE = 1200.0, 0.5
+SLAB = 12
+REACH_MM = 85.0  # no tissue or marker lies further from the limb's axis
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where the voxels are: ``shape`` (k, j, i), ``spacing`` and ``direction`` columns for i, j, k, LPS mm."""
+
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    origin: NDArray[np.float64]
+    direction: NDArray[np.float64]
+
+    def points(self, k: slice, j: slice, i: slice) -> NDArray[np.float32]:
+        """LPS centres (nk, nj, ni, 3) of a block of voxels."""
+        steps = self.direction * np.array(self.spacing)
+        kk, jj, ii = (np.arange(s.start, s.stop, dtype=np.float64) for s in (k, j, i))
+        out = self.origin + kk[:, None, None, None] * steps[:, 2]
+        out = out + jj[None, :, None, None] * steps[:, 1] + ii[None, None, :, None] * steps[:, 0]
+        return out.astype(np.float32)
+
+
+DETAIL_GRIDS = {
+    "coarse": ((130, 76, 76), (2.36, 2.30, 2.00)),
+    "paper": ((256, 256, 256), (1.18, 1.15, 1.00)),
+}
+
+
+def make_grid(limb: Limb, detail: str, seed: int) -> Grid:
+    """The scanner's oblique box around a limb: a few degrees off the limb's own frame."""
+    shape, spacing = DETAIL_GRIDS[detail]
+    random = np.random.default_rng([seed, 3])
+    tilt = rotation_about(random.normal(size=3), np.deg2rad(random.uniform(2, 4)))
+    direction = limb.rotation @ tilt
+    middle = limb.to_patient(np.array([0.0, 3.0, PROXIMAL_CUT_MM / 2 - 1.0]))
+    half = np.array([shape[2] - 1, shape[1] - 1, shape[0] - 1]) / 2 * np.array(spacing)
+    return Grid(shape, spacing, middle - direction @ half, direction)
+
+
+@dataclass(frozen=True)
+class SkinMarker:
+    """A bright disc on the skin: where it sits (LPS mm) and the outward direction."""
+
+    position: NDArray[np.float64]
+    outward: NDArray[np.float64]
+
+    def field(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Field of a disc with rounded edges that reaches 2 mm into the skin."""
+        offset = points - self.position.astype(points.dtype)
+        height = offset @ self.outward.astype(points.dtype)
+        radial = np.sqrt(np.maximum((offset * offset).sum(-1) - height**2, 0))
+        rounding, base = 1.5, 2.0
+        a = radial - MARKER_DIAMETER_MM / 2 + rounding
+        b = np.abs(height - (MARKER_HEIGHT_MM - base) / 2) - (MARKER_HEIGHT_MM + base) / 2 + rounding
+        return np.minimum(np.maximum(a, b), 0) + np.hypot(np.maximum(a, 0), np.maximum(b, 0)) - rounding
+
+
+def _occupancy(
+    field: NDArray[np.floating], spacing: tuple[float, float, float], offsets: Sequence[float]
+) -> list[NDArray[np.floating]]:
+    """Share of each voxel that lies deeper than ``offset`` inside, for each offset (mm)."""
+    steps = [np.gradient(field, axis=axis) for axis in range(3)]
+    per_voxel = np.sqrt(sum(g * g for g in steps))
+    per_mm = np.sqrt(sum((g / h) ** 2 for g, h in zip(steps, spacing[::-1], strict=True)))
+    per_mm = np.maximum(per_mm, 0.2)
+    distance, width = field / per_mm, np.maximum(per_voxel / per_mm, 0.5 * min(spacing))
+    return [ndtr(-np.sqrt(12.0, dtype=field.dtype) * (distance + offset) / width) for offset in offsets]
+
+
+def _tissue(limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float]) -> tuple:
+    """Noise-free signal of a block and the share of each voxel inside the skin."""
+    skin, inner = _occupancy(limb.skin(points), spacing, (0.0, FAT_THICKNESS_MM))
+    signal = FAT * skin + (MUSCLE - FAT) * inner
+    for name in BONES:
+        bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, CORTEX_MM[name]))
+        signal = signal * (1 - bone) + CORTEX * bone + (MARROW - CORTEX) * marrow
+    return signal, skin
+
+
+def _add_marker(
+    signal: NDArray[np.floating],
+    skin: NDArray[np.floating],
+    points: NDArray[np.floating],
+    spacing: tuple[float, float, float],
+    marker: SkinMarker,
+) -> None:
+    """Add a marker's signal in place, in the small box of voxels around it."""
+    near = np.linalg.norm(points - marker.position.astype(points.dtype), axis=-1) < 14.0
+    if not near.any():
+        return
+    box = tuple(slice(max(ix.min() - 1, 0), ix.max() + 2) for ix in np.nonzero(near))
+    if min(signal[box].shape) < 2:
+        return
+    (share,) = _occupancy(marker.field(points[box]), spacing, (0.0,))
+    signal[box] += MARKER * share * (1 - skin[box])
+
+
+def _limb_window(grid: Grid, limb: Limb, k: slice) -> tuple[slice, slice]:
+    """Rows and columns of a slab that can hold tissue."""
+    heights = np.array([-10.0, PROXIMAL_CUT_MM + 40.0])
+    axis = limb.to_patient(np.stack([0 * heights, 0 * heights, heights], axis=-1))
+    index = (axis - grid.origin) @ grid.direction / np.array(grid.spacing)
+    t = (np.array([k.start, k.stop]) - index[0, 2]) / (index[1, 2] - index[0, 2])
+    centres = index[0] + t[:, None] * (index[1] - index[0])
+    window = []
+    for column, size in ((1, grid.shape[1]), (0, grid.shape[2])):
+        reach = REACH_MM / grid.spacing[column]
+        low, high = centres[:, column].min() - reach, centres[:, column].max() + reach
+        window.append(slice(max(int(low), 0), min(int(high) + 2, size)))
+    return window[0], window[1]
+
+
+def _bias_field(seed: int) -> Callable[[Grid, slice], NDArray[np.float32]]:
+    """A smooth receive profile within 1 +- ``BIAS`` over the whole image."""
+    random = np.random.default_rng([seed, 4])
+    linear, quadratic = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
+    scale = BIAS / (np.abs(linear).sum() + np.abs(quadratic).sum())
+
+    def profile(grid: Grid, k: slice) -> NDArray[np.float32]:
+        terms = []
+        for axis, (a, b) in enumerate(zip(linear, quadratic, strict=True)):
+            u = np.linspace(-1, 1, grid.shape[axis])
+            terms.append(a * u + b * (2 * u * u - 1))
+        total = terms[0][k, None, None] + terms[1][None, :, None] + terms[2][None, None, :]
+        return (1 + scale * total).astype(np.float32)
+
+    return profile
+
+
+def slabs(
+    limb: Limb, grid: Grid, markers: Sequence[SkinMarker], seed: int, noise: float = NOISE
+) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """The image slab by slab: slices and signal (nk, nj, ni) relative to fat, with bias and noise."""
+    random = np.random.default_rng([seed, 5, len(markers)])
+    bias = _bias_field(seed)
+    for start in range(0, grid.shape[0], SLAB):
+        k = slice(start, min(start + SLAB, grid.shape[0]))
+        padded = slice(k.start - 1, k.stop + 1)
+        rows, columns = _limb_window(grid, limb, padded)
+        points = grid.points(padded, rows, columns)
+        tissue, skin = _tissue(limb, points, grid.spacing)
+        for marker in markers:
+            _add_marker(tissue, skin, points, grid.spacing, marker)
+        signal = np.zeros((k.stop - k.start, *grid.shape[1:]), np.float32)
+        signal[:, rows, columns] = tissue[1:-1]
+        signal *= bias(grid, k)
+        real = signal + noise * random.standard_normal(signal.shape, dtype=np.float32)
+        imaginary = noise * random.standard_normal(signal.shape, dtype=np.float32)
+        yield k, np.hypot(real, imaginary)
+
+
+def write_series(
+    folder: Path,
+    limb: Limb,
+    grid: Grid,
+    markers: Sequence[SkinMarker] = (),
+    *,
+    seed: int = 0,
+    number: int = 1,
+    description: str = "UTE plain",
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """Render a limb and write it as one DICOM file per slice (MR Image Storage) into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    series = _uid(seed, "series", number)
+    for k, signal in slabs(limb, grid, markers, seed):
+        stored = np.clip(np.rint(signal * (FULL_SCALE / RESCALE_SLOPE)), 0, 65535).astype(np.uint16)
+        for index, pixels in zip(range(k.start, k.stop), stored, strict=True):
+            slice_ = _slice_dataset(grid, index, pixels, seed, number, series)
+            slice_.SeriesDescription = description
+            slice_.save_as(folder / f"IM{index + 1:04d}.dcm", enforce_file_format=True)
+        if progress is not None:
+            progress(k.stop / grid.shape[0])
+
+
+def _uid(seed: int, *names: object) -> str:
+    """The same seed gives the same identifiers, so that a phantom is reproduced to the byte."""
+    return generate_uid(entropy_srcs=["limbfit phantom", str(seed), *map(str, names)])
+
+
+def _decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
+    return [format_number_as_ds(float(value)) for value in values]
+
+
+def _slice_dataset(
+    grid: Grid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: str
+) -> FileDataset:
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = MRImageStorage
+    meta.MediaStorageSOPInstanceUID = _uid(seed, "image", number, index)
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)  # type: ignore[arg-type]
+    _identify(data, meta, seed, number, series)
+    _place(data, grid, index)
+    data.InstanceNumber = index + 1
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.Rows, data.Columns = pixels.shape
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    data.RescaleSlope, data.RescaleIntercept, data.RescaleType = str(RESCALE_SLOPE), "0", "US"
+    data.PixelData = pixels.tobytes()
+    return data
+
+
+def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: str) -> None:
+    """Tags of a made-up scan; nobody is behind them."""
+    data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
+    data.StudyInstanceUID, data.SeriesInstanceUID = _uid(seed, "study"), series
+    data.FrameOfReferenceUID, data.PositionReferenceIndicator = _uid(seed, "frame"), ""
+    data.PatientName, data.PatientID = "PHANTOM", f"PHANTOM-{seed}"
+    data.PatientBirthDate, data.PatientSex = "", ""
+    data.StudyID, data.SeriesNumber, data.AccessionNumber = "1", str(number), ""
+    data.StudyDate = data.SeriesDate = data.ContentDate = "20000101"
+    data.StudyTime = data.SeriesTime = data.ContentTime = "120000"
+    data.Modality, data.Manufacturer, data.ManufacturerModelName = "MR", "limbfit", "synthetic residuum"
+    data.ReferringPhysicianName, data.BodyPartExamined, data.PatientPosition = "", "LEG", "FFP"
+    data.ImageType = ["DERIVED", "PRIMARY", "M", "NONE"]
+    data.ScanningSequence, data.SequenceVariant, data.ScanOptions = "RM", "SP", ""
+    data.MRAcquisitionType, data.RepetitionTime, data.EchoTime = "3D", "5.8", "0.1"
+    data.MagneticFieldStrength, data.FlipAngle, data.EchoTrainLength = "3", "10", "1"
+
+
+def _place(data: FileDataset, grid: Grid, index: int) -> None:
+    """Image plane tags: the row cosines point along i, the column cosines along j."""
+    position = grid.origin + index * grid.spacing[2] * grid.direction[:, 2]
+    data.ImagePositionPatient = _decimals(position)
+    data.ImageOrientationPatient = _decimals(np.concatenate([grid.direction[:, 0], grid.direction[:, 1]]))
+    data.PixelSpacing = _decimals([grid.spacing[1], grid.spacing[0]])
+    data.SliceThickness = data.SpacingBetweenSlices = _decimals([grid.spacing[2]])[0]
+    data.SliceLocation = _decimals([float(position @ grid.direction[:, 2])])[0]
