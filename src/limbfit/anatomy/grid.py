@@ -1,0 +1,194 @@
+"""Sampled images in patient space: the grid, volumes and label maps.
+
+Vocabulary
+----------
+index    (i, j, k): column, row, slice; the array is ``[k, j, i]``.
+point    LPS patient coordinates (x to the Left, y Posterior, z Superior), mm.
+affine   the 4 x 4 matrix that takes an index to a point: ``direction @ diag(spacing)`` and ``origin``,
+         the centre of voxel (0, 0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import ImageError, LabelError
+
+Array = NDArray[np.float64]
+
+SOFT_TISSUE = "soft tissue"
+BONES = ("tibia", "fibula", "femur", "patella")
+DEFAULT_NAMES: Mapping[int, str] = {1: SOFT_TISSUE, **dict(enumerate(BONES, 2))}
+SOFT_NAMES = frozenset({SOFT_TISSUE, "skin", "fat", "muscle", "limb", "body"})
+
+_ORTHONORMAL = 1e-4  # largest deviation of direction^T direction from the identity
+_SAME_POINT_MM = 0.01
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A sampled array with its place in the patient.
+
+    Attributes
+    ----------
+    array : ``[k, j, i]``.
+    spacing : (3,) mm along i, j, k.
+    origin : (3,) LPS mm of the centre of voxel (0, 0, 0).
+    direction : (3, 3), columns are the unit axes of i, j, k in LPS; orthonormal, either handedness.
+    """
+
+    array: NDArray[Any]
+    spacing: Array
+    origin: Array
+    direction: Array
+
+    def __post_init__(self) -> None:
+        for name in ("spacing", "origin", "direction"):
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=float))
+        object.__setattr__(self, "array", self._as_array(self.array))
+        self._check()
+
+    def _as_array(self, array: ArrayLike) -> NDArray[Any]:
+        return np.asarray(array)
+
+    def _check(self) -> None:
+        if self.array.ndim != 3 or 0 in self.array.shape:
+            raise ImageError(f"an image needs three dimensions, this one has shape {self.array.shape}")
+        if self.spacing.shape != (3,) or not np.all(np.isfinite(self.spacing) & (self.spacing > 0)):
+            raise ImageError(f"voxel spacing must be three positive lengths, not {self.spacing.tolist()}")
+        if self.origin.shape != (3,) or not np.all(np.isfinite(self.origin)):
+            raise ImageError("the image has no usable origin")
+        check_direction(self.direction)
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Number of voxels along i, j, k."""
+        k, j, i = self.array.shape
+        return i, j, k
+
+    @property
+    def affine(self) -> Array:
+        """(4, 4): index (i, j, k, 1) to LPS mm."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.direction * self.spacing
+        matrix[:3, 3] = self.origin
+        return matrix
+
+    @property
+    def voxel_mm3(self) -> float:
+        return float(np.prod(self.spacing))
+
+    def index_to_point(self, index: ArrayLike) -> Array:
+        """(..., 3) continuous indices (i, j, k) to LPS mm."""
+        return np.asarray(index, dtype=float) @ (self.direction * self.spacing).T + self.origin
+
+    def point_to_index(self, point: ArrayLike) -> Array:
+        """(..., 3) LPS mm to continuous indices (i, j, k)."""
+        return (np.asarray(point, dtype=float) - self.origin) @ (self.direction / self.spacing)
+
+    def same_grid(self, other: Grid) -> bool:
+        """Whether both sample the same points: every corner voxel within 0.01 mm."""
+        if self.array.shape != other.array.shape:
+            return False
+        ends = np.array(self.size) - 1.0
+        corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * ends
+        gap = np.abs(self.index_to_point(corners) - other.index_to_point(corners))
+        return bool(gap.max() <= _SAME_POINT_MM)
+
+    def to_sitk(self) -> sitk.Image:
+        """The same image for SimpleITK, geometry included."""
+        image = sitk.GetImageFromArray(np.ascontiguousarray(self.array))
+        image.SetSpacing(self.spacing.tolist())
+        image.SetOrigin(self.origin.tolist())
+        image.SetDirection(self.direction.ravel().tolist())
+        return image
+
+
+@dataclass(frozen=True)
+class Volume(Grid):
+    """A scalar image, ``array`` float32; see :class:`Grid`."""
+
+    def _as_array(self, array: ArrayLike) -> NDArray[Any]:
+        return np.asarray(array, dtype=np.float32)
+
+    @classmethod
+    def from_sitk(cls, image: sitk.Image) -> Volume:
+        return cls(sitk.GetArrayFromImage(image), *geometry_of(image))
+
+    def with_array(self, array: ArrayLike) -> Volume:
+        return replace(self, array=np.asarray(array))
+
+
+@dataclass(frozen=True)
+class LabelMap(Grid):
+    """What each voxel is: ``array`` uint8, 0 outside the limb, ``names`` of the other values."""
+
+    names: Mapping[int, str] = field(default_factory=lambda: dict(DEFAULT_NAMES))
+
+    def _as_array(self, array: ArrayLike) -> NDArray[Any]:
+        raw = np.asarray(array)
+        if raw.dtype == np.uint8:
+            return raw
+        if raw.size and (raw.min() < 0 or raw.max() > 255 or np.any(raw != np.round(raw))):
+            raise LabelError("labels must be whole numbers from 0 to 255")
+        return raw.astype(np.uint8)
+
+    @classmethod
+    def from_sitk(cls, image: sitk.Image, names: Mapping[int, str] | None = None) -> LabelMap:
+        array = sitk.GetArrayFromImage(image)
+        return cls(array, *geometry_of(image), names=dict(names or DEFAULT_NAMES))
+
+    @property
+    def limb(self) -> NDArray[np.bool_]:
+        """Everything inside the skin, bones included."""
+        return self.array > 0
+
+    @property
+    def bone_names(self) -> tuple[str, ...]:
+        """Names of the bones that have voxels, in order of their label."""
+        present = set(np.unique(self.array).tolist())
+        return tuple(
+            name for value, name in sorted(self.names.items()) if value in present and name not in SOFT_NAMES
+        )
+
+    def value(self, name: str) -> int:
+        """The label value of a name."""
+        for value, known in self.names.items():
+            if known == name:
+                return value
+        raise LabelError(
+            f"no label is named {name!r}", remedy="the map has " + ", ".join(sorted(self.names.values()))
+        )
+
+    def mask(self, name: str) -> NDArray[np.bool_]:
+        """Voxels of one name."""
+        return self.array == self.value(name)
+
+    def with_array(self, array: ArrayLike, names: Mapping[int, str] | None = None) -> LabelMap:
+        return replace(self, array=np.asarray(array), names=dict(names or self.names))
+
+
+def check_direction(direction: Array) -> None:
+    """Refuse axes that are not orthonormal: a sheared grid (gantry tilt) would be read as a straight one."""
+    if direction.shape != (3, 3) or not np.all(np.isfinite(direction)):
+        raise ImageError("the image axes are not a 3 x 3 matrix of numbers")
+    skew = np.abs(direction.T @ direction - np.eye(3)).max()
+    if skew > _ORTHONORMAL:
+        raise ImageError(
+            f"the image axes are not orthonormal (off by {skew:.2g})",
+            remedy="resample the image to a rectangular grid",
+        )
+
+
+def geometry_of(image: sitk.Image) -> tuple[Array, Array, Array]:
+    """Spacing, origin and direction of a three-dimensional SimpleITK image."""
+    if image.GetDimension() != 3:
+        raise ImageError(f"an image needs three dimensions, this one has {image.GetDimension()}")
+    direction = np.array(image.GetDirection()).reshape(3, 3)
+    return np.array(image.GetSpacing()), np.array(image.GetOrigin()), direction

@@ -1,0 +1,169 @@
+"""Images and label maps in and out, geometry kept: DICOM folders, NIfTI, NRRD, MetaImage, ``.seg.nrrd``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+
+from ..errors import ImageError, LabelError
+from .dicom import Series, list_series, read_series
+from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
+from .labelfiles import (
+    check_same_grid,
+    is_seg_nrrd,
+    read_label_image,
+    read_seg_nrrd,
+    write_seg_nrrd,
+    write_sidecar,
+    wrong_file,
+)
+
+__all__ = [
+    "BONES",
+    "DEFAULT_NAMES",
+    "SOFT_TISSUE",
+    "LabelMap",
+    "Series",
+    "Volume",
+    "list_series",
+    "read_labels",
+    "read_volume",
+    "write_labels",
+    "write_volume",
+]
+
+SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+
+
+def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
+    """An image with its full geometry.
+
+    Parameters
+    ----------
+    path : a DICOM folder, or one file: .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd.
+    series_uid : which DICOM series, where the folder holds several.
+
+    Raises
+    ------
+    ImageError
+        With the file, the place and the remedy.
+    """
+    path = Path(path)
+    if path.is_dir():
+        volume = read_series(path, series_uid)
+    else:
+        volume = _as_volume(_read_image(path), path)
+    if not np.all(np.isfinite(volume.array)):
+        bad = int((~np.isfinite(volume.array)).sum())
+        raise ImageError(f"{bad} voxels are not numbers", file=path, remedy="export the image again")
+    return volume
+
+
+def write_volume(path: str | Path, volume: Volume) -> None:
+    """Write .nii(.gz), .nrrd, .mha or .mhd by the suffix, compressed where the format can."""
+    _check_suffix(Path(path))
+    sitk.WriteImage(volume.to_sitk(), str(path), useCompression=True)
+
+
+def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
+    """A label map: ``.seg.nrrd`` (3D Slicer) or a label image with default or sidecar names.
+
+    Parameters
+    ----------
+    path : the file; a plain image may have its names in ``<file>.json``.
+    like : the image that it belongs to; a cropped ``.seg.nrrd`` is brought to its grid.
+
+    Raises
+    ------
+    LabelError
+        Also for a map on another grid than ``like``, and for one without a single labelled voxel.
+    """
+    path = Path(path)
+    if is_seg_nrrd(path) and path.is_file():
+        labels = read_seg_nrrd(path, like)
+    else:
+        labels = check_same_grid(_read_label_file(path), like, path)
+    if not labels.array.any():
+        raise LabelError("the label map is empty", file=path, remedy="give one with the limb labelled")
+    return labels
+
+
+def write_labels(path: str | Path, labels: LabelMap) -> None:
+    """Write ``.seg.nrrd`` with names and colours, or a plain image with its names in ``<file>.json``."""
+    path = Path(path)
+    if is_seg_nrrd(path):
+        write_seg_nrrd(path, labels)
+        return
+    _check_suffix(path)
+    sitk.WriteImage(labels.to_sitk(), str(path), useCompression=True)
+    write_sidecar(path, labels.names)
+
+
+def _read_label_file(path: Path) -> LabelMap:
+    try:
+        image = _read_image(path)
+        return read_label_image(path, image)
+    except ImageError as error:
+        raise wrong_file(error, path) from None
+
+
+def _check_suffix(path: Path) -> None:
+    if not path.name.lower().endswith(SUFFIXES):
+        raise ImageError(
+            f"unknown kind of image {path.suffix!r}", file=path, remedy="use one of " + " ".join(SUFFIXES)
+        )
+
+
+def _read_image(path: Path) -> sitk.Image:
+    if not path.is_file():
+        raise ImageError("no such image", file=path, remedy="give a DICOM folder or an image file")
+    _check_suffix(path)
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    try:
+        reader.ReadImageInformation()
+        image = reader.Execute()
+    except RuntimeError as error:
+        raise _unreadable(path, str(error)) from None
+    _check_stated_geometry(reader, path)
+    return image
+
+
+def _unreadable(path: Path, text: str) -> ImageError:
+    if "orthonormal" in text or "Bad direction" in text:
+        return ImageError(
+            "the image axes are not orthonormal",
+            file=path,
+            remedy="resample the image to a rectangular grid",
+        )
+    return ImageError("the image cannot be read", file=path, remedy="check that the file is whole")
+
+
+def _check_stated_geometry(reader: sitk.ImageFileReader, path: Path) -> None:
+    """Refuse a file that leaves its place in the patient to be guessed."""
+    keys = set(reader.GetMetaDataKeys())
+    name = path.name.lower()
+    if name.endswith((".nii", ".nii.gz")):
+        codes = [reader.GetMetaData(key).strip() for key in ("qform_code", "sform_code") if key in keys]
+        stated = any(code not in ("", "0") for code in codes)
+    elif name.endswith((".nrrd", ".nhdr")):
+        stated = "NRRD_space" in keys
+    else:
+        stated = True
+    if not stated:
+        raise ImageError(
+            "the file does not say how it lies in the patient",
+            file=path,
+            remedy="export it with its orientation",
+        )
+
+
+def _as_volume(image: sitk.Image, path: Path) -> Volume:
+    if image.GetNumberOfComponentsPerPixel() != 1:
+        raise ImageError("an image needs one grey value per voxel", file=path)
+    try:
+        return Volume.from_sitk(image)
+    except ImageError as error:
+        raise ImageError(error.what, file=path, remedy=error.remedy) from None
