@@ -1,0 +1,25 @@
+"""Indentation records: read them, find the touch-down, regularise them.
+
+A record starts clear of the skin (or on it), the indenter is pushed in along a line, possibly held, and drawn
+back. ``read_trace`` checks it, ``find_touch_down`` tells where the skin was met, and ``regularise`` gives
+curves counted from there: piecewise straight for the displacement, a cubic smoothing spline for the force,
+loading and unloading apart so that the peak is not smoothed away (paper, section 2.1 and figure 3).
+
+Units: s, mm, N; force positive when pushing, displacement positive into the limb.
+"""
+
+from .reading import read_trace
+from .record import COLUMNS, Trace, check_trace
+from .regularise import Regularised, regularise
+from .touchdown import TouchDown, find_touch_down
+
+__all__ = [
+    "COLUMNS",
+    "Regularised",
+    "TouchDown",
+    "Trace",
+    "check_trace",
+    "find_touch_down",
+    "read_trace",
+    "regularise",
+]

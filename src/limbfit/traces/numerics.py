@@ -1,0 +1,24 @@
+"""Small numerics that the trace modules share."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def noise_level(values: Array) -> float:
+    """Standard deviation of white noise on a smooth curve, from second differences (robust)."""
+    return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6.0))
+
+
+def rms(residual: Array) -> float:
+    return float(np.sqrt(np.mean(residual**2)))
+
+
+def bins(x: Array, y: Array, most: int) -> tuple[Array, Array, Array]:
+    """Averages of x and y over at most ``most`` runs of samples, and how many samples are in each."""
+    edges = np.unique(np.linspace(0, len(x), min(most, len(x)) + 1).astype(int))
+    n = np.diff(edges).astype(float)
+    return np.add.reduceat(x, edges[:-1]) / n, np.add.reduceat(y, edges[:-1]) / n, n

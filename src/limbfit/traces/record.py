@@ -1,0 +1,113 @@
+"""Records: the type, and the checks that every record passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import TraceError
+from .numerics import Array, bins, noise_level
+
+COLUMNS = ("time_s", "displacement_mm", "force_N")
+MIN_SAMPLES = 20
+MAX_SAMPLES = 20_000_000
+SPEED_MM_S = (0.05, 50.0)
+TRAVEL_MM = (0.2, 60.0)
+PEAK_N = (0.05, 200.0)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One record: ``time_s``, ``displacement_mm``, ``force_N``, each (n,)."""
+
+    time_s: Array
+    displacement_mm: Array
+    force_N: Array
+
+
+def check_trace(
+    trace: Trace, *, columns: tuple[str, str, str] = COLUMNS, file: str | Path | None = None
+) -> None:
+    """Refuse a record that cannot be an indentation in s, mm and N.
+
+    Raises
+    ------
+    TraceError
+        Too short, not finite, time not increasing, never in contact, or units that cannot be right: travel
+        outside 0.2-60 mm, speed outside 0.05-50 mm/s, peak force outside 0.05-200 N.
+    """
+    series = (trace.time_s, trace.displacement_mm, trace.force_N)
+    for values, name in zip(series, columns, strict=True):
+        if values.shape != trace.time_s.shape or values.ndim != 1:
+            raise TraceError(f"{values.size} values for {trace.time_s.size} times", file=file, place=name)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise TraceError(f"{values[bad[0]]} in sample {bad[0] + 1}", file=file, place=name)
+    if len(trace.time_s) < MIN_SAMPLES:
+        what = f"only {len(trace.time_s)} samples"
+        raise TraceError(what, file=file, remedy=f"a record needs at least {MIN_SAMPLES}")
+    back = np.flatnonzero(np.diff(trace.time_s) <= 0)
+    if back.size:
+        what = f"time does not increase at sample {back[0] + 2}"
+        raise TraceError(what, file=file, place=columns[0], remedy="remove doubled or unsorted samples")
+    _check_contact(trace, columns, file)
+    _check_units(trace, columns, file)
+
+
+def _check_contact(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
+    noise = noise_level(trace.force_N)
+    _, force, _ = bins(trace.time_s, trace.force_N, 60)
+    start = float(np.median(force[: max(len(force) // 20, 1)]))
+    rise, fall = float(force.max()) - start, start - float(force.min())
+    if rise <= 5 * noise and fall > 5 * noise and fall > 2 * rise:
+        remedy = "pushing must be positive: change the sign"
+        raise TraceError(
+            "the force falls when the indenter pushes", file=file, place=columns[2], remedy=remedy
+        )
+    if rise <= 5 * noise:
+        what = f"no contact: the force rises by {rise:.3g} against a noise of {noise:.3g}"
+        raise TraceError(what, file=file, place=columns[2], remedy="check the sensor, or leave the site out")
+
+
+def _check_units(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
+    start = float(np.median(trace.displacement_mm[:5]))
+    inward = float(trace.displacement_mm.max()) - start
+    if inward <= 0.5 * (start - float(trace.displacement_mm.min())):
+        remedy = "displacement into the limb must be positive: change the sign"
+        raise TraceError("the displacement falls", file=file, place=columns[1], remedy=remedy)
+    _check_range(inward, TRAVEL_MM, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1], file)
+    speed = _typical_speed(trace)
+    guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
+    _check_range(speed, SPEED_MM_S, "speed", "mm/s", guesses, columns[0], file)
+    peak = float(trace.force_N.max())
+    guesses = {1e3: "kilonewtons", 1e-3: "millinewtons", 9.81e-3: "grams"}
+    _check_range(peak, PEAK_N, "peak force", "N", guesses, columns[2], file)
+
+
+def _typical_speed(trace: Trace) -> float:
+    """Speed on the way in between 20 and 80 % of the travel, mm/s."""
+    u = trace.displacement_mm
+    low, high = np.median(u[:5]), u.max()
+    top = int(np.argmax(u >= low + 0.8 * (high - low)))
+    foot = int(np.flatnonzero(u[: top + 1] <= low + 0.2 * (high - low))[-1])
+    return float((u[top] - u[foot]) / (trace.time_s[top] - trace.time_s[foot]))
+
+
+def _check_range(
+    value: float,
+    limits: tuple[float, float],
+    quantity: str,
+    unit: str,
+    guesses: dict[float, str],
+    column: str,
+    file: str | Path | None,
+) -> None:
+    low, high = limits
+    if low <= value <= high:
+        return
+    likely = [name for factor, name in guesses.items() if low <= value * factor <= high]
+    remedy = f"it looks like {likely[0]}: convert it" if likely else "check the units"
+    what = f"a {quantity} of {value:.3g} {unit} is not plausible ({low:g} to {high:g})"
+    raise TraceError(what, file=file, place=column, remedy=remedy)
