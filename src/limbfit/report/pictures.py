@@ -1,0 +1,344 @@
+"""Pictures of the model, drawn off-screen: surfaces with sites (the paper's figure 1), cut meshes (figures 4
+and 6) and the deformed cut at the peak.
+
+Every view is a parallel projection, so that a scale bar holds everywhere in it and the labels can be set as
+text above the picture instead of being burnt into it.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pyvista as pv
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+from .page import Figure
+from .store import Json, Store
+
+PAPER = "#f6f5f1"
+SKIN, MUSCLE, BONE = "#dcc27a", "#b8565f", "#8d99a6"
+FITTED, HELD_OUT = "#0072b2", "#d55e00"
+FIELD_MAP = "viridis"
+FIELDS = (
+    ("von_mises_kPa", "von Mises stress (kPa)"),
+    ("displacement_mm", "displacement (mm)"),
+    ("J", "volume ratio J (–)"),
+)
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """A parallel projection: ``direction`` is where the camera looks, ``size`` is in pixels."""
+
+    focal: Array
+    direction: Array
+    up: Array
+    half_height_mm: float
+    size: tuple[int, int]
+
+    @property
+    def right(self) -> Array:
+        return np.cross(self.direction, self.up)
+
+    @property
+    def pixels_per_mm(self) -> float:
+        return self.size[1] / (2 * self.half_height_mm)
+
+    def project(self, points: Array) -> Array:
+        """Pixels (n, 2), the origin at the top left, of points (n, 3) in mm."""
+        offset = np.atleast_2d(points) - self.focal
+        axes = np.column_stack([self.right, -self.up])
+        return offset @ axes * self.pixels_per_mm + np.array(self.size) / 2
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A point of a picture with its name; ``axis`` (into the limb) is drawn as an arrow when given."""
+
+    text: str
+    position: Array
+    color: str
+    filled: bool = True
+    axis: Array | None = None
+
+
+def _unit(values: Iterable[float]) -> Array:
+    v = np.asarray(tuple(values), dtype=float)
+    return v / np.linalg.norm(v)
+
+
+def limb_frame(store: Store) -> Array:
+    """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
+    up = _unit(store.surfaces.get("cut_normal") or (0.0, 0.0, 1.0))
+    back = np.array([0.0, 1.0, 0.0])
+    back = _unit(back - (back @ up) * up) if abs(up[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
+    return np.array([np.cross(back, up), back, up])
+
+
+def _shoot(plotter: pv.Plotter, view: View) -> Array:
+    """The picture (rows, columns, 3) of what the plotter holds, seen by a view."""
+    camera = plotter.camera
+    camera.parallel_projection = True
+    camera.focal_point = tuple(view.focal)
+    camera.position = tuple(view.focal - 2000.0 * view.direction)
+    camera.up = tuple(view.up)
+    camera.parallel_scale = view.half_height_mm
+    plotter.window_size = list(view.size)
+    plotter.renderer.ResetCameraClippingRange()
+    plotter.render()
+    return np.asarray(plotter.screenshot(return_img=True))
+
+
+def _plotter() -> pv.Plotter:
+    plotter = pv.Plotter(off_screen=True, lighting="light kit")
+    plotter.set_background(PAPER)
+    plotter.enable_anti_aliasing("ssaa")
+    return plotter
+
+
+def _png(pixels: Array) -> str:
+    buffer = io.BytesIO()
+    matplotlib.image.imsave(buffer, pixels, format="png")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def surface_figure(store: Store) -> Figure | None:
+    """The limb from four sides: skin translucent, bones inside, sites named on the side that shows them."""
+    files = store.surface_files
+    if "skin" not in files:
+        return None
+    plotter = _plotter()
+    skin = pv.read(files["skin"])
+    plotter.enable_depth_peeling(8)
+    plotter.add_mesh(skin, color=SKIN, opacity=0.38, smooth_shading=True, specular=0.1)
+    for name, file in files.items():
+        if name != "skin":
+            plotter.add_mesh(pv.read(file), color=BONE, smooth_shading=True, specular=0.2)
+    left, back, up = limb_frame(store)
+    sides = (("anterior", back), ("left", -left), ("posterior", -back), ("right", left))
+    points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
+    half = np.abs(points).max(axis=0) * 1.06 + 4
+    width = 2 * max(half[0], half[1]) + 8
+    size = (round(1000 * width / (2 * half[2])), 1000)
+    views = [View(np.array(skin.center), side, up, half[2], size) for _, side in sides]
+    shots = [(_shoot(plotter, view), view, _facing(store, view)) for view in views]
+    plotter.close()
+    alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
+    caption = (
+        "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
+        "Filled: sites that were fitted; open: held out."
+    )
+    markup = _strip(shots, [f"{name} view" for name, _ in sides], alt)
+    return Figure("model", markup, caption)
+
+
+def _facing(store: Store, view: View) -> list[Mark]:
+    """The sites whose skin faces the camera of a view."""
+    marks = []
+    for row in store.sites:
+        if row.get("position_mm") and row.get("axis") and _unit(row["axis"]) @ view.direction > 0.5:
+            marks.append(_mark(row))
+    return marks
+
+
+def _mark(row: Json, axis: bool = False) -> Mark:
+    fitted = bool(row.get("fitted"))
+    color = FITTED if fitted else HELD_OUT
+    position, direction = np.array(row["position_mm"]), _unit(row["axis"]) if axis else None
+    return Mark(str(row["site"]), position, color, fitted, direction)
+
+
+def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
+    """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
+    rows = _drawable(store, sites, "mesh")
+    if not rows:
+        return None
+    whole, near = [], []
+    for row, file in rows:
+        view, close = _cut_views(store, row, file)
+        plotter = _plotter()
+        _add_regions(plotter, _far_side(_linear(file), view))
+        whole.append((_shoot(plotter, view), view, [_mark(row, axis=True)]))
+        near.append((_shoot(plotter, close), close, []))
+        plotter.close()
+    names = [row["site"] for row, _ in rows]
+    alt = "Meshes cut through the sites " + ", ".join(names) + ": skin layer, muscle and bone voids"
+    legend = _legend((("skin–adipose layer", SKIN), ("muscle–soft tissue", MUSCLE)))
+    caption = (
+        "The mesh of each fitted site, cut along the limb through the site (above), and near the indenter "
+        "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
+    )
+    titles = [f"{name}" for name in names]
+    markup = _strip(whole, titles, alt) + _strip(near, [f"{t}, near" for t in titles], alt) + legend
+    return Figure("mesh-cut", markup, caption)
+
+
+def field_figure(store: Store, sites: Sequence[str]) -> Figure | None:
+    """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
+    rows = _drawable(store, sites, "predict")
+    grids = [(row, file, _linear(file)) for row, file in rows]
+    stored = {name for _, _, grid in grids for name in grid.array_names}
+    field = next(((name, title) for name, title in FIELDS if name in stored), None)
+    if not grids or field is None or "displacement_mm" not in stored:
+        return None
+    limits = _limits([grid for _, _, grid in grids], field[0])
+    shots = []
+    for row, file, grid in grids:
+        _, close = _cut_views(store, row, file)
+        plotter = _plotter()
+        cut = _far_side(grid, close, smooth=True).warp_by_vector("displacement_mm")
+        scalars = {"scalars": field[0], "clim": limits, "cmap": FIELD_MAP, "show_scalar_bar": False}
+        plotter.add_mesh(cut.extract_surface(algorithm="dataset_surface"), **scalars, lighting=False)
+        shots.append((_shoot(plotter, close), close, []))
+        plotter.close()
+    names = [row["site"] for row, _, _ in grids]
+    alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
+    caption = f"Deformed cut through each fitted site at the largest indentation; colour: {field[1]}."
+    return Figure("field", _strip(shots, names, alt) + _colour_bar(limits, field[1]), caption)
+
+
+def _drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
+    """Sites with a place and a stored mesh."""
+    rows = {row["site"]: row for row in store.sites if row.get("position_mm") and row.get("axis")}
+    found = [(rows[name], store.vtu(stage, name)) for name in sites if name in rows]
+    return [(row, file) for row, file in found if file is not None]
+
+
+def _linear(file: Path) -> pv.UnstructuredGrid:
+    """The stored mesh with straight-edged elements, which draw much faster."""
+    return pv.read(file).linear_copy()
+
+
+def _cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
+    """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
+    up = limb_frame(store)[2]
+    axis = _unit(row["axis"])
+    normal = _unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else limb_frame(store)[0]
+    points = np.asarray(pv.read(file).points)
+    height = points @ up
+    middle = points.mean(axis=0)
+    half = float(np.ptp(height)) / 2 * 1.05
+    centre = middle + ((height.max() + height.min()) / 2 - middle @ up) * up
+    reach = float(np.abs((points - centre) @ axis).max()) + 30
+    whole = View(centre, normal, up, half, (round(900 * reach / half), 900))
+    close = View(np.array(row["position_mm"]) + 14 * axis, normal, up, 34.0, (700, 700))
+    return whole, close
+
+
+def _far_side(grid: pv.UnstructuredGrid, view: View, smooth: bool = False) -> pv.DataSet:
+    """What lies behind the plane through the middle of the view: whole cells, or cut through."""
+    if smooth:
+        return grid.clip(normal=tuple(view.direction), origin=tuple(view.focal), invert=False)
+    centres = np.asarray(grid.cell_centers().points)
+    return grid.extract_cells(np.flatnonzero((centres - view.focal) @ view.direction > 0))
+
+
+def _add_regions(plotter: pv.Plotter, grid: pv.DataSet) -> None:
+    regions = np.asarray(grid.cell_data[_region_name(grid)])
+    for index, color in ((0, SKIN), (1, MUSCLE)):
+        part = grid.extract_cells(np.flatnonzero(regions == index))
+        if part.n_cells:
+            surface = part.extract_surface(algorithm="dataset_surface")
+            plotter.add_mesh(surface, color=color, show_edges=True, edge_color="#3b2f2f", line_width=1)
+
+
+def _region_name(grid: pv.DataSet) -> str:
+    return next(name for name in ("regions", "region") if name in grid.cell_data)
+
+
+def _limits(grids: Sequence[pv.UnstructuredGrid], field: str) -> tuple[float, float]:
+    """Colour limits shared by all pictures: the 0.5 and 99.5 percentile, so that a corner does not rule."""
+    values = [np.asarray(grid[field]) for grid in grids if field in grid.array_names]
+    flat = np.concatenate([np.linalg.norm(v, axis=1) if v.ndim == 2 else v for v in values])
+    low, high = np.percentile(flat, [0.5, 99.5])
+    return float(low), float(max(high, low + 1e-9))
+
+
+# ---- pictures as SVG ------------------------------------------------------------------------------------
+
+_GAP, _TITLE = 14, 34
+
+
+def _strip(shots: Sequence[tuple[Array, View, list[Mark]]], titles: Sequence[str], alt: str) -> str:
+    """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
+    width = sum(view.size[0] for _, view, _ in shots) + _GAP * (len(shots) - 1)
+    height = max(view.size[1] for _, view, _ in shots) + _TITLE
+    parts, x = [], 0
+    for (pixels, view, marks), title in zip(shots, titles, strict=True):
+        parts.append(f'<g transform="translate({x} 0)">{_panel(pixels, view, marks, title)}</g>')
+        x += view.size[0] + _GAP
+    head = f'<svg class="picture" viewBox="0 0 {width} {height}" role="img"><title>{escape(alt)}</title>'
+    return head + "".join(parts) + "</svg>"
+
+
+def _panel(pixels: Array, view: View, marks: list[Mark], title: str) -> str:
+    w, h = view.size
+    image = f'<image href="{_png(pixels)}" width="{w}" height="{h}"/>'
+    text = f'<text class="panel-title" x="2" y="{_TITLE - 12}">{escape(title)}</text>'
+    return f'{text}<g transform="translate(0 {_TITLE})">{image}{_labels(view, marks)}{_scale_bar(view)}</g>'
+
+
+def _labels(view: View, marks: list[Mark]) -> str:
+    """Dots, arrows and names; names stand right of their dot and give way to each other downwards."""
+    placed: list[tuple[float, float]] = []
+    parts = []
+    for mark in sorted(marks, key=lambda m: float(view.project(m.position)[0, 1])):
+        x, y = (float(v) for v in view.project(mark.position)[0])
+        if mark.axis is not None:
+            parts.append(_arrow(view, mark))
+        else:
+            fill = mark.color if mark.filled else PAPER
+            parts.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="9" fill="{fill}" stroke="{mark.color}"/>')
+            ly = y
+            while any(abs(ly - py) < 26 and abs(x - px) < 22 * (2 + len(mark.text)) for px, py in placed):
+                ly += 4
+            placed.append((x, ly))
+            parts.append(f'<text class="site" x="{x + 15:.0f}" y="{ly + 8:.0f}">{escape(mark.text)}</text>')
+    return "".join(parts)
+
+
+def _arrow(view: View, mark: Mark) -> str:
+    assert mark.axis is not None
+    tip = view.project(mark.position)[0]
+    step = view.project(mark.position + mark.axis)[0] - tip
+    step = step / np.linalg.norm(step)
+    side = np.array([-step[1], step[0]])
+    tail, wing = tip - 70 * step, tip - 22 * step
+    head = " ".join(f"{p[0]:.0f},{p[1]:.0f}" for p in (tip, wing + 10 * side, wing - 10 * side))
+    shaft = f'x1="{tail[0]:.0f}" y1="{tail[1]:.0f}" x2="{wing[0]:.0f}" y2="{wing[1]:.0f}"'
+    return (
+        f'<line {shaft} stroke="{mark.color}" stroke-width="6"/><polygon points="{head}" fill="{mark.color}"/>'
+    )
+
+
+def _scale_bar(view: View) -> str:
+    length = next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * view.size[0])
+    w, (right, bottom) = length * view.pixels_per_mm, (view.size[0] - 14, view.size[1] - 14)
+    line = f'<line x1="{right - w:.1f}" y1="{bottom}" x2="{right}" y2="{bottom}" class="scale"/>'
+    return f'{line}<text class="scale-text" x="{right}" y="{bottom - 10}">{length} mm</text>'
+
+
+def _legend(entries: Iterable[tuple[str, str]]) -> str:
+    items = "".join(
+        f'<span><i class="swatch" style="background:{color}"></i>{escape(text)}</span>'
+        for text, color in entries
+    )
+    return f'<div class="legend">{items}</div>'
+
+
+def _colour_bar(limits: tuple[float, float], title: str) -> str:
+    stops = ", ".join(
+        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[FIELD_MAP](t)[:3]) for t in np.linspace(0, 1, 9)
+    )
+    bar = f'<i class="colour-bar" style="background:linear-gradient(90deg, {stops})"></i>'
+    low, high = (f"{value:.3g}" for value in limits)
+    return f'<div class="legend"><span>{low}</span>{bar}<span>{high}</span><span>{escape(title)}</span></div>'

@@ -1,0 +1,330 @@
+"""The sections of the report, each made from the store; what is not stored is said in a sentence."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+
+from . import figures, pictures, tables
+from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
+from .store import PARAMETERS, TISSUES, Store
+
+PRIVACY = (
+    "This report holds no name, date of birth or other identity from the images. It does show the shape of "
+    "a limb and how it responds, which is health data: handle it as the study's consent allows."
+)
+
+
+def make_page(store: Store) -> Page:
+    """Every section in the order in which a reader asks."""
+    study = store.run.get("study") or {}
+    name = str(study.get("name") or "Unnamed study")
+    makers: tuple[Callable[[Store], Section], ...] = (
+        model,
+        meshes,
+        records,
+        fit,
+        prediction,
+        parameters,
+        convergence,
+        solver,
+        method,
+        timing,
+        settings,
+        provenance,
+    )
+    version = store.run.get("limbfit", "unknown version")
+    return Page(
+        title=name,
+        subtitle=str(study.get("description") or ""),
+        key_numbers=key_numbers(store),
+        summary=summary(store),
+        sections=tuple(make(store) for make in makers),
+        footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
+    )
+
+
+def _blocks(*blocks: Block | None, otherwise: str) -> tuple[Block, ...]:
+    """The blocks that exist, or a note that says what is missing."""
+    found = tuple(block for block in blocks if block is not None)
+    return found or (Note(otherwise),)
+
+
+def key_numbers(store: Store) -> tuple[KeyNumber, ...]:
+    """The numbers that a reader looks for first."""
+    found = []
+    if store.predict:
+        heldout, fitted = (tables.mean_and_deviation(store, which) for which in ("heldout", "fitted"))
+        found.append(KeyNumber(heldout, "%", "mean force error at the held-out sites"))
+        found.append(KeyNumber(fitted, "%", "mean force error at the fitted sites"))
+    for tissue in TISSUES:
+        last = store.stages[-1].get("parameters", {}).get(tissue) if store.stages else None
+        if last:
+            found.append(KeyNumber(tables.number(last.get("c_kPa")), "kPa", _with_interval(store, tissue)))
+    seconds = [stage.get("seconds", 0.0) for stage in (store.run.get("stages") or {}).values()]
+    if seconds:
+        found.append(KeyNumber(*_short_time(sum(seconds)), "computing time, all stages"))
+    return tuple(found)
+
+
+def _short_time(seconds: float) -> tuple[str, str]:
+    return (f"{seconds:.0f}", "s") if seconds < 120 else (f"{seconds / 60:.0f}", "min")
+
+
+def _with_interval(store: Store, tissue: str) -> str:
+    limits = tables.interval(store, tissue, "c_kPa")
+    text = f"{tissue}, long-term shear modulus c"
+    return f"{text} ({tables.number(limits[0])} to {tables.number(limits[1])} kPa)" if limits else text
+
+
+def summary(store: Store) -> tuple[Block, ...]:
+    """One paragraph in plain words, then the verdict."""
+    sentences = [_what_was_done(store), _how_well(store), _one_or_two(store)]
+    blocks: list[Block] = [Prose(" ".join(sentence for sentence in sentences if sentence))]
+    words = _verdict(store)
+    return (*blocks, Bullets(words)) if words else tuple(blocks)
+
+
+def _what_was_done(store: Store) -> str:
+    names, fitted = store.site_names, store.fitted
+    if not names:
+        return "Nothing has been computed yet for this study."
+    if not store.stages:
+        return f"The study has {len(names)} indentation sites; no parameters have been identified yet."
+    return (
+        f"The soft tissue of this limb was identified from robotic indentations at {len(fitted)} of "
+        f"{len(names)} sites ({', '.join(fitted)}): first as one material, then as a skin–adipose layer and "
+        "the muscle–soft tissue beneath it."
+    )
+
+
+def _how_well(store: Store) -> str:
+    held = [row for row in store.predicted if not row.get("fitted")]
+    if not store.predict:
+        return ""
+    if not held:
+        return f"At the fitted sites the force error is {tables.mean_and_deviation(store, 'fitted')} %."
+    places = "the one site that was" if len(held) == 1 else f"the {len(held)} sites that were"
+    errors = [row["error_percent"] for row in held if row.get("error_percent") is not None]
+    worst = f" (largest {tables.fixed(max(errors))} %)" if errors else ""
+    return (
+        f"At {places} not used, the model predicts the force with a mean error of "
+        f"{tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted sites it "
+        f"is {tables.mean_and_deviation(store, 'fitted')} %."
+    )
+
+
+def _one_or_two(store: Store) -> str:
+    held = [row for row in store.predicted if not row.get("fitted")]
+    one = [row.get("error_one_material_percent") for row in held]
+    two = [row.get("error_percent") for row in held]
+    if not held or None in one or None in two:
+        return ""
+    first, second = statistics.fmean(one), statistics.fmean(two)
+    start = f"With one material for all soft tissue the held-out error is {tables.fixed(first)} %: "
+    if abs(first - second) < 0.1 * max(first, second):
+        return start + "here two materials predict no better than one."
+    return start + ("two materials predict better." if second < first else "two materials predict worse.")
+
+
+def _verdict(store: Store) -> tuple[str, ...]:
+    uncertainty = store.calibration.get("uncertainty") or {}
+    stored = uncertainty.get("verdict") or {}
+    if not stored:
+        return ()
+    names = {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in TISSUES for n in PARAMETERS}
+    groups: dict[str, list[str]] = {}
+    for name, word in stored.items():
+        groups.setdefault(str(word), []).append(names.get(name, name))
+    words = [f"{word.capitalize()}: {', '.join(found)}." for word, found in groups.items()]
+    return (*words, *(str(sentence) for sentence in uncertainty.get("combinations") or ()))
+
+
+def model(store: Store) -> Section:
+    """Surfaces, sites and volumes."""
+    blocks = _blocks(
+        pictures.surface_figure(store),
+        tables.volume_table(store),
+        tables.place_table(store) if store.sites else None,
+        otherwise="No surfaces and sites are stored yet.",
+    )
+    source = store.segment.get("method")
+    if source:
+        blocks = (Prose(f"Segmentation: {source}."), *blocks)
+    return Section("model", "The model", blocks)
+
+
+def meshes(store: Store) -> Section:
+    """Cut meshes and their quality."""
+    blocks = _blocks(
+        pictures.mesh_figure(store, store.fitted[:4]),
+        tables.mesh_table(store) if store.mesh else None,
+        otherwise="No meshes are stored yet.",
+    )
+    return Section("meshes", "Meshes", blocks)
+
+
+def records(store: Store) -> Section:
+    """Indentation records."""
+    chosen = [site for site in (*store.fitted, *store.traces) if store.curves("traces", site)]
+    blocks = _blocks(
+        figures.record_figure(store, chosen[0]) if chosen else None,
+        tables.trace_table(store) if store.traces else None,
+        otherwise="No indentation records are stored yet.",
+    )
+    return Section("records", "Indentation records", blocks)
+
+
+def fit(store: Store) -> Section:
+    """Force against time at the fitted sites."""
+    rows = [row for row in store.predicted if row.get("fitted")]
+    blocks = _blocks(
+        figures.force_figure(store, rows, "time_s", "forces-fitted", 2),
+        pictures.field_figure(store, store.fitted[:4]),
+        otherwise="No simulated forces of fitted sites are stored yet.",
+    )
+    return Section("fit", "Fitted sites", blocks)
+
+
+def prediction(store: Store) -> Section:
+    """Everything about the sites that were not used, and table 2."""
+    rows = [row for row in store.predicted if not row.get("fitted")]
+    blocks = _blocks(
+        tables.site_table(store) if store.predicted else None,
+        figures.error_figure(store),
+        figures.force_figure(store, rows, "time_s", "forces-held-out", 3),
+        figures.force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
+        otherwise="No predictions are stored yet.",
+    )
+    if store.predicted and not rows:
+        blocks = (*blocks, Note("Every site was fitted, so nothing tests the model on unseen data."))
+    return Section("prediction", "All sites, held-out sites", blocks)
+
+
+def parameters(store: Store) -> Section:
+    """Table 1, intervals and correlations."""
+    found: tuple[Block | None, ...] = ()
+    if store.stages:
+        found = (
+            tables.parameter_table(store),
+            figures.interval_figure(store),
+            tables.correlation_table(store),
+        )
+    blocks = _blocks(*found, otherwise="No parameters have been identified yet.")
+    if store.stages and not store.calibration.get("uncertainty"):
+        blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
+    noise = (store.calibration.get("uncertainty") or {}).get("noise_N")
+    if noise is not None:
+        text = f"The intervals rest on a force noise of {tables.number(noise)} N, estimated from the records."
+        blocks = (*blocks, Prose(text))
+    return Section("parameters", "Parameters", blocks)
+
+
+def convergence(store: Store) -> Section:
+    """How the identification went."""
+    stages = store.stages
+    texts = tuple(
+        f"{str(stage['name']).capitalize()}: {'converged' if stage.get('converged') else 'not converged'} after "
+        f"{len(stage.get('iterations') or ())} iterates and {stage.get('evaluations', tables.NOTHING)} "
+        f"evaluations; {stage.get('reason') or 'no reason stored'}."
+        for stage in stages
+    )
+    figure: Figure | None = figures.convergence_figure(store)
+    details: tuple[Table, ...] = tuple(
+        tables.iteration_table(stage) for stage in stages if stage.get("iterations")
+    )
+    blocks = _blocks(
+        Bullets(texts) if texts else None, figure, *details, otherwise="No identification is stored yet."
+    )
+    return Section("convergence", "Convergence of the identification", blocks)
+
+
+def solver(store: Store) -> Section:
+    """What the simulations say about themselves."""
+    facts = {
+        "Objective": store.calibration.get("objective"),
+        "Forward simulations of the identification": store.calibration.get("forward_runs"),
+        "Linear solver": store.calibration.get("linear_solver"),
+        "Element": store.calibration.get("element"),
+    }
+    known = {key: value for key, value in facts.items() if value is not None}
+    failed = [str(row["site"]) for row in store.predicted if not row.get("completed")]
+    warning = f"The simulation did not reach the end of the record at: {', '.join(failed)}." if failed else None
+    blocks = _blocks(
+        Note(warning) if warning else None,
+        tables.solver_table(store) if store.predicted else None,
+        tables.pair_table("solver-facts", "The identification's solver.", ("Fact", "Value"), known)
+        if known
+        else None,
+        otherwise="No simulations are stored yet.",
+    )
+    return Section("solver", "Solver", blocks)
+
+
+def method(store: Store) -> Section:
+    """The method in words that a paper's supplement can take over."""
+    options = store.run.get("settings") or {}
+    geometry, indenter = options.get("geometry") or {}, options.get("indenter") or {}
+    kappa = (options.get("material") or {}).get("kappa_ratio")
+    layer = tables.number(geometry.get("skin_layer_mm"))
+    width = tables.number(indenter.get("width_mm"))
+    return Section(
+        "method",
+        "Method",
+        (
+            Prose(
+                "The method follows Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater.): "
+                "both tissues obey the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with "
+                "quasi-linear viscoelasticity, G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress. "
+                f"The bulk modulus κ is c times {tables.number(kappa)}. The skin–adipose layer is {layer} mm "
+                "thick; bones are voids whose surfaces, like the proximal cut, do not move."
+            ),
+            Prose(
+                f"A rigid {indenter.get('shape') or 'square'} indenter of {width} mm follows the measured "
+                "displacement along the mean local normal, without friction. Parameters minimise the force "
+                "residuals at the fitted sites by bounded least squares with exact sensitivities. The force "
+                "error of a site is the mean absolute error over the trace divided by the largest measured "
+                "force."
+            ),
+        ),
+    )
+
+
+def timing(store: Store) -> Section:
+    """How long it took, and on what."""
+    machine = store.run.get("machine") or {}
+    words = [
+        f"{machine['cores']} cores" if "cores" in machine else "",
+        f"{tables.fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
+        f"Python {machine['python']}" if "python" in machine else "",
+    ]
+    known = ", ".join(word for word in words if word)
+    blocks = _blocks(
+        tables.timing_table(store) if store.run.get("stages") else None,
+        Prose(f"Machine: {known}.") if known else None,
+        otherwise="No times are stored.",
+    )
+    return Section("timing", "Computing time", blocks)
+
+
+def settings(store: Store) -> Section:
+    """Every setting of the study file."""
+    flat = tables.flatten(store.run.get("settings") or {})
+    table = tables.pair_table(
+        "all-settings", "Every setting of the study, defaults included.", ("Key", "Value"), flat
+    )
+    blocks = _blocks(table if flat else None, otherwise="No settings are stored.")
+    return Section("settings", "Settings", blocks)
+
+
+def provenance(store: Store) -> Section:
+    """Versions and hashes: what someone else needs to get the same numbers."""
+    versions = {"limbfit": store.run.get("limbfit")} | (store.run.get("versions") or {})
+    inputs = store.run.get("inputs") or {}
+    known = {name: value for name, value in versions.items() if value}
+    blocks = _blocks(
+        tables.pair_table("versions", "Software.", ("Library", "Version"), known) if known else None,
+        tables.pair_table("inputs", "Inputs and their SHA-256.", ("File", "SHA-256"), inputs) if inputs else None,
+        otherwise="No versions and input hashes are stored.",
+    )
+    return Section("provenance", "Versions and inputs", blocks)

@@ -1,0 +1,124 @@
+"""The stored results of a study, read and nothing more: JSON summaries, CSV curves, paths of geometry."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
+TISSUES = ("skin", "muscle")
+
+Curves = dict[str, NDArray[np.float64]]
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Store:
+    """A results folder; every dictionary is empty where its file is not there (yet)."""
+
+    folder: Path
+    run: Json
+    segment: Json
+    surfaces: Json
+    sites: tuple[Json, ...]
+    traces: Json
+    mesh: Json
+    calibration: Json
+    predict: Json
+    truth: Json
+
+    @property
+    def site_names(self) -> tuple[str, ...]:
+        """Names of the sites in the order of the study, whichever stage knows them."""
+        known = [site["site"] for site in self.sites] or [site["site"] for site in self.predicted]
+        return tuple(known or self.traces)
+
+    @property
+    def predicted(self) -> tuple[Json, ...]:
+        return tuple(self.predict.get("sites", ()))
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        rows = self.sites or self.predicted
+        return tuple(row["site"] for row in rows if row.get("fitted"))
+
+    @property
+    def stages(self) -> tuple[Json, ...]:
+        """The stages of the identification, one material first."""
+        return tuple(self.calibration.get("stages", ()))
+
+    @property
+    def surface_files(self) -> dict[str, Path]:
+        """``skin`` and each ``bone-<name>``: the surfaces that are stored."""
+        folder = self.folder / "surfaces"
+        files = {"skin": folder / "skin.stl"} | {p.stem: p for p in sorted(folder.glob("bone-*.stl"))}
+        return {name: path for name, path in files.items() if path.is_file()}
+
+    def region(self, site: str) -> str:
+        rows = {row["site"]: row for row in (*self.predicted, *self.sites)}
+        return str(rows.get(site, {}).get("region") or "")
+
+    def curves(self, stage: str, name: str) -> Curves | None:
+        """The columns of ``<stage>/<name>.csv``, or None where there is no such file."""
+        file = self.folder / stage / f"{name}.csv"
+        return _read_csv(file) if file.is_file() else None
+
+    def vtu(self, stage: str, site: str) -> Path | None:
+        file = self.folder / stage / f"{site}.vtu"
+        return file if file.is_file() else None
+
+
+def load_store(results: Path) -> Store:
+    """Read what is below ``results``.
+
+    Raises
+    ------
+    InputError
+        When there is no such folder, or a summary in it is not readable.
+    """
+    if not results.is_dir():
+        raise InputError("no results there", file=results, remedy="run the study first")
+    sites = _read_json(results / "sites" / "sites.json").get("sites", [])
+    return Store(
+        folder=results,
+        run=_read_json(results / "run.json"),
+        segment=_read_json(results / "segment" / "segment.json"),
+        surfaces=_read_json(results / "surfaces" / "surfaces.json"),
+        sites=tuple(sites),
+        traces=_read_json(results / "traces" / "traces.json").get("sites", {}),
+        mesh=_read_json(results / "mesh" / "mesh.json").get("sites", {}),
+        calibration=_read_json(results / "calibrate" / "calibration.json"),
+        predict=_read_json(results / "predict" / "predict.json"),
+        truth=_read_json(results / "truth.json"),
+    )
+
+
+def _read_json(file: Path) -> Json:
+    if not file.is_file():
+        return {}
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"not readable: {error}", file=file, remedy="run its stage again") from None
+    if not isinstance(content, dict):
+        raise InputError("not a JSON object", file=file, remedy="run its stage again")
+    return content
+
+
+def _read_csv(file: Path) -> Curves:
+    lines = file.read_text(encoding="utf-8").splitlines()
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
+    try:
+        values = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise InputError(f"not readable: {error}", file=file, remedy="run its stage again") from None
+    if values.shape[1:] != (len(names),):
+        raise InputError("its rows do not fit its header", file=file, remedy="run its stage again")
+    return {name: values[:, i] for i, name in enumerate(names)}

@@ -1,0 +1,402 @@
+"""Stored results as tables: parameters (the paper's table 1), sites (table 2), and the facts beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from .page import Cell, Row, Table
+from .store import PARAMETERS, TISSUES, Json, Store
+
+NOTHING = "–"
+SYMBOLS = {"c_kPa": "c", "m": "m", "gamma": "γ", "tau_s": "τ"}
+UNITS = {"c_kPa": "kPa", "m": NOTHING, "gamma": NOTHING, "tau_s": "s"}
+MEANING = {
+    "c_kPa": "long-term shear modulus",
+    "m": "strain-stiffening exponent",
+    "gamma": "relaxation amplitude",
+    "tau_s": "relaxation time",
+}
+TISSUE_NAMES = {"skin": "Skin–adipose layer", "muscle": "Muscle–soft tissue"}
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number to so many significant digits, without an exponent where a person can do without."""
+    if not isinstance(value, int | float) or value != value:
+        return NOTHING
+    if value in (float("inf"), float("-inf")):
+        return "∞" if value > 0 else "−∞"
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        text = f"{value:#.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}".replace(",", " ")
+        return text.rstrip(".").replace("-", "−")
+    return f"{value:.{digits - 1}e}".replace("-", "−")
+
+
+def fixed(value: Any, decimals: int = 1) -> str:
+    """A number to so many decimals."""
+    if not isinstance(value, int | float) or value != value:
+        return NOTHING
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def duration(seconds: Any) -> str:
+    """Seconds as a person says them."""
+    if not isinstance(seconds, int | float):
+        return NOTHING
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 90:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def vector(values: Any) -> str:
+    return ", ".join(fixed(value) for value in values) if values else NOTHING
+
+
+def _n(text: str, share: float | None = None) -> Cell:
+    return Cell(text, number=True, share=share)
+
+
+def _h(text: str) -> Cell:
+    return Cell(text, header=True)
+
+
+def interval(store: Store, tissue: str, name: str) -> list[float] | None:
+    """The stored 95 % interval of a parameter."""
+    uncertainty = store.calibration.get("uncertainty") or {}
+    limits = (uncertainty.get("intervals_95") or {}).get(tissue, {}).get(name)
+    return limits if limits and None not in limits else None
+
+
+def verdict(store: Store, tissue: str, name: str) -> str:
+    """What the identification says about a parameter: ``determined`` or the contrary, in its own words."""
+    uncertainty = store.calibration.get("uncertainty") or {}
+    return str((uncertainty.get("verdict") or {}).get(f"{tissue}.{name}", NOTHING))
+
+
+def _limits(limits: list[float] | None) -> str:
+    return f"{number(limits[0])} to {number(limits[1])}" if limits else NOTHING
+
+
+def parameter_table(store: Store) -> Table:
+    """Table 1: start, one material, two materials, interval, verdict, and the truth where it is known."""
+    stages = store.stages
+    head = ["Tissue", "Parameter", "Unit", "Start"]
+    head += [f"{str(stage['name']).capitalize()}" for stage in stages]
+    head += ["95 % interval", "Verdict"] + (["Truth"] if store.truth else [])
+    return Table(
+        name="parameters",
+        caption="Table 1. Constitutive parameters before and after each stage of the identification. "
+        "The interval and the verdict belong to the last stage.",
+        head=tuple(head),
+        rows=tuple(_parameter_row(store, tissue, name) for tissue in TISSUES for name in PARAMETERS),
+    )
+
+
+def _parameter_row(store: Store, tissue: str, name: str) -> Row:
+    stages = store.stages
+    values = [stages[0].get("start", {}), *(stage.get("parameters", {}) for stage in stages)]
+    cells = [_h(TISSUE_NAMES[tissue]), Cell(f"{SYMBOLS[name]}, {MEANING[name]}"), Cell(UNITS[name])]
+    cells += [_n(number(tissues.get(tissue, {}).get(name))) for tissues in values]
+    cells += [_n(_limits(interval(store, tissue, name))), Cell(verdict(store, tissue, name))]
+    if store.truth:
+        cells.append(_n(number(store.truth.get("parameters", {}).get(tissue, {}).get(name))))
+    return Row(tuple(cells))
+
+
+def site_table(store: Store) -> Table:
+    """Table 2: largest force and errors of each site, fitted sites marked."""
+    head = (
+        "Site",
+        "Region",
+        "Use",
+        "Largest force (N)",
+        "Depth (mm)",
+        "Error, one material (%)",
+        "Error, two materials (%)",
+    )
+    return Table(
+        name="sites",
+        caption="Table 2. Force error at every site: the mean absolute error over the trace divided by the "
+        "largest measured force. Sites that the identification used are marked.",
+        head=head,
+        rows=tuple(_site_row(store, row) for row in store.predicted),
+        foot=tuple(_mean_rows(store)),
+    )
+
+
+def _site_row(store: Store, row: Json) -> Row:
+    fitted = bool(row.get("fitted"))
+    depth = store.traces.get(row["site"], {}).get("depth_mm")
+    return Row(
+        (
+            _h(str(row["site"])),
+            Cell(str(row.get("region") or NOTHING)),
+            Cell("fitted" if fitted else "held out"),
+            _n(fixed(row.get("peak_force_N"), 2)),
+            _n(fixed(depth, 2)),
+            _n(fixed(row.get("error_one_material_percent"))),
+            _n(fixed(row.get("error_percent"))),
+        ),
+        marked=fitted,
+    )
+
+
+def _mean_rows(store: Store) -> Iterable[Row]:
+    for word, key in (("fitted", "fitted"), ("held out", "heldout")):
+        chosen = [row for row in store.predicted if bool(row.get("fitted")) == (key == "fitted")]
+        one = [row.get("error_one_material_percent") for row in chosen]
+        if chosen:
+            yield Row(
+                (
+                    _h(f"Mean, {word}"),
+                    Cell(f"{len(chosen)} site{'s' if len(chosen) > 1 else ''}"),
+                    Cell(word),
+                    _n(""),
+                    _n(""),
+                    _n(fixed(sum(one) / len(one)) if None not in one else NOTHING),
+                    _n(mean_and_deviation(store, key)),
+                )
+            )
+
+
+def mean_and_deviation(store: Store, which: str) -> str:
+    """``4.5 ± 1.0``: stored mean and standard deviation of the errors at ``fitted`` or ``heldout`` sites."""
+    mean = store.predict.get(f"mean_error_{which}_percent")
+    deviation = store.predict.get(f"sd_error_{which}_percent")
+    return fixed(mean) if deviation is None else f"{fixed(mean)} ± {fixed(deviation)}"
+
+
+def correlation_table(store: Store) -> Table | None:
+    """The correlation of every pair of parameters, coloured."""
+    correlation = (store.calibration.get("uncertainty") or {}).get("correlation") or {}
+    names, matrix = correlation.get("names"), correlation.get("matrix")
+    if not names or not matrix:
+        return None
+    short = tuple(_short(str(name)) for name in names)
+    rows = tuple(
+        Row((_h(label), *(Cell(fixed(value, 2), number=True, shade=_shade(value)) for value in values)))
+        for label, values in zip(short, matrix, strict=True)
+    )
+    return Table(
+        name="correlation",
+        caption="Correlation of the identified parameters. Near ±1 a pair cannot be told apart: "
+        "the data determine only a combination of the two.",
+        head=("", *short),
+        rows=rows,
+    )
+
+
+def _shade(value: Any) -> float | None:
+    return max(-1.0, min(1.0, float(value))) if isinstance(value, int | float) and value == value else None
+
+
+def _short(name: str) -> str:
+    tissue, _, parameter = name.partition(".")
+    return f"{tissue} {SYMBOLS.get(parameter, parameter)}" if parameter else name
+
+
+def trace_table(store: Store) -> Table:
+    """Touch-down, peak, noise and speed of every record."""
+    head = (
+        "Site",
+        "Touch-down (s)",
+        "Touch-down (mm)",
+        "± (mm)",
+        "Depth (mm)",
+        "Largest force (N)",
+        "Noise (N)",
+        "Loading (mm/s)",
+        "Unloading (mm/s)",
+    )
+    keys = (
+        ("touch_down_s", 3),
+        ("touch_down_mm", 3),
+        ("touch_down_uncertainty_mm", 3),
+        ("depth_mm", 2),
+        ("peak_force_N", 2),
+        ("noise_N", 3),
+        ("speed_load_mm_s", 3),
+        ("speed_unload_mm_s", 3),
+    )
+    rows = tuple(
+        Row((_h(site), *(_n(fixed(facts.get(key), digits)) for key, digits in keys)), site in store.fitted)
+        for site, facts in store.traces.items()
+    )
+    return Table("trace-facts", "What was found in each indentation record.", head, rows)
+
+
+def place_table(store: Store) -> Table:
+    """Where each site lies, and on what evidence."""
+    rows = tuple(_place_row(row) for row in store.sites)
+    head = ("Site", "Region", "Position, LPS (mm)", "Axis into the limb", "Off the skin (mm)", "Marker")
+    return Table("places", "Indentation sites in patient coordinates (LPS).", head, rows)
+
+
+def _place_row(row: Json) -> Row:
+    marker = row.get("marker")
+    evidence = "position given in the study"
+    if marker:
+        evidence = (
+            f"{fixed(marker.get('height_mm'))} mm high, "
+            f"{fixed(marker.get('distance_to_hint_mm'))} mm from the hint"
+        )
+    axis = ", ".join(fixed(value, 3) for value in row.get("axis") or ()) or NOTHING
+    cells = (
+        _h(str(row["site"])),
+        Cell(str(row.get("region") or NOTHING)),
+        _n(vector(row.get("position_mm"))),
+        _n(axis),
+        _n(fixed(row.get("off_skin_mm"), 2)),
+        Cell(evidence),
+    )
+    return Row(cells, bool(row.get("fitted")))
+
+
+def volume_table(store: Store) -> Table | None:
+    """Volumes from the label map and inside the surfaces."""
+    labels = store.segment.get("volumes_cm3") or {}
+    closed = store.surfaces.get("volumes_cm3") or {}
+    names = list(dict.fromkeys([*labels, *closed]))
+    if not names:
+        return None
+    rows = tuple(
+        Row((_h(str(name)), _n(fixed(labels.get(name))), _n(fixed(closed.get(name))))) for name in names
+    )
+    head = ("Structure", "Label map (cm³)", "Inside the surface (cm³)")
+    return Table("volumes", "Volumes of the segmented structures and of the smooth surfaces.", head, rows)
+
+
+def mesh_table(store: Store) -> Table:
+    """Size and quality of every site's mesh, and what the bone policy trimmed."""
+    head = (
+        "Site",
+        "Element",
+        "Nodes",
+        "Elements",
+        "Smallest dihedral (°)",
+        "Layer (mm)",
+        "Bone trimmed (mm³)",
+        "Time",
+    )
+    rows = tuple(_mesh_row(site, facts, site in store.fitted) for site, facts in store.mesh.items())
+    caption = "Meshes. The layer is the mean ± standard deviation of the skin–adipose thickness."
+    return Table("meshes", caption, head, rows)
+
+
+def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
+    trimmed = facts.get("trimmed_bone_mm3") or {}
+    total = sum(trimmed.values()) if isinstance(trimmed, Mapping) else trimmed
+    layer = f"{fixed(facts.get('layer_mean_mm'), 2)} ± {fixed(facts.get('layer_sd_mm'), 2)}"
+    cells = (
+        _h(site),
+        Cell(str(facts.get("element", NOTHING))),
+        _n(_count(facts.get("nodes"))),
+        _n(_count(facts.get("cells"))),
+        _n(fixed(facts.get("min_dihedral_deg"))),
+        _n(layer),
+        _n(fixed(total, 0)),
+        _n(duration(facts.get("seconds"))),
+    )
+    return Row(cells, marked)
+
+
+def _count(value: Any) -> str:
+    return f"{value:,}".replace(",", " ") if isinstance(value, int) else NOTHING
+
+
+def solver_table(store: Store) -> Table:
+    """How each prediction went: steps, penetration, and the reason where one stopped early."""
+    rows = tuple(
+        Row(
+            (
+                _h(str(row["site"])),
+                Cell(str(row.get("element", NOTHING))),
+                _n(_count(row.get("steps"))),
+                _n(fixed(row.get("penetration_mm"), 3)),
+                Cell("yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"),
+            ),
+            bool(row.get("fitted")),
+        )
+        for row in store.predicted
+    )
+    head = ("Site", "Element", "Steps", "Largest penetration (mm)", "Completed")
+    return Table("solver", "The simulation of each site with the identified parameters.", head, rows)
+
+
+def iteration_table(stage: Json) -> Table:
+    """Every accepted iterate of one identification stage."""
+    iterations = stage.get("iterations") or []
+    tissues = TISSUES if stage.get("name") != "one material" else TISSUES[:1]
+    columns = [(tissue, name) for tissue in tissues for name in PARAMETERS]
+    heads = [
+        f"{tissue + ' ' if len(tissues) > 1 else ''}{SYMBOLS[name]}{_unit(name)}" for tissue, name in columns
+    ]
+    rows = tuple(
+        Row(
+            (
+                _h(str(step.get("iteration"))),
+                _n(number(step.get("cost"), 4)),
+                _n(fixed(step.get("error_percent"), 2)),
+                *(_n(number(step.get("parameters", {}).get(t, {}).get(name))) for t, name in columns),
+            )
+        )
+        for step in iterations
+    )
+    name = str(stage.get("name"))
+    return Table(
+        name=f"iterations-{name.replace(' ', '-')}",
+        caption=f"Iterations of the stage “{name}”.",
+        head=("Iteration", "Objective", "Error (%)", *heads),
+        rows=rows,
+        folded=True,
+    )
+
+
+def _unit(name: str) -> str:
+    return f" ({UNITS[name]})" if UNITS[name] != NOTHING else ""
+
+
+def timing_table(store: Store) -> Table:
+    """How long each stage took, with bars."""
+    seconds = {name: facts.get("seconds") for name, facts in (store.run.get("stages") or {}).items()}
+    known = {name: value for name, value in seconds.items() if isinstance(value, int | float)}
+    longest = max([*known.values(), 1e-9])
+    finished = {name: str(facts.get("finished", NOTHING)) for name, facts in store.run["stages"].items()}
+    rows = tuple(
+        Row((_h(name), _n(duration(value), share=value / longest), Cell(finished[name])))
+        for name, value in known.items()
+    )
+    total = Row((_h("Total"), _n(duration(sum(known.values()))), Cell("")))
+    caption = "How long each stage took."
+    return Table("timing", caption, ("Stage", "Time", "Finished"), rows, (total,))
+
+
+def pair_table(name: str, caption: str, head: tuple[str, str], pairs: Mapping[str, Any]) -> Table:
+    """Two columns: a key and its value; long ones are folded away on the screen."""
+    rows = tuple(Row((_h(str(key)), Cell(str(value)))) for key, value in pairs.items())
+    return Table(name, caption, head, rows, folded=len(rows) > 12)
+
+
+def flatten(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested tables as ``table.key`` pairs; the entries of a list of sites go by the site's name."""
+    if isinstance(settings, Mapping):
+        items: Iterable[tuple[Any, Any]] = settings.items()
+    elif isinstance(settings, list) and settings and all(isinstance(one, Mapping) for one in settings):
+        items = ((one.get("name", i), one) for i, one in enumerate(settings))
+    else:
+        return {prefix: _plain(settings)}
+    flat: dict[str, Any] = {}
+    for key, value in items:
+        flat |= flatten(value, f"{prefix}.{key}" if prefix else str(key))
+    return flat
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return NOTHING
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(str(one) for one in value) if isinstance(value, list) else str(value)
