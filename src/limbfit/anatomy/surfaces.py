@@ -1,0 +1,315 @@
+"""The limb as closed surfaces: skin with a flat proximal cap, and bones.
+
+Bones that reach the proximal cut stick out of the skin's cap by a few millimetres, so that the void they
+leave in the soft tissue is open there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import igl
+import numpy as np
+import pyvista as pv
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import LabelError, SurfaceError
+from .extraction import extract_surface, remesh
+from .grid import Grid, LabelMap
+from .triangles import (
+    Surface,
+    bodies,
+    check_closed,
+    from_pyvista,
+    read_surface,
+    self_intersections,
+    write_surface,
+)
+
+__all__ = [
+    "Anatomy",
+    "Surface",
+    "bodies",
+    "build_anatomy",
+    "check_anatomy",
+    "check_closed",
+    "extract_surface",
+    "load_anatomy",
+    "read_surface",
+    "save_anatomy",
+    "self_intersections",
+    "write_surface",
+]
+
+Array = NDArray[np.float64]
+
+_CUT_INSIDE_MM = 2.0  # of the image's proximal end
+_STICK_OUT_MM = 6.0  # of the bones beyond the cut
+_SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
+_STUMP_MM3 = 200.0  # what is left of a bone distal of the cut, below which it is dropped
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Closed surfaces of a limb, LPS mm.
+
+    Attributes
+    ----------
+    skin : closed, flat where the limb was cut proximally.
+    bones : closed, by name; they may stick out of the skin beyond the cut plane, nowhere else.
+    cut_point, cut_normal : (3,) the plane of the proximal cut; the unit normal points out, proximally.
+    """
+
+    skin: Surface
+    bones: Mapping[str, Surface]
+    cut_point: Array
+    cut_normal: Array
+
+    def __post_init__(self) -> None:
+        normal = np.asarray(self.cut_normal, dtype=float)
+        object.__setattr__(self, "cut_normal", normal / np.linalg.norm(normal))
+        object.__setattr__(self, "cut_point", np.asarray(self.cut_point, dtype=float))
+
+    def height(self, points: ArrayLike) -> Array:
+        """(...) distance of points beyond the cut plane, mm; negative inside the limb."""
+        return (np.asarray(points, dtype=float) - self.cut_point) @ self.cut_normal
+
+
+def build_anatomy(
+    labels: LabelMap,
+    edge_mm: float = 3.0,
+    proximal_cut: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Anatomy:
+    """Smooth closed surfaces of a label map.
+
+    Parameters
+    ----------
+    labels : the limb and its bones; the limb ends at one border of the image or within it.
+    edge_mm : edge length of the triangles.
+    proximal_cut : point and proximal normal (LPS mm) of the cut; by default 2 mm inside the limb's proximal
+        end, across the image axis along which it is longest.
+
+    Raises
+    ------
+    LabelError
+        For a map without a limb, or a limb that the image's side cuts off.
+    SurfaceError
+        For a cut that misses the limb.
+    """
+    end = _proximal_end(labels)
+    point, normal = end.plane(labels) if proximal_cut is None else _plane(*proximal_cut)
+    extended = end.extended(labels, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
+    _check_sides(labels, end, point, normal)
+    skin = _capped(extract_surface(extended, None, edge_mm), point, normal, edge_mm, "the limb")
+    reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
+    bones = {}
+    for name in labels.bone_names:
+        if _distal_volume(labels, name, point, normal) >= _STUMP_MM3:
+            bones[name] = extract_surface(reach, name, edge_mm)
+    return Anatomy(skin, bones, point, normal)
+
+
+@dataclass(frozen=True)
+class _End:
+    """One end of the limb in the image: grid axis (0, 1, 2 for i, j, k), side (-1 or 1), last full layer."""
+
+    axis: int
+    side: int
+    layer: int
+
+    def plane(self, labels: LabelMap) -> tuple[Array, Array]:
+        """The default cut: a little inside the outer face of the last layer."""
+        index = (np.array(labels.size) - 1) / 2
+        index[self.axis] = self.layer + self.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[self.axis])
+        return labels.index_to_point(index), self.side * labels.direction[:, self.axis]
+
+    def extended(self, labels: LabelMap, length_mm: float) -> LabelMap:
+        """The map with the layer at the end repeated outward, as if the limb went on."""
+        count = int(np.ceil(length_mm / labels.spacing[self.axis]))
+        kept = _take(labels.array, self.axis, self.side, self.layer)
+        pad = [(0, 0)] * 3
+        pad[2 - self.axis] = (count, 0) if self.side < 0 else (0, count)
+        start = np.zeros(3)
+        start[self.axis] = self.layer - count if self.side < 0 else 0
+        return replace(labels, array=np.pad(kept, pad, mode="edge"), origin=labels.index_to_point(start))
+
+
+def _take(array: NDArray[np.uint8], axis: int, side: int, layer: int) -> NDArray[np.uint8]:
+    """The array up to ``layer`` on that side."""
+    keep = slice(layer, None) if side < 0 else slice(None, layer + 1)
+    return array[tuple(keep if n == 2 - axis else slice(None) for n in range(3))]
+
+
+def _proximal_end(labels: LabelMap) -> _End:
+    """Where the limb was cut: at the border of the image that it fills most, else at its thicker end.
+
+    The limb's axis is the grid axis along which it is longest. Of two ends at the border, the superior one
+    is proximal.
+    """
+    limb = labels.limb
+    if not limb.any():
+        raise LabelError("the label map is empty", remedy="give one with the limb labelled")
+    extents = [_extent(limb, axis) for axis in range(3)]
+    lengths = [(high - low + 1) * labels.spacing[axis] for axis, (low, high) in enumerate(extents)]
+    axis = int(np.argmax(lengths))
+    low, high = extents[axis]
+    ends = [_End(axis, -1, low), _End(axis, 1, high)]
+    border = [end for end in ends if end.layer in (0, labels.size[axis] - 1)]
+    if len(border) == 1:
+        return border[0]
+    if len(border) == 2:
+        return max(border, key=lambda end: end.side * labels.direction[2, axis])
+    return max(ends, key=lambda end: int(_layer(limb, axis, end.layer + 3 * -end.side).sum()))
+
+
+def _extent(limb: NDArray[np.bool_], axis: int) -> tuple[int, int]:
+    others = tuple(n for n in range(3) if n != 2 - axis)
+    filled = np.flatnonzero(limb.any(axis=others))
+    return int(filled[0]), int(filled[-1])
+
+
+def _layer(limb: NDArray[np.bool_], axis: int, index: int) -> NDArray[np.bool_]:
+    return np.take(limb, index, axis=2 - axis)
+
+
+def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+    vector = np.asarray(normal, dtype=float)
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        raise SurfaceError("the normal of the proximal cut is zero", remedy="give a direction")
+    return np.asarray(point, dtype=float), vector / length
+
+
+def _check_sides(labels: LabelMap, end: _End, point: Array, normal: Array) -> None:
+    """Refuse a limb that a side of the image cuts off distal of the cut."""
+    limb = labels.limb & (_heights(labels, point, normal) < 0)
+    for axis in range(3):
+        if axis == end.axis:
+            continue
+        for layer in (0, labels.size[axis] - 1):
+            if _layer(limb, axis, layer).sum() > 20:
+                raise LabelError(
+                    "the limb runs out of the side of the image",
+                    remedy="take an image that holds the whole limb, or move the proximal cut",
+                )
+
+
+def _heights(grid: Grid, point: Array, normal: Array) -> Array:
+    """(k, j, i) distance of each voxel beyond a plane."""
+    i, j, k = (np.arange(n, dtype=float) for n in grid.size)
+    steps = (grid.direction * grid.spacing).T @ normal
+    start = float((grid.origin - point) @ normal)
+    return start + k[:, None, None] * steps[2] + j[:, None] * steps[1] + i * steps[0]
+
+
+def _within(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
+    """Only what lies distal of a plane."""
+    return labels.with_array(np.where(_heights(labels, point, normal) <= 0, labels.array, 0))
+
+
+def _distal_volume(labels: LabelMap, name: str, point: Array, normal: Array) -> float:
+    inside = labels.mask(name) & (_heights(labels, point, normal) < 0)
+    return float(inside.sum()) * labels.voxel_mm3
+
+
+def _capped(surface: Surface, point: Array, normal: Array, edge_mm: float, name: str) -> Surface:
+    """The part distal of the plane, closed by a flat cap of even triangles."""
+    heights = (surface.points - point) @ normal
+    if heights.min() >= 0 or heights.max() <= 0:
+        raise SurfaceError(f"the proximal cut misses {name}", remedy="move its point into the limb (LPS mm)")
+    cut = surface.to_pyvista().clip_closed_surface(normal=-normal, origin=point, tolerance=1e-6)
+    whole = bodies(_cleaned(from_pyvista(pv.PolyData(cut).triangulate())))[0]
+    even = remesh(whole, edge_mm)
+    return even
+
+
+def _cleaned(surface: Surface) -> Surface:
+    poly = surface.to_pyvista().clean(tolerance=1e-4, absolute=True)
+    return from_pyvista(poly.triangulate())
+
+
+def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> None:
+    """Refuse an anatomy that cannot be meshed.
+
+    Raises
+    ------
+    SurfaceError
+        For a surface that :func:`check_closed` refuses, a bone outside the skin (beyond the cut is allowed),
+        or bones that overlap.
+    """
+    files = files or {}
+    check_closed(anatomy.skin, "skin", files.get("skin"))
+    for name, bone in anatomy.bones.items():
+        check_closed(bone, name, files.get(name))
+        _check_inside(anatomy, name, files.get(name))
+
+
+def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
+    points = anatomy.bones[name].points
+    inner = points[anatomy.height(points) < -_SKIN_TOLERANCE_MM]
+    if len(inner) == 0:
+        raise SurfaceError(
+            f"{name} lies wholly beyond the proximal cut", file=file, remedy="leave it out or move the cut"
+        )
+    distance = signed_distance(anatomy.skin, inner)
+    outside = distance > _SKIN_TOLERANCE_MM
+    if outside.any():
+        raise SurfaceError(
+            f"{name} lies outside the skin: {int(outside.sum())} of its {len(points)} points,"
+            f" by up to {distance.max():.1f} mm",
+            file=file,
+            remedy="check that skin and bone are in the same coordinates (LPS or RAS, mm)",
+        )
+
+
+def signed_distance(surface: Surface, points: ArrayLike) -> Array:
+    """(n,) distance of points to a closed surface, mm, negative inside (fast winding number)."""
+    query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    distance = igl.signed_distance(
+        query, surface.points, surface.faces, sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    )[0]
+    return np.asarray(distance).ravel()
+
+
+def save_anatomy(folder: str | Path, anatomy: Anatomy) -> None:
+    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas) into a folder."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_surface(folder / "skin.stl", anatomy.skin)
+    for name, bone in anatomy.bones.items():
+        write_surface(folder / f"bone-{name}.stl", bone)
+    summary = {
+        "coordinates": "LPS",
+        "unit": "mm",
+        "cut_point": anatomy.cut_point.tolist(),
+        "cut_normal": anatomy.cut_normal.tolist(),
+        "skin": _measures(anatomy.skin),
+        "bones": {name: _measures(bone) for name, bone in anatomy.bones.items()},
+    }
+    (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _measures(surface: Surface) -> dict[str, float | int]:
+    return {
+        "faces": len(surface.faces),
+        "volume_mm3": round(surface.volume, 1),
+        "area_mm2": round(surface.area, 1),
+    }
+
+
+def load_anatomy(folder: str | Path) -> Anatomy:
+    """What :func:`save_anatomy` wrote."""
+    folder = Path(folder)
+    try:
+        summary = json.loads((folder / "surfaces.json").read_text(encoding="utf-8"))
+        names, point, normal = list(summary["bones"]), summary["cut_point"], summary["cut_normal"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise SurfaceError(
+            "surfaces.json is missing or unreadable", file=folder, remedy="run the surfaces stage again"
+        ) from None
+    skin = read_surface(folder / "skin.stl")
+    bones = {name: read_surface(folder / f"bone-{name}.stl") for name in names}
+    return Anatomy(skin, bones, point, normal)
