@@ -1,0 +1,345 @@
+"""The identification: stages of bounded least squares on a simulation that is handed in.
+
+``calibrate`` knows no study, no mesh and no solver. It calls ``simulate(parameters)``, which returns force
+and derivatives per site, and it can be stopped after any accepted iterate and taken up again from its
+``state`` with the same answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CalibrationError
+from .objective import Measured, Objective, Simulate, SiteResponse, check_responses, residuals
+from .parameters import TWO_STAGES, Grouping, Space, Unknowns, search_space
+from .prediction import error_percent
+from .trust_region import FIRST_RADIUS, Point, Step, minimise
+
+Array = NDArray[np.float64]
+
+# Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
+_RESTARTS = (0.0, 0.0, 0.1, 0.25, 0.5)
+_PAPER_CHANGE = 0.01
+_TRIES = 3  # of a simulation that completed before
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How parameters are found.
+
+    ``stopping="paper"`` ends where no parameter or no objective entry changed by more than 0.01, absolute
+    (section 2.3); ``relative_tolerance`` is a relative change of parameters (see ``trust_region.minimise``).
+    ``max_iterations`` counts accepted steps, per stage.
+    """
+
+    objective: Objective = "pointwise"
+    relative_tolerance: float = 1e-3
+    max_iterations: int = 25
+    stopping: Literal["relative", "paper"] = "relative"
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """An accepted point: full parameters, cost, force error in percent per site, evaluations so far."""
+
+    stage: int
+    parameters: tuple[float, ...]
+    cost: float
+    errors_percent: tuple[float, ...]
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """How a stage ended."""
+
+    grouping: Grouping
+    parameters: tuple[float, ...]
+    cost: float
+    iterations: int
+    evaluations: int
+    converged: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class State:
+    """All that is needed to go on: the current stage, its parameters and trust radius, and what went before.
+
+    ``parameters`` are exact: a run taken up again repeats the interrupted one to the last bit.
+    """
+
+    stage: int
+    z: tuple[float, ...]
+    radius: float
+    evaluations: int
+    history: tuple[Iterate, ...] = ()
+    stages: tuple[StageResult, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> State:
+        """The state of :meth:`to_dict`, also after a trip through JSON."""
+        return cls(
+            stage=int(content["stage"]),
+            z=tuple(content["z"]),
+            radius=float(content["radius"]),
+            evaluations=int(content["evaluations"]),
+            history=tuple(_iterate(entry) for entry in content["history"]),
+            stages=tuple(_stage_result(entry) for entry in content["stages"]),
+        )
+
+
+def _iterate(entry: dict[str, Any]) -> Iterate:
+    tuples = {key: tuple(entry[key]) for key in ("parameters", "errors_percent")}
+    return Iterate(**{**entry, **tuples})
+
+
+def _stage_result(entry: dict[str, Any]) -> StageResult:
+    tuples = {key: tuple(entry[key]) for key in ("grouping", "parameters")}
+    return StageResult(**{**entry, **tuples})
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The answer: ``parameters`` (p,) by ``names``, each stage, every accepted iterate, and the final
+    responses.
+
+    ``responses`` (force and derivatives per site at the answer) are what ``uncertainty`` works on.
+    """
+
+    names: tuple[str, ...]
+    sites: tuple[str, ...]
+    parameters: Array
+    stages: tuple[StageResult, ...]
+    history: tuple[Iterate, ...]
+    evaluations: int
+    settings: CalibrationSettings
+    responses: tuple[SiteResponse, ...] = field(repr=False)
+
+    @property
+    def converged(self) -> bool:
+        return all(stage.converged for stage in self.stages)
+
+    @property
+    def reason(self) -> str:
+        return self.stages[-1].reason
+
+    @property
+    def cost(self) -> float:
+        return self.stages[-1].cost
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like values, without the responses."""
+        return {
+            "parameters": dict(zip(self.names, self.parameters.tolist())),
+            "errors_percent": dict(zip(self.sites, self.history[-1].errors_percent)),
+            "cost": self.cost,
+            "converged": self.converged,
+            "reason": self.reason,
+            "evaluations": self.evaluations,
+            "settings": asdict(self.settings),
+            "stages": [asdict(stage) for stage in self.stages],
+            "history": [asdict(iterate) for iterate in self.history],
+        }
+
+
+def calibrate(
+    simulate: Simulate,
+    measured: Sequence[Measured],
+    unknowns: Unknowns,
+    settings: CalibrationSettings | None = None,
+    *,
+    stages: Sequence[Grouping] = TWO_STAGES,
+    on_iterate: Callable[[State], None] | None = None,
+    state: State | None = None,
+) -> Calibration:
+    """Find the parameters that bring the simulated forces closest to the measured ones.
+
+    Parameters
+    ----------
+    simulate : from full parameters (p,) to one response per site, in the order of ``measured``. A response
+    that
+        is not completed, or not finite, makes the trial step fail: a shorter one is tried.
+    measured : the records, at the times at which ``simulate`` gives the force.
+    unknowns : names, start and bounds of the full parameters.
+    stages : groupings (see ``search_space``), each started from the end of the one before.
+    on_iterate : called after every accepted iterate with the state to be kept.
+    state : go on from here; one evaluation at its parameters is repeated and not counted.
+
+    Raises
+    ------
+    CalibrationError
+        Where no first simulation completes.
+    """
+    run = _Run(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), tuple(stages))
+    point = None
+    if state is None:
+        state, point = run.first()
+        if on_iterate:
+            on_iterate(state)
+    for state, point in run.go_on(state, point):
+        if on_iterate:
+            on_iterate(state)
+    return run.result(state)
+
+
+class _Run:
+    """One calibration under way: counts evaluations and keeps the responses of the last accepted point."""
+
+    def __init__(
+        self,
+        simulate: Simulate,
+        measured: tuple[Measured, ...],
+        unknowns: Unknowns,
+        settings: CalibrationSettings,
+        stages: tuple[Grouping, ...],
+    ) -> None:
+        self.simulate, self.measured, self.unknowns = simulate, measured, unknowns
+        self.settings, self.stages = settings, stages
+        self.evaluations = 0
+        self.failure = ""
+        self._responses: dict[bytes, tuple[SiteResponse, ...]] = {}
+
+    def space(self, stage: int) -> Space:
+        return search_space(self.unknowns, self.stages[stage])
+
+    def evaluate(self, space: Space, z: Array) -> Point | None:
+        """The point at z, simulated unless its responses are at hand; None where a simulation failed."""
+        parameters = space.expand(z)
+        responses = self._responses.get(parameters.tobytes())
+        if responses is None:
+            self.evaluations += 1
+            responses = tuple(self.simulate(parameters))
+            self.failure = check_responses(responses, self.measured, len(parameters))
+            if self.failure:
+                return None
+            self._responses[parameters.tobytes()] = responses
+        residual, jacobian = residuals(self.settings.objective, responses, self.measured)
+        return Point(z, residual, space.pull_back(jacobian, parameters))
+
+    def responses(self, parameters: Array) -> tuple[SiteResponse, ...]:
+        return self._responses[parameters.tobytes()]
+
+    def keep_only(self, parameters: Array) -> None:
+        self._responses = {parameters.tobytes(): self.responses(parameters)}
+
+    def first(self) -> tuple[State, Point]:
+        """The start, or a place between it and the middle of the bounds where all simulations complete."""
+        space = self.space(0)
+        start, middle = space.reduce(np.log(self.unknowns.start)), (space.lower + space.upper) / 2
+        for share in _RESTARTS:
+            z = start + share * (middle - start)
+            point = self.evaluate(space, z)
+            if point is not None:
+                state = State(0, tuple(z.tolist()), FIRST_RADIUS, self.evaluations)
+                return replace(state, history=(self.iterate(0, point),)), point
+        raise CalibrationError(f"no simulation completes near the start parameters: {self.failure}")
+
+    def iterate(self, stage: int, point: Point) -> Iterate:
+        parameters = self.space(stage).expand(point.z)
+        errors = tuple(
+            error_percent(response.force_N, site.force_N)
+            for response, site in zip(self.responses(parameters), self.measured)
+        )
+        return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations)
+
+    def go_on(self, state: State, point: Point | None) -> Iterator[tuple[State, Point]]:
+        """Yield a state for every accepted step and every finished stage."""
+        if point is None:
+            point = self._again(state)
+        while True:
+            space = self.space(state.stage)
+            steps = () if len(state.stages) > state.stage else self._steps(space, point, state)
+            for step in steps:
+                point = step.point
+                self.keep_only(space.expand(point.z))
+                state = self._after(state, step)
+                yield state, point
+            if len(state.stages) == len(self.stages):
+                return
+            state, point = self._next_stage(state, space.logarithms(point.z))
+            yield state, point
+
+    def _again(self, state: State) -> Point:
+        """The point at which a run was interrupted; its evaluation was counted then."""
+        space = self.space(state.stage)
+        for _ in range(_TRIES):
+            point = self.evaluate(space, np.array(state.z))
+            self.evaluations = state.evaluations
+            if point is not None:
+                return point
+        raise CalibrationError(f"the simulation of the stored iterate fails now: {self.failure}")
+
+    def _steps(self, space: Space, point: Point, state: State) -> Iterator[Step]:
+        done = sum(1 for iterate in state.history if iterate.stage == state.stage) - 1
+        return minimise(
+            lambda z: self.evaluate(space, z),
+            point,
+            space.lower,
+            space.upper,
+            tolerance=self.settings.relative_tolerance,
+            radius=state.radius,
+            max_iterations=max(self.settings.max_iterations - done, 1),
+            stop=self._paper_rule(space) if self.settings.stopping == "paper" else None,
+        )
+
+    def _after(self, state: State, step: Step) -> State:
+        """The state after an accepted step, the stage closed where it was the last."""
+        history = state.history
+        if tuple(step.point.z.tolist()) != state.z:
+            history = (*history, self.iterate(state.stage, step.point))
+        stages = state.stages
+        if step.reason:
+            mine = [iterate for iterate in history if iterate.stage == state.stage]
+            counted = self.evaluations - sum(stage.evaluations for stage in stages)
+            stages = (*stages, self._stage_result(state.stage, mine, counted, step))
+        return State(
+            state.stage, tuple(step.point.z.tolist()), step.radius, self.evaluations, history, stages
+        )
+
+    def _stage_result(self, stage: int, mine: list[Iterate], counted: int, step: Step) -> StageResult:
+        last = mine[-1]
+        reason = step.reason if step.converged or not self.failure else f"{step.reason} ({self.failure})"
+        return StageResult(
+            self.stages[stage], last.parameters, last.cost, len(mine) - 1, counted, step.converged, reason
+        )
+
+    def _next_stage(self, state: State, logarithms: Array) -> tuple[State, Point]:
+        """The same parameters in the next stage's space: nothing is simulated unless its bounds forbid
+        them.""" stage = state.stage + 1 space = self.space(stage) z = space.reduce(logarithms) point =
+        self.evaluate(space, z)
+        if point is None:
+            raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
+        history = (*state.history, self.iterate(stage, point))
+        return State(stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages), point
+
+    def _paper_rule(self, space: Space) -> Callable[[Point, Point], str]:
+        def stop(before: Point, after: Point) -> str:
+            if np.abs(space.expand(after.z) - space.expand(before.z)).max() < _PAPER_CHANGE:
+                return "no parameter changed by more than 0.01"
+            if np.abs(after.residual - before.residual).max() < _PAPER_CHANGE:
+                return "no entry of the objective changed by more than 0.01"
+            return ""
+
+        return stop
+
+    def result(self, state: State) -> Calibration:
+        parameters = np.array(state.history[-1].parameters)
+        return Calibration(
+            names=self.unknowns.names,
+            sites=tuple(site.name for site in self.measured),
+            parameters=parameters,
+            stages=state.stages,
+            history=state.history,
+            evaluations=state.evaluations,
+            settings=self.settings,
+            responses=self.responses(parameters),
+        )

@@ -1,0 +1,142 @@
+"""Bounded nonlinear least squares for dear functions whose evaluations may fail.
+
+Each step solves the linearised problem exactly inside a box, the intersection of the bounds with a trust
+region, so the iterates never leave the bounds. A trial that fails, or does not lower the cost, shrinks the
+region and costs one evaluation; nothing else remembers it. The iteration's whole state is (point, radius).
+Textbook: Nocedal and Wright, Numerical Optimization, chapters 4 and 10; Moré 1978 for the gain ratio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+Array = NDArray[np.float64]
+
+FIRST_RADIUS = 1.0
+_LARGEST_RADIUS = 2.0
+_MAX_REJECTED = 12
+# Directions that the data hardly see are not followed: relative to the residual, in units of z.
+_DAMPING = 1e-2
+_EXACT = 1e-9  # a residual this small (relative force) is a perfect fit
+
+
+@dataclass(frozen=True)
+class Point:
+    """An evaluated point: z (k,), residual (N,), jacobian (N, k)."""
+
+    z: Array
+    residual: Array
+    jacobian: Array
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares."""
+        return 0.5 * float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True)
+class Step:
+    """An accepted point and the radius to go on with; ``reason`` is set on the last, with ``converged``."""
+
+    point: Point
+    radius: float
+    reason: str = ""
+    converged: bool = False
+
+
+Evaluate = Callable[[Array], "Point | None"]
+Stop = Callable[[Point, Point], str]
+
+
+def minimise(
+    evaluate: Evaluate,
+    point: Point,
+    lower: Array,
+    upper: Array,
+    *,
+    tolerance: float = 1e-3,
+    radius: float = FIRST_RADIUS,
+    max_iterations: int = 25,
+    stop: Stop | None = None,
+) -> Iterator[Step]:
+    """Yield the accepted points from ``point`` on; the last one carries the reason for the end.
+
+    Parameters
+    ----------
+    evaluate : the point at z, or None where it cannot be evaluated.
+    tolerance : ends where a full Gauss-Newton step would change no entry of z by more than this, or would
+    lower
+        the cost by less than a tenth of this fraction.
+    radius : half the width of the trust region, in z.
+    stop : a further rule: from the last two points to a reason, empty to go on.
+    """
+    rejected = accepted = 0
+    while True:
+        reason = _converged(point, lower, upper, tolerance)
+        if reason:
+            yield Step(point, radius, reason, converged=True)
+            return
+        step = _bounded_step(point, np.maximum(lower - point.z, -radius), np.minimum(upper - point.z, radius))
+        trial = evaluate(np.clip(point.z + step, lower, upper))
+        gain = _gain(point, trial, step)
+        length = float(np.abs(step).max())
+        radius = _next_radius(radius, length, gain)
+        if trial is None or gain <= 1e-4:
+            rejected += 1
+            if rejected >= _MAX_REJECTED or radius < 1e-3 * tolerance:
+                why = "the simulations fail" if trial is None else "no smaller step lowers the error"
+                yield Step(point, radius, f"stuck: {why} around this point")
+                return
+            continue
+        previous, point, rejected, accepted = point, trial, 0, accepted + 1
+        reason = stop(previous, point) if stop else ""
+        if reason or accepted >= max_iterations:
+            yield Step(point, radius, reason or "the limit of iterations is reached", bool(reason))
+            return
+        yield Step(point, radius)
+
+
+def _bounded_step(point: Point, lower: Array, upper: Array) -> Array:
+    """The least-squares step inside a box, damped where the data are blind."""
+    size = len(point.z)
+    damping = _DAMPING * np.linalg.norm(point.residual) + 1e-14
+    rows = np.vstack([point.jacobian, damping * np.eye(size)])
+    target = np.r_[-point.residual, np.zeros(size)]
+    return lsq_linear(rows, target, bounds=(lower, upper), method="bvls").x
+
+
+def _predicted(point: Point, step: Array) -> float:
+    """The decrease of cost that the linearisation promises."""
+    after = point.residual + point.jacobian @ step
+    return point.cost - 0.5 * float(after @ after)
+
+
+def _gain(point: Point, trial: Point | None, step: Array) -> float:
+    """Actual over predicted decrease; minus infinity where there is no trial."""
+    if trial is None:
+        return -np.inf
+    return (point.cost - trial.cost) / max(_predicted(point, step), 1e-300)
+
+
+def _next_radius(radius: float, length: float, gain: float) -> float:
+    if gain < 0.25:
+        return 0.35 * length
+    if gain > 0.75 and length > 0.95 * radius:
+        return min(2 * radius, _LARGEST_RADIUS)
+    return radius
+
+
+def _converged(point: Point, lower: Array, upper: Array, tolerance: float) -> str:
+    if float(np.linalg.norm(point.residual)) < _EXACT:
+        return "the fit is exact"
+    step = _bounded_step(point, lower - point.z, upper - point.z)
+    if np.abs(step).max() < tolerance:
+        return f"no parameter would change by more than {tolerance:g} of itself"
+    if _predicted(point, step) < 0.1 * tolerance * point.cost:
+        return f"the squared error would fall by less than {0.1 * tolerance:g} of itself"
+    return ""
