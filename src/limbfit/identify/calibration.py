@@ -313,9 +313,11 @@ class _Run:
         )
 
     def _next_stage(self, state: State, logarithms: Array) -> tuple[State, Point]:
-        """The same parameters in the next stage's space: nothing is simulated unless its bounds forbid
-        them.""" stage = state.stage + 1 space = self.space(stage) z = space.reduce(logarithms) point =
-        self.evaluate(space, z)
+        """The same parameters in the next space; nothing is simulated unless its bounds forbid them."""
+        stage = state.stage + 1
+        space = self.space(stage)
+        z = space.reduce(logarithms)
+        point = self.evaluate(space, z)
         if point is None:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
         history = (*state.history, self.iterate(stage, point))
