@@ -1,0 +1,117 @@
+"""Frictionless rigid contact by a penalty energy over the reference skin.
+
+``E = eps/2 int <-phi(x)>^2 dA_0`` with the indenter's signed distance ``phi``: one potential, hence a
+symmetric tangent, and a reaction that is its derivative with respect to the indenter's advance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .assembly import scatter_upper
+from .elements import Element, face_quadrature
+from .indenter import Indenter, signed_distance
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ContactSurface:
+    """Faces (f, k) that may touch: shape values (q, k), reference areas (f, q), rest points (n, 3)."""
+
+    faces: NDArray[np.int64]
+    N: Array
+    areas: Array
+    points: Array
+
+    @classmethod
+    def build(cls, element: Element, points: Array, faces: NDArray[np.int64]) -> ContactSurface:
+        N, areas = face_quadrature(element, points, faces)
+        return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
+
+    def gaps(self, indenter: Indenter, u: Array | None = None) -> Array:
+        """Signed distances (f, q) at the quadrature points, mm."""
+        x = self.points if u is None else self.points + u
+        at = np.einsum("qk,fki->fqi", self.N, x[self.faces])
+        return indenter.signed_distance(at.reshape(-1, 3)).reshape(self.areas.shape)
+
+
+def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: float = 1e-9) -> float:
+    """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface."""
+    at = np.einsum("qk,fki->fqi", surface.N, surface.points[surface.faces]).reshape(-1, 3)
+    along = (at - np.asarray(indenter.centre)) @ indenter.frame[2]
+    span = np.ptp(along) + 2.0 * indenter.width
+    low, high = along.min() - span, along.max() + span
+    while high - low > tolerance:  # the gap of a body without far end only shrinks as it advances
+        middle = 0.5 * (low + high)
+        if indenter.moved(middle).signed_distance(at).min() > 0.0:
+            low = middle
+        else:
+            high = middle
+    return float(low)
+
+
+@njit(cache=True)
+def contact(faces, N, areas, X, u, centre, frame, kernel, penalty, tangent, positions, residual, data, advance):  # type: ignore[no-untyped-def]
+    """Add the contact energy's gradient to ``residual`` and its hessian to ``data``.
+
+    ``advance (n, 3)`` receives the mixed derivative with respect to displacement and indenter advance
+    (times -1 it is the derivative of the residual).  Returns energy, reaction along the axis (N), largest
+    penetration (mm), reference area in touch (mm^2).
+    """
+    shape, half, radius = kernel
+    k = faces.shape[1]
+    Ke = np.empty((3 * k, 3 * k))
+    x, local, gl, g = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    hl, h = np.empty((3, 3)), np.empty((3, 3))
+    energy = force = deepest = area = 0.0
+    reach = 1.8 * half
+    for f in range(faces.shape[0]):
+        Ke[:] = 0.0
+        touched = False
+        for q in range(N.shape[0]):
+            x[:] = -centre
+            for a in range(k):
+                for i in range(3):
+                    x[i] += N[q, a] * (X[faces[f, a], i] + u[faces[f, a], i])
+            for i in range(3):
+                local[i] = frame[i, 0] * x[0] + frame[i, 1] * x[1] + frame[i, 2] * x[2]
+            if local[2] > 0.0 or abs(local[0]) > reach or abs(local[1]) > reach:
+                continue
+            phi = signed_distance(shape, half, radius, local, gl, hl)
+            if phi >= 0.0:
+                continue
+            touched = True
+            w = penalty * areas[f, q]
+            energy += 0.5 * w * phi * phi
+            force -= w * phi * gl[2]
+            deepest = max(deepest, -phi)
+            area += areas[f, q]
+            for i in range(3):
+                g[i] = frame[0, i] * gl[0] + frame[1, i] * gl[1] + frame[2, i] * gl[2]
+            for a in range(k):
+                for i in range(3):
+                    residual[faces[f, a], i] += w * phi * N[q, a] * g[i]
+            if not tangent:
+                continue
+            for i in range(3):
+                for j in range(3):
+                    value = 0.0
+                    for p in range(3):
+                        for r in range(3):
+                            value += frame[p, i] * hl[p, r] * frame[r, j]
+                    h[i, j] = w * (g[i] * g[j] + phi * value)
+            for a in range(k):
+                for i in range(3):
+                    along = h[i, 0] * frame[2, 0] + h[i, 1] * frame[2, 1] + h[i, 2] * frame[2, 2]
+                    advance[faces[f, a], i] += N[q, a] * along
+                    for j in range(3):
+                        for b in range(k):
+                            Ke[i * k + a, j * k + b] += h[i, j] * N[q, a] * N[q, b]
+        if tangent and touched:
+            scatter_upper(Ke, positions[f], data)
+    return energy, force, deepest, area

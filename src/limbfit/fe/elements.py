@@ -1,0 +1,161 @@
+"""The element table: shape functions, quadrature and formulation of every element, as data.
+
+Local coordinates: tetrahedra and triangles on the unit simplex, hexahedra and quadrilaterals on [-1, 1]^d,
+nodes in VTK order.  Adding an element is adding a row to `ELEMENTS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import TET10_EDGES, TRI6_EDGES
+
+Array = NDArray[np.float64]
+Shape = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Element:
+    """A volume element.
+
+    ``shape(x (q, 3))`` gives values (q, k) and derivatives (q, k, 3); ``points``/``weights`` are the
+    quadrature; ``mean_dilatation`` takes one volume ratio and pressure per element (three-field,
+    Simo, Taylor and Pister 1985); ``face_shape``/``face_points``/``face_weights`` belong to its faces.
+    """
+
+    name: str
+    cell_type: str
+    shape: Shape
+    points: Array
+    weights: Array
+    mean_dilatation: bool
+    face_shape: Shape
+    face_points: Array
+    face_weights: Array
+
+
+def _simplex_gradients(d: int) -> Array:
+    return np.vstack([-np.ones(d), np.eye(d)])
+
+
+def _barycentric(x: Array) -> Array:
+    return np.column_stack([1.0 - x.sum(axis=1), x])
+
+
+def linear_simplex(x: Array) -> tuple[Array, Array]:
+    """Linear triangle (d = 2) or tetrahedron (d = 3)."""
+    L = _barycentric(x)
+    return L, np.broadcast_to(_simplex_gradients(x.shape[1]), (*L.shape, x.shape[1])).copy()
+
+
+def quadratic_simplex(x: Array) -> tuple[Array, Array]:
+    """Quadratic triangle (6 nodes) or tetrahedron (10 nodes)."""
+    L, dL = _barycentric(x), _simplex_gradients(x.shape[1])
+    edges = TRI6_EDGES if x.shape[1] == 2 else TET10_EDGES
+    i, j = edges[:, 0], edges[:, 1]
+    values = np.hstack([L * (2.0 * L - 1.0), 4.0 * L[:, i] * L[:, j]])
+    corner = (4.0 * L - 1.0)[:, :, None] * dL[None]
+    middle = 4.0 * (L[:, i, None] * dL[j][None] + L[:, j, None] * dL[i][None])
+    return values, np.concatenate([corner, middle], axis=1)
+
+
+def _tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
+    d = x.shape[1]
+    factors = 0.5 * (1.0 + x[:, None, :] * corners[None])
+    gradients = np.empty((len(x), len(corners), d))
+    for i in range(d):
+        others = np.delete(factors, i, axis=2).prod(axis=2)
+        gradients[:, :, i] = 0.5 * corners[None, :, i] * others
+    return factors.prod(axis=2), gradients
+
+
+QUAD_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
+HEX_CORNERS = np.vstack([np.column_stack([QUAD_CORNERS, np.full(4, z)]) for z in (-1.0, 1.0)])
+
+
+def linear_quadrilateral(x: Array) -> tuple[Array, Array]:
+    """Bilinear quadrilateral, 4 nodes."""
+    return _tensor_linear(x, QUAD_CORNERS)
+
+
+def linear_hexahedron(x: Array) -> tuple[Array, Array]:
+    """Trilinear hexahedron, 8 nodes."""
+    return _tensor_linear(x, HEX_CORNERS)
+
+
+def _orbit(*orbits: tuple[float, float], d: int) -> tuple[Array, Array]:
+    """Quadrature of points (a, b, b, ..) and permutations; each orbit gives a and its relative weight."""
+    points, weights = [], []
+    for a, weight in orbits:
+        b = (1.0 - a) / d
+        for i in range(d + 1):
+            L = np.full(d + 1, b)
+            L[i] = a
+            points.append(L[1:])
+            weights.append(weight)
+    return np.array(points), np.array(weights) / (2.0 if d == 2 else 6.0)
+
+
+def _gauss(d: int, n: int) -> tuple[Array, Array]:
+    x, w = np.polynomial.legendre.leggauss(n)
+    grids = np.meshgrid(*[x] * d, indexing="ij")
+    weights = np.meshgrid(*[w] * d, indexing="ij")
+    return np.column_stack([g.ravel() for g in grids]), np.prod([g.ravel() for g in weights], axis=0)
+
+
+def _triangle_7() -> tuple[Array, Array]:
+    """Degree 5, seven points (Radon 1948)."""
+    root = np.sqrt(15.0)
+    points, weights = _orbit(
+        (1.0 - 2.0 * (6.0 - root) / 21.0, (155.0 - root) / 1200.0),
+        (1.0 - 2.0 * (6.0 + root) / 21.0, (155.0 + root) / 1200.0),
+        d=2,
+    )
+    return np.vstack([[1 / 3, 1 / 3], points]), np.concatenate([[9.0 / 80.0], weights])
+
+
+_TET_1 = (np.full((1, 3), 0.25), np.array([1.0 / 6.0]))
+_TET_4 = _orbit(((5.0 + 3.0 * np.sqrt(5.0)) / 20.0, 0.25), d=3)
+# Degree 3, eight points: the rule of FEBio's default tet10.
+_TET_8 = _orbit((0.0158359099, 0.138527967), (0.6791431780, 0.111472033), d=3)
+_TRI = _triangle_7()
+_QUAD = _gauss(2, 3)
+_HEX = _gauss(3, 2)
+
+ELEMENTS: dict[str, Element] = {
+    e.name: e
+    for e in (
+        Element("tet4", "tet4", linear_simplex, *_TET_1, False, linear_simplex, *_TRI),
+        Element("tet10", "tet10", quadratic_simplex, *_TET_4, False, quadratic_simplex, *_TRI),
+        Element("tet10g8", "tet10", quadratic_simplex, *_TET_8, False, quadratic_simplex, *_TRI),
+        Element("tet10p0", "tet10", quadratic_simplex, *_TET_4, True, quadratic_simplex, *_TRI),
+        Element("hex8", "hex8", linear_hexahedron, *_HEX, True, linear_quadrilateral, *_QUAD),
+    )
+}
+
+
+def reference_gradients(element: Element, points: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Gradients (m, q, 3, k) of the shape functions in the reference configuration and weights (m, q), mm^3.
+
+    A weight is not positive where the cell is inverted.
+    """
+    _, dN = element.shape(element.points)
+    X = points[cells]
+    jacobian = np.einsum("mki,qkj->mqij", X, dN, optimize=True)
+    weights = np.linalg.det(jacobian) * element.weights
+    with np.errstate(all="ignore"):
+        safe = np.where((np.abs(weights) > 0)[..., None, None], jacobian, np.eye(3))
+    gradients = np.einsum("qkj,mqji->mqik", dN, np.linalg.inv(safe), optimize=True)
+    return np.ascontiguousarray(gradients), weights
+
+
+def face_quadrature(element: Element, points: Array, faces: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Shape values (q, k) and reference areas (f, q), mm^2, at the quadrature points of faces."""
+    N, dN = element.face_shape(element.face_points)
+    tangents = np.einsum("fki,qkj->fqij", points[faces], dN, optimize=True)
+    normal = np.cross(tangents[..., 0], tangents[..., 1])
+    return N, np.linalg.norm(normal, axis=-1) * element.face_weights

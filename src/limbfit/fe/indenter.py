@@ -1,0 +1,161 @@
+"""Rigid indenters as signed distances with gradient and curvature.
+
+The indenter's frame: origin at the middle of its foremost face (``centre``), coordinates ``(x, y, z)`` along
+``edge``, ``axis x edge`` and ``axis``; the body lies at ``z <= 0`` and has no far end (a sphere is the end of
+a round rod).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+
+SHAPES = {"square": 0, "sphere": 1, "cylinder": 2}
+# No mesh resolves the singularity of a sharp edge; this rounding over the width stands for it.
+SHARP_EDGE = 0.01
+
+
+@dataclass(frozen=True)
+class Indenter:
+    """A rigid indenter that moves along ``axis``.
+
+    Parameters
+    ----------
+    shape : ``square`` (prism), ``sphere`` or ``cylinder`` (flat end).
+    width : edge length or diameter, mm, rounding included.
+    edge_radius : rounding of the edges of square and cylinder, mm.  Less than 1 % of the width (also 0, a
+        sharp edge) is taken as 1 % of the width.
+    centre : (3,) the middle of the foremost face, mm.
+    axis : (3,) into the tissue; any length.
+    edge : (3,) direction of one edge of the square; by default the cross product of ``axis`` and z.
+    """
+
+    shape: str = "square"
+    width: float = 20.0
+    edge_radius: float = 0.0
+    centre: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0)
+    axis: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, -1.0)
+    edge: Sequence[float] | NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if self.shape not in SHAPES:
+            raise ProblemError(f"unknown indenter shape {self.shape!r}; use one of {sorted(SHAPES)}")
+        if not (math.isfinite(self.width) and self.width > 0):
+            raise ProblemError(f"indenter width {self.width} mm is not positive")
+        if not 0 <= self.edge_radius <= self.width / 2:
+            raise ProblemError(f"edge radius {self.edge_radius} mm does not fit a width of {self.width} mm")
+        for name in ("centre", "axis"):
+            value = np.asarray(getattr(self, name), dtype=float)
+            if value.shape != (3,) or not np.isfinite(value).all():
+                raise ProblemError(f"indenter {name} is not three finite numbers")
+        if np.linalg.norm(self.axis) < 1e-12:
+            raise ProblemError("indenter axis has no length")
+        if np.linalg.norm(np.cross(self.axis, self._edge_guess())) < 1e-9:
+            raise ProblemError("indenter edge is parallel to its axis")
+
+    def _edge_guess(self) -> NDArray[np.float64]:
+        if self.edge is not None:
+            return np.asarray(self.edge, dtype=float)
+        axis = np.asarray(self.axis, dtype=float)
+        guess = np.cross(axis, [0.0, 0.0, 1.0])
+        small = np.linalg.norm(guess) < 1e-6 * np.linalg.norm(axis)
+        return np.array([1.0, 0.0, 0.0]) if small else guess
+
+    @property
+    def frame(self) -> NDArray[np.float64]:
+        """(3, 3) orthonormal rows: edge, axis x edge, axis."""
+        axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
+        edge = self._edge_guess()
+        edge = edge - (edge @ axis) * axis
+        edge = edge / np.linalg.norm(edge)
+        return np.array([edge, np.cross(axis, edge), axis])
+
+    @property
+    def kernel(self) -> tuple[int, float, float]:
+        """Code, half width and effective edge radius, as the compiled kernels read them."""
+        return SHAPES[self.shape], self.width / 2, max(self.edge_radius, SHARP_EDGE * self.width)
+
+    def moved(self, distance: float) -> Indenter:
+        """The indenter, advanced along its axis by ``distance`` mm."""
+        return replace(self, centre=np.asarray(self.centre, dtype=float) + distance * self.frame[2])
+
+    def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance (n,) of points (n, 3), mm; negative inside."""
+        local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
+        return signed_distances(np.ascontiguousarray(local), *self.kernel)
+
+
+@njit(cache=True)
+def signed_distance(shape, half, radius, x, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Distance of the local point ``x (3,)``; fills its gradient (3,) and hessian (3, 3).
+
+    The prism is a box shrunk by its rounding, grown again (Quilez' rounded box).  Deeper than the rounding
+    the way out is always through the foremost face: a point that a large step left inside must go back to
+    where it came from, not sideways through the nearest wall.
+    """
+    gradient[:] = 0.0
+    hessian[:, :] = 0.0
+    if shape == 1:
+        z = max(x[2] + half, 0.0)
+        r = max(np.sqrt(x[0] * x[0] + x[1] * x[1] + z * z), 1e-300)
+        gradient[0], gradient[1], gradient[2] = x[0] / r, x[1] / r, z / r
+        for i in range(3):
+            for j in range(3):
+                identity = 1.0 if i == j and (i < 2 or z > 0.0) else 0.0
+                hessian[i, j] = (identity - gradient[i] * gradient[j]) / r
+        return r - half
+    inner, z = half - radius, x[2] + radius
+    if shape == 0:
+        p, q = max(abs(x[0]) - inner, 0.0), max(abs(x[1]) - inner, 0.0)
+    else:
+        rho = np.sqrt(x[0] * x[0] + x[1] * x[1])
+        p, q = max(rho - inner, 0.0), 0.0
+    up = max(z, 0.0)
+    r = np.sqrt(p * p + q * q + up * up)
+    if r <= 1e-12 * half:
+        gradient[2] = 1.0
+        return z - radius
+    if shape == 0:
+        gradient[0], gradient[1], gradient[2] = np.sign(x[0]) * p / r, np.sign(x[1]) * q / r, up / r
+        for i in range(3):
+            active = (p if i == 0 else (q if i == 1 else up)) > 0.0
+            for j in range(3):
+                hessian[i, j] = ((1.0 if i == j and active else 0.0) - gradient[i] * gradient[j]) / r
+        return r - radius
+    _cylinder(x, p, up, r, gradient, hessian)
+    return r - radius
+
+
+@njit(cache=True)
+def _cylinder(x, p, up, r, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Chain rule from the half plane (rho, z) to space."""
+    gradient[2] = up / r
+    if p > 0.0:
+        rho = np.sqrt(x[0] * x[0] + x[1] * x[1])
+        c, s = x[0] / rho, x[1] / rho
+        gradient[0], gradient[1] = c * p / r, s * p / r
+        hessian[0, 0] = c * c / r + s * s / rho * p / r
+        hessian[1, 1] = s * s / r + c * c / rho * p / r
+        hessian[0, 1] = c * s / r - c * s / rho * p / r
+        hessian[1, 0] = hessian[0, 1]
+    if up > 0.0:
+        hessian[2, 2] = 1.0 / r
+    for i in range(3):
+        for j in range(3):
+            hessian[i, j] -= gradient[i] * gradient[j] / r
+
+
+@njit(cache=True)
+def signed_distances(local, shape, half, radius):  # type: ignore[no-untyped-def]
+    """`signed_distance` of many local points (n, 3), without derivatives."""
+    out, gradient, hessian = np.empty(len(local)), np.empty(3), np.empty((3, 3))
+    for i in range(len(local)):
+        out[i] = signed_distance(shape, half, radius, local[i], gradient, hessian)
+    return out

@@ -1,0 +1,202 @@
+"""Sparse symmetric linear systems behind one interface: PARDISO, CHOLMOD or SuperLU.
+
+A matrix is the upper triangle in CSR form (``indptr, indices`` sorted, diagonal first in each row).  A
+factorisation is Cholesky where the library offers it, so that a matrix that is not positive definite is
+noticed: `NotPositiveDefiniteError`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib
+import weakref
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+
+class NotPositiveDefiniteError(ArithmeticError):
+    """The matrix has no Cholesky factor."""
+
+
+class LinearSolver(Protocol):
+    """Analyse once, factorise often, solve oftener."""
+
+    name: str
+
+    def factorise(self, data: Array) -> None:
+        """Factorise the matrix with these entries; raises `NotPositiveDefiniteError`."""
+
+    def solve(self, b: Array) -> Array:
+        """Solution (n,) or (n, r) for right-hand sides of that shape."""
+
+
+class Pardiso:
+    """Cholesky by Intel MKL's PARDISO, one thread (sites run side by side, one process each)."""
+
+    name = "pardiso"
+
+    def __init__(self, indptr: Index, indices: Index) -> None:
+        self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)
+        self._indices = np.ascontiguousarray(indices, dtype=np.int32)
+        self._n = ctypes.c_int32(len(indptr) - 1)
+        self._data = np.empty(0)
+        self._handle = np.zeros(64, dtype=np.int64)
+        self._parameters = np.zeros(64, dtype=np.int32)
+        for position, value in {0: 1, 1: 2, 9: 13, 17: -1, 20: 1, 34: 1}.items():
+            self._parameters[position] = value  # no defaults, METIS, zero-based rows
+        self._mkl = _mkl()
+        self._analysed = False
+        # The factor lives outside Python's memory.
+        self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
+
+    def factorise(self, data: Array) -> None:
+        self._data = np.array(data)
+        phase = 22 if self._analysed else 12
+        code = self._call(phase, np.zeros(1), np.zeros(1), 1)
+        if code == -4:
+            self._analysed = True
+            raise NotPositiveDefiniteError
+        if code:
+            raise MemoryError(f"PARDISO failed with code {code}")
+        self._analysed = True
+
+    def solve(self, b: Array) -> Array:
+        right = np.asfortranarray(b)
+        x = np.zeros_like(right, order="F")
+        code = self._call(33, right, x, 1 if b.ndim == 1 else b.shape[1])
+        if code:
+            raise MemoryError(f"PARDISO failed with code {code}")
+        return x
+
+    def _call(self, phase: int, b: Array, x: Array, count: int) -> int:
+        return _pardiso(
+            self._mkl, self._handle, self._parameters, self._n, phase,
+            self._data, self._indptr, self._indices, b, x, count,
+        )  # fmt: skip
+
+
+@functools.cache
+def _mkl() -> Any:
+    """MKL, found by pypardiso (which searches the disk for it), on one thread."""
+    library = importlib.import_module("pypardiso").PyPardisoSolver().libmkl
+    library.MKL_Set_Num_Threads(1)
+    return library
+
+
+def _pardiso(
+    mkl: Any,
+    handle: NDArray[np.int64],
+    parameters: Index,
+    n: ctypes.c_int32,
+    phase: int,
+    data: Array,
+    indptr: Index,
+    indices: Index,
+    b: Array,
+    x: Array,
+    count: int,
+) -> int:
+    def number(value: int) -> Any:
+        return ctypes.byref(ctypes.c_int32(value))
+
+    def address(array: NDArray) -> ctypes.c_void_p:
+        return ctypes.c_void_p(array.ctypes.data)
+
+    error = ctypes.c_int32(0)
+    positive_definite = 2
+    mkl["pardiso"](
+        address(handle), number(1), number(1), number(positive_definite), number(phase), ctypes.byref(n),
+        address(data), address(indptr), address(indices), address(np.zeros(1, dtype=np.int32)), number(count),
+        address(parameters), number(0), address(b), address(x), ctypes.byref(error),
+    )  # fmt: skip
+    return error.value
+
+
+def _release(mkl: Any, handle: NDArray[np.int64], parameters: Index, n: ctypes.c_int32) -> None:
+    empty, none = np.zeros(1), np.zeros(1, dtype=np.int32)
+    _pardiso(mkl, handle, parameters, n, -1, empty, none, none, empty, empty, 1)
+
+
+class Cholmod:
+    """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
+
+    name = "cholmod"
+
+    def __init__(self, indptr: Index, indices: Index) -> None:
+        self._cholmod = importlib.import_module("sksparse.cholmod")
+        self._pattern = (np.asarray(indices), np.asarray(indptr))
+        self._factor = self._cholmod.analyze(self._lower(np.ones(len(indices))), mode="supernodal")
+
+    def _lower(self, data: Array) -> sp.csc_matrix:
+        n = len(self._pattern[1]) - 1  # the upper triangle's rows are the lower triangle's columns
+        return sp.csc_matrix((data, *self._pattern), shape=(n, n))
+
+    def factorise(self, data: Array) -> None:
+        try:
+            self._factor.cholesky_inplace(self._lower(data))
+        except self._cholmod.CholmodNotPositiveDefiniteError:
+            raise NotPositiveDefiniteError from None
+
+    def solve(self, b: Array) -> Array:
+        return self._factor(b)
+
+
+class SuperLU:
+    """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
+
+    name = "superlu"
+
+    def __init__(self, indptr: Index, indices: Index) -> None:
+        self._pattern = (np.asarray(indices), np.asarray(indptr))
+        self._factor: Any = None
+
+    def factorise(self, data: Array) -> None:
+        n = len(self._pattern[1]) - 1
+        upper = sp.csr_matrix((data, *self._pattern), shape=(n, n))
+        full = (upper + sp.triu(upper, 1).T).tocsc()
+        options = {"SymmetricMode": True, "DiagPivotThresh": 0.001}
+        try:
+            self._factor = spla.splu(full, permc_spec="MMD_AT_PLUS_A", options=options)
+        except RuntimeError:
+            raise NotPositiveDefiniteError from None
+
+    def solve(self, b: Array) -> Array:
+        return self._factor.solve(np.asarray(b))
+
+
+SOLVERS: dict[str, type] = {solver.name: solver for solver in (Pardiso, Cholmod, SuperLU)}
+
+
+def linear_solver(indptr: Index, indices: Index, name: str = "auto") -> LinearSolver:
+    """The named solver of `SOLVERS`, or the first that works on this machine."""
+    for candidate in SOLVERS if name == "auto" else (name,):
+        try:
+            return SOLVERS[candidate](indptr, indices)
+        except (ImportError, OSError, AttributeError):
+            if candidate == name:
+                raise
+    raise ImportError("no sparse solver works here")
+
+
+@njit(cache=True)
+def symmetric_product(indptr, indices, data, x):  # type: ignore[no-untyped-def]
+    """``A x`` (n, r) of a symmetric matrix given by its upper triangle."""
+    y = np.zeros_like(x)
+    for i in range(len(indptr) - 1):
+        for r in range(x.shape[1]):
+            y[i, r] += data[indptr[i]] * x[i, r]
+        for p in range(indptr[i] + 1, indptr[i + 1]):
+            j, a = indices[p], data[p]
+            for r in range(x.shape[1]):
+                y[i, r] += a * x[j, r]
+                y[j, r] += a * x[i, r]
+    return y

@@ -1,0 +1,158 @@
+"""Ogden hyperelasticity in principal logarithmic stretches, and the paper's material.
+
+``W = sum_k c_k/m_k^2 sum_i (exp(m_k e_i) - 1)`` with ``e_i = ln(lambda_i) - ln(J)/3``.  All differences of
+principal values are divided differences of exponentials, so that the tangent is exact where stretches
+repeat.  Neo-Hookean (m = 2) and Mooney-Rivlin (m = 2, -2) are tables of terms of the same law.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...errors import ProblemError
+from .volumetric import VOLUMETRIC_LAWS
+
+
+@dataclass(frozen=True)
+class MaterialTable:
+    """What the kernels know of a material, or a derivative of it.
+
+    ``terms (k, 2)``: Ogden moduli c_k (MPa) and exponents m_k; ``kappa``: bulk modulus (MPa);
+    ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law.
+    """
+
+    terms: NDArray[np.float64]
+    kappa: float
+    prony: NDArray[np.float64]
+    volumetric: int = 0
+
+
+@dataclass(frozen=True)
+class OgdenQLV:
+    """The paper's tissue: symmetric second-order Ogden with one relaxation term.
+
+    ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``.
+
+    Parameters
+    ----------
+    c : long-term shear modulus of small strains, MPa.
+    m : exponent.
+    gamma : relaxation amplitude, dimensionless (0: elastic).
+    tau : relaxation time, s.
+    kappa_ratio : bulk modulus over ``c``; the bulk modulus moves with ``c``.
+    """
+
+    c: float
+    m: float
+    gamma: float
+    tau: float
+    kappa_ratio: float = 100.0
+
+    parameter_names = ("c", "m", "gamma", "tau")
+
+    def __post_init__(self) -> None:
+        for name in ("c", "m", "tau", "kappa_ratio"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ProblemError(f"material parameter {name} = {value} is not positive")
+        if not (math.isfinite(self.gamma) and self.gamma >= 0):
+            raise ProblemError(f"material parameter gamma = {self.gamma} is negative")
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        return self.c, self.m, self.gamma, self.tau
+
+    @property
+    def instantaneous_modulus(self) -> float:
+        """``c (1 + gamma)``, MPa."""
+        return self.c * (1.0 + self.gamma)
+
+    @property
+    def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
+        """Derivative of `instantaneous_modulus` with respect to each parameter."""
+        return 1.0 + self.gamma, 0.0, self.c, 0.0
+
+    def table(self) -> MaterialTable:
+        """The material as the kernels read it."""
+        terms = np.array([[self.c, self.m], [self.c, -self.m]])
+        prony = np.array([[self.gamma, self.tau]])
+        return MaterialTable(terms, self.kappa_ratio * self.c, prony, VOLUMETRIC_LAWS["log"])
+
+    def derivatives(self) -> tuple[MaterialTable, ...]:
+        """Derivative of the table with respect to each parameter."""
+        none, still = np.zeros((2, 2)), np.zeros((1, 2))
+        return (
+            MaterialTable(np.array([[1.0, 0.0], [1.0, 0.0]]), self.kappa_ratio, still),
+            MaterialTable(np.array([[0.0, 1.0], [0.0, -1.0]]), 0.0, still),
+            MaterialTable(none, 0.0, np.array([[1.0, 0.0]])),
+            MaterialTable(none, 0.0, np.array([[0.0, 1.0]])),
+        )
+
+
+@njit(cache=True)
+def sinhc(x: float) -> float:
+    """``sinh(x)/x``, by its series where the quotient is lost."""
+    if abs(x) < 0.1:
+        y = x * x
+        return 1.0 + y / 6.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0 * (1.0 + y / 72.0)))
+    return np.sinh(x) / x
+
+
+@njit(cache=True)
+def ogden(terms, c2, e, beta, slope, quotient):  # type: ignore[no-untyped-def]
+    """Energy and principal derivatives of the deviatoric law at one point.
+
+    Parameters
+    ----------
+    terms : (k, 2) moduli and exponents.
+    c2 : (3,) eigenvalues of C, that is squared stretches.
+    e : (3,) logarithmic isochoric stretches.
+    beta, slope, quotient : (3,) results: deviatoric principal Kirchhoff stresses; ``dw/de`` of the
+        undeviated stresses; ``(beta_i - beta_j)/(c2_i - c2_j)`` for ij = 12, 20, 01.
+
+    Returns the energy density.
+    """
+    energy = 0.0
+    for i in range(3):
+        beta[i] = 0.0
+        slope[i] = 0.0
+        quotient[i] = 0.0
+    for k in range(terms.shape[0]):
+        c, m = terms[k, 0], terms[k, 1]
+        x0, x1, x2 = np.exp(m * e[0]), np.exp(m * e[1]), np.exp(m * e[2])
+        energy += c / (m * m) * (x0 + x1 + x2 - 3.0)
+        beta[0] += c / m * x0
+        beta[1] += c / m * x1
+        beta[2] += c / m * x2
+        slope[0] += c * x0
+        slope[1] += c * x1
+        slope[2] += c * x2
+        quotient[0] += c * np.sqrt(x1 * x2) * sinhc(0.5 * m * (e[1] - e[2]))
+        quotient[1] += c * np.sqrt(x2 * x0) * sinhc(0.5 * m * (e[2] - e[0]))
+        quotient[2] += c * np.sqrt(x0 * x1) * sinhc(0.5 * m * (e[0] - e[1]))
+    mean = (beta[0] + beta[1] + beta[2]) / 3.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        beta[i] -= mean
+        # (c2_j - c2_k) = 2 (e_j - e_k) sqrt(c2_j c2_k) sinhc(e_j - e_k)
+        quotient[i] /= 2.0 * np.sqrt(c2[j] * c2[k]) * sinhc(e[j] - e[k])
+    return energy
+
+
+@njit(cache=True)
+def ogden_derivative(terms, d_terms, e, d_beta):  # type: ignore[no-untyped-def]
+    """Derivative of the deviatoric principal Kirchhoff stresses along ``d_terms`` at fixed stretches."""
+    for i in range(3):
+        d_beta[i] = 0.0
+        for k in range(terms.shape[0]):
+            c, m = terms[k, 0], terms[k, 1]
+            dc, dm = d_terms[k, 0], d_terms[k, 1]
+            d_beta[i] += np.exp(m * e[i]) * (dc / m + dm * c / m * (e[i] - 1.0 / m))
+    mean = (d_beta[0] + d_beta[1] + d_beta[2]) / 3.0
+    for i in range(3):
+        d_beta[i] -= mean

@@ -1,0 +1,174 @@
+"""The mechanical problem, checked before anything is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from ..mesh import Mesh
+from .elements import ELEMENTS, Element, reference_gradients
+from .indenter import Indenter
+from .materials import OgdenQLV
+
+FACE_NODES = {"tet4": 3, "tet10": 6, "hex8": 4}
+
+
+@dataclass(frozen=True)
+class History:
+    """Piecewise linear advance of the indenter: ``times (n,)`` s from 0, ``displacement (n,)`` mm."""
+
+    times: NDArray[np.float64]
+    displacement: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        times, values = np.asarray(self.times, dtype=float), np.asarray(self.displacement, dtype=float)
+        if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
+            raise ProblemError("a displacement history needs two or more times and as many displacements")
+        if not (np.isfinite(times).all() and np.isfinite(values).all()):
+            raise ProblemError("the displacement history holds values that are not finite")
+        if times[0] != 0.0:
+            raise ProblemError(f"the displacement history starts at {times[0]} s, not at 0")
+        if not (np.diff(times) > 0).all():
+            raise ProblemError("the displacement history goes backwards in time")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "displacement", values)
+
+    def at(self, t: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement at time(s) ``t``, mm."""
+        return np.interp(t, self.times, self.displacement)
+
+    @property
+    def knots(self) -> NDArray[np.float64]:
+        """Times where the speed changes, with both ends: the steps that must be hit."""
+        speed = np.diff(self.displacement) / np.diff(self.times)
+        turns = np.abs(np.diff(speed)) > 1e-6 * np.abs(speed).max()
+        return self.times[np.concatenate([[True], turns, [True]])]
+
+    @property
+    def peak(self) -> float:
+        """Time of the (first) largest displacement, s."""
+        return float(self.times[np.argmax(self.displacement)])
+
+
+@dataclass(frozen=True)
+class Support:
+    """Nodes whose displacement ``component`` (0, 1, 2) is ``factor`` times the history's displacement."""
+
+    nodes: NDArray[np.int64]
+    component: int
+    factor: float = 0.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """An indentation.
+
+    Parameters
+    ----------
+    mesh : points in mm.
+    materials : by region name.
+    fixed : (n,) nodes held in all directions.
+    contact_faces : (f, 3 | 6 | 4) outward boundary faces that the indenter may touch.
+    indenter : where it starts; None for a problem that is driven by its supports only.
+    history : the indenter's advance.
+    supports : single components held or moved.
+    element : name in the element table; by default the mesh's cell type.
+    start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
+    """
+
+    mesh: Mesh
+    materials: Mapping[str, OgdenQLV]
+    fixed: NDArray[np.int64]
+    contact_faces: NDArray[np.int64]
+    indenter: Indenter | None
+    history: History
+    supports: tuple[Support, ...] = ()
+    element: str = ""
+    start: str = "touching"
+    name: str = field(default="", compare=False)
+
+    def with_materials(self, materials: Mapping[str, OgdenQLV]) -> Problem:
+        """The same problem with other materials; a prepared system stays valid."""
+        return replace(self, materials=materials)
+
+    @property
+    def formulation(self) -> Element:
+        """The row of the element table."""
+        return ELEMENTS[self.element or self.mesh.cell_type]
+
+    @property
+    def parameter_names(self) -> tuple[tuple[str, str], ...]:
+        """(region, parameter) in the order of every sensitivity."""
+        return tuple(
+            (region, name)
+            for region in self.mesh.region_names
+            for name in self.materials[region].parameter_names
+        )
+
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """Values in the order of `parameter_names`; mm, N, s, MPa."""
+        return np.array([v for region in self.mesh.region_names for v in self.materials[region].parameters])
+
+
+def check(problem: Problem) -> None:
+    """Raise `ProblemError` where the problem is impossible as stated."""
+    _check_choices(problem)
+    mesh, n = problem.mesh, len(problem.mesh.points)
+    if not np.isfinite(mesh.points).all():
+        raise ProblemError("the mesh has points that are not finite")
+    if not len(mesh.cells):
+        raise ProblemError("the mesh has no cells")
+    faces = np.asarray(problem.contact_faces)
+    indices = [("cells", mesh.cells), ("fixed nodes", problem.fixed), ("contact faces", faces)]
+    indices += [("support nodes", support.nodes) for support in problem.supports]
+    for name, value in indices:
+        value = np.asarray(value)
+        if value.size and (value.min() < 0 or value.max() >= n):
+            raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
+    _check_cells(problem)
+    _check_contact(problem, faces)
+    if not len(problem.fixed) and not problem.supports:
+        raise ProblemError("nothing is held in place", remedy="fix the bone and proximal nodes")
+
+
+def _check_choices(problem: Problem) -> None:
+    mesh = problem.mesh
+    name = problem.element or mesh.cell_type
+    if name not in ELEMENTS or ELEMENTS[name].cell_type != mesh.cell_type:
+        fitting = ", ".join(e.name for e in ELEMENTS.values() if e.cell_type == mesh.cell_type)
+        raise ProblemError(f"no element {name!r} for {mesh.cell_type} cells", remedy=f"use one of {fitting}")
+    missing = [region for region in mesh.region_names if region not in problem.materials]
+    if missing:
+        raise ProblemError(f"region {missing[0]!r} has no material")
+    if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
+        raise ProblemError("the mesh has region indices without a name")
+    if problem.start not in ("touching", "as-given"):
+        raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
+
+
+def _check_cells(problem: Problem) -> None:
+    mesh = problem.mesh
+    unique = np.unique(np.sort(mesh.cells, axis=1), axis=0)
+    if len(unique) != len(mesh.cells):
+        raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
+    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
+    bad = np.flatnonzero(~(weights > 0).all(axis=1))
+    if len(bad):
+        raise ProblemError(f"{len(bad)} cells are inverted or flat, the first is cell {bad[0]}")
+    used = np.zeros(len(mesh.points), dtype=bool)
+    used[mesh.cells] = True
+    if not used.all():
+        raise ProblemError(f"{(~used).sum()} nodes belong to no cell", remedy="drop them from the mesh")
+
+
+def _check_contact(problem: Problem, faces: NDArray[np.int64]) -> None:
+    if problem.indenter is None:
+        return
+    width = FACE_NODES[problem.mesh.cell_type]
+    if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
+        raise ProblemError(f"contact faces have shape {faces.shape}, not (f, {width}) with f > 0")

@@ -1,0 +1,217 @@
+"""Direct differentiation: the derivative of every step with respect to every material parameter.
+
+At a converged step ``R(u, history, p) = 0``, hence ``K du/dp = -dR/dp``; the right-hand side holds the
+explicit derivative and that of the history, which is carried along at the quadrature points
+(Michaleris, Tortorelli and Vidal 1994, transient problems).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .history import Memory
+from .kinematics import deformation_gradient, from_principal, logarithmic_stretches, principal
+from .materials import prony_factors
+from .materials.ogden import ogden, ogden_derivative
+from .materials.volumetric import volumetric
+from .system import Increment, Laws, System
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MemoryDerivative:
+    """Derivatives of a `Memory`: ``elastic (m, q, p, 6)``, ``prony (l, m, q, p, 6)``."""
+
+    elastic: Array
+    prony: Array
+
+    @classmethod
+    def rest(cls, system: System, laws: Laws) -> MemoryDerivative:
+        shape = (*system.weights.shape, laws.count, 6)
+        return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
+
+    def residual(
+        self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
+    ) -> Array:
+        """Derivative (n, 3, p) of the internal forces at fixed displacement ``u``; no contact in it."""
+        out = np.zeros((*u.shape, laws.count))
+        explicit_forces(
+            system.cells, system.gradients, system.weights, system.element.mean_dilatation, system.regions,
+            laws.tables, (laws.d_terms, laws.d_kappa, laws.parameter_index), increment.scale,
+            _step_coefficients(laws, dt), memory.elastic, memory.prony, self.elastic, self.prony, u, out,
+        )  # fmt: skip
+        return out
+
+    def advanced(
+        self, system: System, laws: Laws, before: Memory, after: Memory, u: Array, du: Array, dt: float
+    ) -> MemoryDerivative:
+        """The derivative of the memory after the step, given ``du (n, 3, p)``."""
+        elastic = np.empty_like(self.elastic)
+        elastic_stress_derivative(
+            system.cells, system.gradients, system.regions, laws.terms, laws.d_terms, laws.parameter_index,
+            u, du, elastic,
+        )  # fmt: skip
+        decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
+        of, prony = system.regions, np.empty_like(self.prony)
+        for l in range(len(prony)):
+            prony[l] = decay[of, l][:, None, None, None] * self.prony[l]
+            prony[l] += ramp[of, l][:, None, None, None] * (elastic - self.elastic)
+            for r, p in zip(*np.nonzero(laws.d_prony[:, :, l, 1])):
+                d_tau, cells = laws.d_prony[r, p, l, 1], of == r
+                change = d_decay[r, l] * before.prony[l][cells]
+                change += d_ramp[r, l] * (after.elastic - before.elastic)[cells]
+                prony[l][cells, :, laws.parameter_index[r, p]] += d_tau * change
+        return MemoryDerivative(elastic, prony)
+
+
+def _step_coefficients(laws: Laws, dt: float) -> tuple[Array, ...]:
+    """Weights of H and Se in the history tensor K, their explicit derivatives, and that of the scale."""
+    decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
+    gamma = laws.prony[..., 0]
+    d_gamma, d_tau = laws.d_prony[..., 0], laws.d_prony[..., 1]
+    on_prony = gamma * decay
+    on_elastic = -(gamma * ramp).sum(axis=1)
+    d_on_prony = d_gamma * decay[:, None] + d_tau * (gamma * d_decay)[:, None]
+    d_scale = (d_gamma * ramp[:, None] + d_tau * (gamma * d_ramp)[:, None]).sum(axis=2)
+    return on_prony, on_elastic, d_on_prony, d_scale
+
+
+@njit(cache=True)
+def explicit_forces(cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u, out):  # type: ignore[no-untyped-def]
+    """Internal forces of the stress ``dS/dp`` at fixed displacement, added to ``out (n, 3, p)``.
+
+    ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``; the kernel of `MemoryDerivative.residual`.
+    """
+    terms, _, law = tables
+    d_terms, d_kappa, index = d_tables
+    on_prony, on_elastic, d_on_prony, d_scale = coefficients
+    m, k = cells.shape
+    P = out.shape[2]
+    ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
+    F, A, N = matrix[0], matrix[1], matrix[2]
+    c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
+    d_beta, value = vector[5], vector[6]
+    S, part, fe = np.empty((P, 6)), np.empty(6), np.empty((k, 3, P))
+    for el in range(m):
+        for a in range(k):
+            for i in range(3):
+                ue[i, a] = u[cells[el, a], i]
+        region = regions[el]
+        fe[:] = 0.0
+        ratio = 1.0
+        if mean:
+            current = 0.0
+            for q in range(grads.shape[1]):
+                current += weights[el, q] * deformation_gradient(grads[el, q], ue, F)
+            ratio = current / weights[el].sum()
+        for q in range(grads.shape[1]):
+            J = deformation_gradient(grads[el, q], ue, F)
+            principal(F, A, c2, N)
+            logarithmic_stretches(c2, e)
+            ogden(terms[region], c2, e, beta, slope, quotient)
+            for p in range(P):
+                for t in range(6):
+                    total = on_elastic[region] * dSe[el, q, p, t]
+                    for l in range(H.shape[0]):
+                        total += on_prony[region, l] * dH[l, el, q, p, t]
+                    S[p, t] = total
+            for j in range(index.shape[1]):
+                p = index[region, j]
+                if p < 0:
+                    continue
+                ogden_derivative(terms[region], d_terms[region, j], e, d_beta)
+                d_JU = volumetric(law[region], d_kappa[region, j], ratio if mean else J)[1]
+                if mean:
+                    d_JU *= J / ratio
+                for i in range(3):
+                    value[i] = d_scale[region, j] * beta[i] + scale[region] * d_beta[i] + d_JU
+                    value[i] /= c2[i]
+                from_principal(value, N, part)
+                for t in range(6):
+                    total = part[t] - d_scale[region, j] * Se[el, q, t]
+                    for l in range(H.shape[0]):
+                        total += d_on_prony[region, j, l] * H[l, el, q, t]
+                    S[p, t] += total
+            for p in range(P):
+                for i in range(3):
+                    x = F[i, 0] * S[p, 0] + F[i, 1] * S[p, 3] + F[i, 2] * S[p, 5]
+                    y = F[i, 0] * S[p, 3] + F[i, 1] * S[p, 1] + F[i, 2] * S[p, 4]
+                    z = F[i, 0] * S[p, 5] + F[i, 1] * S[p, 4] + F[i, 2] * S[p, 2]
+                    for a in range(k):
+                        g = grads[el, q]
+                        fe[a, i, p] += weights[el, q] * (x * g[0, a] + y * g[1, a] + z * g[2, a])
+        for a in range(k):
+            for i in range(3):
+                for p in range(P):
+                    out[cells[el, a], i, p] += fe[a, i, p]
+
+
+@njit(cache=True)
+def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, du, out):  # type: ignore[no-untyped-def]
+    """Total derivative (m, q, p, 6) of Se: explicit in the parameters, and through ``du (n, 3, p)``."""
+    m, k = cells.shape
+    P = du.shape[2]
+    ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
+    F, A, N = matrix[0], matrix[1], matrix[2]
+    c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
+    d_beta = vector[5]
+    dF, FN, dC, dS = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    shear, local = np.empty(3), np.empty((P, 3))
+    for el in range(m):
+        for a in range(k):
+            for i in range(3):
+                ue[i, a] = u[cells[el, a], i]
+        region = regions[el]
+        for q in range(grads.shape[1]):
+            deformation_gradient(grads[el, q], ue, F)
+            principal(F, A, c2, N)
+            logarithmic_stretches(c2, e)
+            ogden(terms[region], c2, e, beta, slope, quotient)
+            total = (slope[0] + slope[1] + slope[2]) / 9.0
+            local[:] = 0.0
+            for j in range(index.shape[1]):
+                if index[region, j] >= 0:
+                    ogden_derivative(terms[region], d_terms[region, j], e, d_beta)
+                    for i in range(3):
+                        local[index[region, j], i] = d_beta[i] / c2[i]
+            for i in range(3):
+                j, h = (i + 1) % 3, (i + 2) % 3
+                shear[i] = 0.5 * ((c2[j] + c2[h]) * quotient[i] - beta[j] - beta[h]) / (c2[j] * c2[h])
+                for p in range(3):
+                    FN[p, i] = F[p, 0] * N[0, i] + F[p, 1] * N[1, i] + F[p, 2] * N[2, i]
+            for p in range(P):
+                dF[:] = 0.0
+                for a in range(k):
+                    for i in range(3):
+                        for j in range(3):
+                            dF[i, j] += du[cells[el, a], i, p] * grads[el, q, j, a]
+                for i in range(3):  # A = (FN)^T dF N, hence dC = A + A^T in the principal frame
+                    for j in range(3):
+                        A[i, j] = 0.0
+                        for r in range(3):
+                            dFN = dF[r, 0] * N[0, j] + dF[r, 1] * N[1, j] + dF[r, 2] * N[2, j]
+                            A[i, j] += FN[r, i] * dFN
+                for i in range(3):
+                    for j in range(3):
+                        dC[i, j] = A[i, j] + A[j, i]
+                for i in range(3):
+                    j, h = (i + 1) % 3, (i + 2) % 3
+                    rate = 0.0
+                    for r in range(3):
+                        moduli = total - (slope[i] + slope[r]) / 3.0 + (slope[i] - 2.0 * beta[i] if i == r else 0.0)
+                        rate += moduli * dC[r, r] / (2.0 * c2[r])
+                    dS[i, i] = local[p, i] + rate / c2[i]
+                    dS[j, h] = shear[i] * dC[j, h]
+                    dS[h, j] = dS[j, h]
+                for t in range(6):
+                    x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
+                    value = 0.0
+                    for i in range(3):
+                        for j in range(3):
+                            value += N[x, i] * dS[i, j] * N[y, j]
+                    out[el, q, p, t] = value

@@ -1,0 +1,314 @@
+"""The simulation in time: a generator of accepted steps, and the result made of them.
+
+A step that does not converge is cut and tried again; what was reached is a result with its reason.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .factor import Factor
+from .history import Memory
+from .newton import Equilibrium, NewtonControl, equilibrate, reaction_scale
+from .problem import History, Problem
+from .result import Result, State, Step
+from .sensitivity import MemoryDerivative
+from .system import Evaluation, Increment, Laws, System
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StepControl:
+    """How a simulation steps; the defaults need no change.
+
+    Parameters
+    ----------
+    load_steps, unload_steps : steps up to the peak and after it, before any is cut.
+    times : (k,) s, instead of the two numbers: exactly these steps (rest at 0 left out).
+    tolerance : residual over reactions at equilibrium.
+    max_cuts : how often a step may be halved.
+    penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
+    penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
+    linear_solver : name in the solver table, or auto.
+    """
+
+    load_steps: int = 10
+    unload_steps: int = 8
+    times: tuple[float, ...] | None = None
+    tolerance: float = 1e-6
+    max_iterations: int = 30
+    max_cuts: int = 8
+    penetration: float = 0.01
+    penalty: float | None = None
+    linear_solver: str = "auto"
+
+    @property
+    def newton(self) -> NewtonControl:
+        return NewtonControl(tolerance=self.tolerance, max_iterations=self.max_iterations)
+
+
+def schedule(history: History, control: StepControl) -> Array:
+    """Times (k,) of the steps: even in loading; in unloading dense after the peak, where force drops fast."""
+    if control.times is not None:
+        return np.asarray(control.times, dtype=float)
+    peak, end = history.peak, float(history.times[-1])
+    parts = [history.knots[1:]]
+    if peak > 0:
+        parts.append(peak * np.arange(1, control.load_steps + 1) / control.load_steps)
+    if end > peak:
+        grade = (np.arange(1, control.unload_steps + 1) / control.unload_steps) ** 1.5
+        parts.append(peak + (end - peak) * grade)
+    times = np.unique(np.concatenate(parts))
+    return times[np.concatenate([np.diff(times) > 1e-9 * end, [True]])]
+
+
+class Simulation:
+    """One run: the system, its materials, and the step that was reached last."""
+
+    def __init__(
+        self, problem: Problem, control: StepControl, sensitivities: bool, warm_start: Result | None
+    ) -> None:
+        started = time.perf_counter()
+        self.problem, self.control = problem, control
+        self.system = _system(problem, warm_start)
+        self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+        self.seconds: Counter[str] = Counter()
+        self.factor = Factor(self.system, control.linear_solver)
+        self.counts: Counter[str] = Counter()
+        self.memory = Memory.rest(self.system, self.laws)
+        self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
+        self.warm = _warm_states(problem, warm_start)
+        self.floor = 0.0
+        width = problem.indenter.width if problem.indenter is not None else 1.0
+        self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
+        if self.warm:
+            self.stiffness = max(self.stiffness, max(state.penalty for state in self.warm.values()))
+        self.deepest = control.penetration * float(np.abs(problem.history.displacement).max())
+        rest = np.zeros_like(self.system.points)
+        self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness)]
+        self.reason = ""
+        self.seconds["setup"] = time.perf_counter() - started
+
+    def run(self) -> Iterator[Step]:
+        """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
+        targets = list(schedule(self.problem.history, self.control))
+        cuts = 0
+        while targets:
+            now = self.states[-1].time
+            found = self._attempt(targets[0])
+            if not isinstance(found, str):
+                cuts = max(cuts - 1, 0)
+                targets.pop(0)
+                yield found
+                continue
+            self.counts["cuts"] += 1
+            cuts += 1
+            if cuts > self.control.max_cuts:
+                self.reason = f"stopped at {now:.4g} s of {targets[-1]:.4g} s: {found}"
+                return
+            targets.insert(0, 0.5 * (now + targets[0]))
+
+    def _attempt(self, t: float) -> Step | str:
+        """The step to time ``t``, or why there is none; nothing is changed unless it is accepted."""
+        before = self.states[-1]
+        displacement, dt = float(self.problem.history.at(t)), t - before.time
+        stiffness, u = self.stiffness, self._predict(t, displacement)
+        for _ in range(6):
+            increment = self.memory.increment(
+                self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
+            )
+            found = self._equilibrate(increment, u)
+            self.counts["newton_iterations"] += found.iterations
+            if found.reason:
+                return found.reason
+            if found.at.penetration <= self.deepest:
+                break
+            stiffness, u = 3.0 * stiffness, found.u
+        return self._accept(found, increment, dt, stiffness)
+
+    def _equilibrate(self, increment: Increment, guess: Array) -> Equilibrium:
+        """From the predicted displacement; from the last one where that fails."""
+        found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
+        for u in (guess, self.states[-1].u):
+            u = self.system.impose(u, increment.displacement)
+            found = equilibrate(
+                self.system, self.laws, increment, u, self.factor, self.control.newton, self.floor, self.seconds
+            )
+            if not found.reason:
+                break
+        return found
+
+    def _predict(self, t: float, displacement: float) -> Array:
+        warm = self.warm.get(round(t, 9))
+        if warm is not None:
+            return warm.u
+        now = self.states[-1]
+        if len(self.states) < 2:
+            return now.u
+        last = self.states[-2]
+        moved = now.displacement - last.displacement
+        if moved == 0.0:
+            return now.u
+        ratio = np.clip((displacement - now.displacement) / moved, -2.0, 2.0)
+        return now.u + ratio * (now.u - last.u)
+
+    def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
+        started = time.perf_counter()
+        u, at = found.u, found.at
+        after = self.memory.advanced(self.system, self.laws, u, dt)
+        du = force_slope = None
+        if self.slope is not None:
+            du, force_slope = self._differentiate(self.slope, found, increment, dt, stiffness)
+            self.slope = self.slope.advanced(self.system, self.laws, self.memory, after, u, du, dt)
+        self.memory, self.stiffness = after, stiffness
+        self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
+        state = State(increment.time, increment.displacement, u, stiffness, du, after)
+        self.states = [*self.states[-1:], state]
+        self.counts["steps"] += 1
+        self.seconds["accept"] += time.perf_counter() - started
+        return Step(
+            increment.time, increment.displacement, at.force, at.penetration, at.contact_area,
+            found.iterations, force_slope, state,
+        )  # fmt: skip
+
+    def _differentiate(
+        self, slope: MemoryDerivative, found: Equilibrium, increment: Increment, dt: float, stiffness: float
+    ) -> tuple[Array, Array]:
+        """Derivatives (n, 3, p) of the displacement and (p,) of the force at equilibrium."""
+        system, laws, at, u = self.system, self.laws, found.at, found.u
+        change = slope.residual(system, laws, self.memory, increment, u, dt)
+        d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
+        pushed = system.contact_force(u, increment)
+        change += pushed[..., None] * d_penalty
+        b = -change.reshape(-1, laws.count)[system.free]
+        self.factor.factorise(at.data)
+        du = np.zeros((u.size, laws.count))
+        du[system.free] = self.factor.apply(b)
+        d_force = at.force * d_penalty
+        if at.advance is not None:
+            d_force = d_force - at.advance.ravel() @ du
+        return du.reshape(*u.shape, laws.count), d_force
+
+
+def _system(problem: Problem, warm_start: Result | None) -> System:
+    if warm_start is not None and warm_start.system is not None and warm_start.system.fits(problem):
+        return warm_start.system
+    return System(problem)
+
+
+def _warm_states(problem: Problem, warm_start: Result | None) -> dict[float, State]:
+    """States of an earlier run by time, moved to the new parameters along their sensitivities."""
+    if warm_start is None or not len(warm_start.states):
+        return {}
+    if warm_start.states[0].u.shape != problem.mesh.points.shape:
+        return {}
+    change = problem.parameters - warm_start.problem.parameters
+    out = {}
+    for state in warm_start.states:
+        u = state.u if state.sensitivity is None else state.u + state.sensitivity @ change
+        out[round(state.time, 9)] = replace(state, u=u)
+    return out
+
+
+def iterate(
+    problem: Problem,
+    steps: StepControl = StepControl(),  # noqa: B008 - frozen
+    sensitivities: bool = False,
+    warm_start: Result | None = None,
+) -> Iterator[Step]:
+    """Accepted steps of a simulation, one by one; ends early where no step converges.
+
+    Raises
+    ------
+    ProblemError
+        Before anything is solved, where the problem is impossible as stated.
+    """
+    yield from Simulation(problem, steps, sensitivities, warm_start).run()
+
+
+def solve(
+    problem: Problem,
+    steps: StepControl = StepControl(),  # noqa: B008 - frozen
+    sensitivities: bool = False,
+    warm_start: Result | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    store: str = "peak",
+) -> Result:
+    """Simulate an indentation.
+
+    Parameters
+    ----------
+    sensitivities : also the derivative of the force with respect to every material parameter.
+    warm_start : an earlier result on the same mesh whose states (``store="all"``) are the first guesses.
+    on_step : called with every accepted step.
+    store : which states to keep: ``peak``, ``all`` or ``none``.
+
+    Raises
+    ------
+    ProblemError
+        Before anything is solved, where the problem is impossible as stated.  A simulation that cannot go
+        on is no error: the result says ``completed = False`` and why.
+    """
+    started = time.perf_counter()
+    run = Simulation(problem, steps, sensitivities, warm_start)
+    rows: list[Step] = []
+    kept: list[State] = []
+    for step in run.run():
+        rows.append(replace(step, state=run.states[0]))
+        if store == "all":
+            kept.append(replace(step.state, memory=None))
+        if store == "peak" and (not kept or step.displacement >= kept[0].displacement):
+            kept = [step.state]
+        if on_step is not None:
+            on_step(step)
+    return _result(problem, run, rows, kept, sensitivities, time.perf_counter() - started)
+
+
+def _result(
+    problem: Problem, run: Simulation, rows: list[Step], kept: list[State], sensitivities: bool, seconds: float
+) -> Result:
+    def column(name: str, rest: float = 0.0) -> Array:
+        return np.array([rest, *(getattr(row, name) for row in rows)])
+
+    slopes = None
+    if sensitivities:
+        nothing = np.zeros(run.laws.count)
+        slopes = np.array([nothing, *(row.force_sensitivity for row in rows)])
+    return Result(
+        problem=problem,
+        times=column("time"),
+        displacement=column("displacement", float(problem.history.at(0.0))),
+        force=column("force"),
+        force_sensitivity=slopes,
+        parameter_names=problem.parameter_names,
+        penetration=column("penetration"),
+        contact_area=column("contact_area"),
+        states=tuple(kept),
+        completed=not run.reason,
+        reason=run.reason,
+        statistics=_statistics(run, seconds),
+        system=run.system,
+    )
+
+
+def _statistics(run: Simulation, seconds: float) -> dict[str, Any]:
+    parts = {name: float(value) for name, value in (run.seconds + run.factor.seconds).items()}
+    return {
+        "steps": run.counts["steps"],
+        "cuts": run.counts["cuts"],
+        "newton_iterations": run.counts["newton_iterations"],
+        "factorisations": run.factor.counts["factorisations"],
+        "solves": run.factor.counts["solves"],
+        "linear_solver": run.factor.name,
+        "element": run.system.element.name,
+        "unknowns": run.system.unknowns,
+        "seconds": {**parts, "total": seconds},
+    }

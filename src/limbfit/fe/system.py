@@ -1,0 +1,268 @@
+"""The discretised body: what depends on mesh, supports and contact faces only, built once and reused.
+
+Free displacement components are numbered node by node; the matrix is the upper triangle in CSR form, and
+every entry of every element's upper triangle knows its place in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numba import njit
+from numpy.typing import NDArray
+
+from .assembly import assemble
+from .contact import ContactSurface, contact, touching_offset
+from .elements import Element, reference_gradients
+from .indenter import Indenter
+from .materials import OgdenQLV
+from .problem import Problem, ProblemError, check
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Laws:
+    """Materials of all regions as padded arrays; see `MaterialTable`.
+
+    ``parameter_index (r, p)`` says which global parameter each region's p-th one is (-1: none).
+    """
+
+    terms: Array
+    kappa: Array
+    law: NDArray[np.int64]
+    prony: Array
+    d_terms: Array
+    d_kappa: Array
+    d_prony: Array
+    parameter_index: NDArray[np.int64]
+    modulus: float
+    modulus_gradient: Array
+
+    @property
+    def tables(self) -> tuple[Array, Array, NDArray[np.int64]]:
+        return self.terms, self.kappa, self.law
+
+    @property
+    def count(self) -> int:
+        """Number of parameters of all regions."""
+        return len(self.modulus_gradient)
+
+    @classmethod
+    def build(cls, materials: list[OgdenQLV]) -> Laws:
+        tables, slopes = [m.table() for m in materials], [m.derivatives() for m in materials]
+        K = max(len(t.terms) for t in tables)
+        L = max(len(t.prony) for t in tables)
+        P = max(len(d) for d in slopes)
+        R = len(materials)
+        terms, prony = np.tile([0.0, 1.0], (R, K, 1)), np.tile([0.0, 1.0], (R, L, 1))
+        d_terms, d_prony, d_kappa = np.zeros((R, P, K, 2)), np.zeros((R, P, L, 2)), np.zeros((R, P))
+        index, at = np.full((R, P), -1), 0
+        for r, (table, slope) in enumerate(zip(tables, slopes)):
+            terms[r, : len(table.terms)], prony[r, : len(table.prony)] = table.terms, table.prony
+            for p, d in enumerate(slope):
+                d_terms[r, p, : len(d.terms)], d_prony[r, p, : len(d.prony)] = d.terms, d.prony
+                d_kappa[r, p] = d.kappa
+                index[r, p] = at
+                at += 1
+        modulus = float(np.mean([m.instantaneous_modulus for m in materials]))
+        gradient = np.concatenate([m.instantaneous_modulus_gradient for m in materials]) / R
+        kappa = np.array([t.kappa for t in tables])
+        law = np.array([t.volumetric for t in tables])
+        return cls(terms, kappa, law, prony, d_terms, d_kappa, d_prony, index, modulus, gradient)
+
+
+@dataclass(frozen=True)
+class Increment:
+    """What is constant while one step is solved.
+
+    ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm.
+    """
+
+    time: float
+    displacement: float
+    scale: Array
+    history: Array
+    penalty: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The potential and its derivatives at one displacement field."""
+
+    energy: float
+    residual: Array
+    data: Array
+    force: float = 0.0
+    penetration: float = 0.0
+    contact_area: float = 0.0
+    advance: Array | None = None
+    contact_norm: float = 0.0
+
+
+class System:
+    """A problem's discretisation; see the module docstring.  Valid for any materials and history."""
+
+    def __init__(self, problem: Problem) -> None:
+        check(problem)
+        mesh = problem.mesh
+        self.problem = problem
+        self.element: Element = problem.formulation
+        self.points = np.ascontiguousarray(mesh.points, dtype=float)
+        self.cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
+        self.regions = np.ascontiguousarray(mesh.regions, dtype=np.int32)
+        self.gradients, self.weights = reference_gradients(self.element, self.points, mesh.cells)
+        self._number_unknowns(problem)
+        self._build_pattern()
+        self.surface: ContactSurface | None = None
+        self.indenter = problem.indenter
+        if problem.indenter is not None:
+            faces = np.asarray(problem.contact_faces, dtype=np.int32)
+            self.surface = ContactSurface.build(self.element, self.points, faces)
+            self.face_positions = _positions(faces, self.numbers, self.indptr, self.indices)
+            if problem.start == "touching":
+                self.indenter = problem.indenter.moved(self._touching(problem.indenter))
+
+    def _touching(self, indenter: Indenter) -> float:
+        assert self.surface is not None
+        offset = touching_offset(self.surface, indenter)
+        if abs(self.surface.gaps(indenter.moved(offset)).min()) > 1e-6:
+            raise ProblemError(
+                "the indenter never meets the contact faces", remedy="check its centre, axis and the faces"
+            )
+        return offset
+
+    def _number_unknowns(self, problem: Problem) -> None:
+        n = len(self.points)
+        factors = np.full((n, 3), np.nan)
+        for support in problem.supports:
+            factors[np.asarray(support.nodes), support.component] = support.factor
+        factors[np.asarray(problem.fixed, dtype=int)] = 0.0
+        free = np.isnan(factors)
+        self.supported = ~free
+        self.factors = np.where(free, 0.0, factors)
+        self.free = np.flatnonzero(free.ravel())
+        self.numbers = np.full((n, 3), -1, dtype=np.int32)
+        self.numbers.ravel()[self.free] = np.arange(len(self.free), dtype=np.int32)
+        if not len(self.free):
+            raise ProblemError("every node is held: nothing is left to solve")
+
+    def _build_pattern(self) -> None:
+        m, k = self.cells.shape
+        incidence = sp.csr_matrix(
+            (np.ones(m * k, dtype=np.int32), self.cells.ravel(), np.arange(0, m * k + 1, k)),
+            shape=(m, len(self.points)),
+        )
+        graph = (incidence.T @ incidence).tocsr()
+        graph.sort_indices()
+        numbers = self.numbers
+        self.indptr, self.indices = _upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
+        self.cell_positions = _positions(self.cells, numbers, self.indptr, self.indices)
+
+    @property
+    def unknowns(self) -> int:
+        return len(self.free)
+
+    def fits(self, problem: Problem) -> bool:
+        """Whether this discretisation is also that of ``problem`` (the same mesh, supports and indenter)."""
+        mine = self.problem
+        return (
+            mine.mesh is problem.mesh
+            and mine.fixed is problem.fixed
+            and mine.contact_faces is problem.contact_faces
+            and mine.indenter is problem.indenter
+            and mine.supports == problem.supports
+            and (mine.element, mine.start) == (problem.element, problem.start)
+        )
+
+    def impose(self, u: Array, displacement: float) -> Array:
+        """``u`` with the supported components at their values."""
+        return np.where(self.supported, self.factors * displacement, u)
+
+    def evaluate(self, u: Array, laws: Laws, increment: Increment) -> Evaluation:
+        """Energy, residual (n, 3) and tangent entries at ``u (n, 3)``."""
+        residual, data = np.zeros_like(u), np.zeros(len(self.indices))
+        energy = assemble(
+            self.cells, self.gradients, self.weights, self.element.mean_dilatation, self.regions,
+            laws.tables, increment.scale, increment.history, u, True, self.cell_positions, residual, data,
+        )  # fmt: skip
+        if not np.isfinite(energy) or self.surface is None or self.indenter is None:
+            return Evaluation(energy, residual, data)
+        advance, pushed = np.zeros_like(u), np.zeros_like(u)
+        found, force, deepest, area = self._contact(u, increment, True, pushed, data, advance)
+        norm = float(np.linalg.norm(pushed))
+        return Evaluation(energy + found, residual + pushed, data, force, deepest, area, advance, norm)
+
+    def contact_force(self, u: Array, increment: Increment) -> Array:
+        """The contact part of the residual (n, 3), N."""
+        pushed = np.zeros_like(u)
+        if self.surface is not None:
+            self._contact(u, increment, False, pushed, np.empty(0), np.empty((0, 3)))
+        return pushed
+
+    def _contact(
+        self, u: Array, increment: Increment, tangent: bool, pushed: Array, data: Array, advance: Array
+    ) -> tuple[float, float, float, float]:
+        assert self.surface is not None and self.indenter is not None
+        surface, frame = self.surface, self.indenter.frame
+        centre = np.asarray(self.indenter.centre) + increment.displacement * frame[2]
+        return contact(
+            surface.faces, surface.N, surface.areas, self.points, u, centre, frame, self.indenter.kernel,
+            increment.penalty, tangent, self.face_positions, pushed, data, advance,
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def _upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
+    """Upper triangle of the unknowns' graph, rows sorted, from the sorted graph of the nodes."""
+    indptr = np.zeros(n + 1, dtype=np.int32)
+    for sweep in range(2):
+        if sweep == 1:
+            for i in range(n):
+                indptr[i + 1] += indptr[i]
+            indices = np.empty(indptr[n], dtype=np.int32)
+        for a in range(numbers.shape[0]):
+            for i in range(3):
+                row = numbers[a, i]
+                if row < 0:
+                    continue
+                count = 0
+                for p in range(start[a], start[a + 1]):
+                    for j in range(3):
+                        column = numbers[neighbours[p], j]
+                        if column >= row:
+                            if sweep == 1:
+                                indices[indptr[row] + count] = column
+                            count += 1
+                if sweep == 0:
+                    indptr[row + 1] = count
+    return indptr, indices
+
+
+@njit(cache=True)
+def _positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
+    """Place of each upper-triangle entry (component-major rows) of each cell in the sparse data."""
+    m, k = cells.shape
+    n = 3 * k
+    out = np.empty((m, n * (n + 1) // 2), dtype=np.int32)
+    for e in range(m):
+        at = 0
+        for r in range(n):
+            row = numbers[cells[e, r % k], r // k]
+            for c in range(r, n):
+                column = numbers[cells[e, c % k], c // k]
+                low, high = min(row, column), max(row, column)
+                out[e, at] = -1
+                if low >= 0:
+                    left, right = indptr[low], indptr[low + 1]
+                    while left < right:
+                        middle = (left + right) // 2
+                        if indices[middle] < high:
+                            left = middle + 1
+                        else:
+                            right = middle
+                    out[e, at] = left
+                at += 1
+    return out

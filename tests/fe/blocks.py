@@ -1,0 +1,90 @@
+"""Structured blocks of every element, for tests: six tetrahedra or one hexahedron per box."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbfit.fe import History, Indenter, OgdenQLV, Problem
+from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
+
+SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+
+
+def quadratic(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray]:
+    """Mid-edge nodes for tetrahedra."""
+    edges = np.sort(cells[:, TET10_EDGES].reshape(-1, 2), axis=1)
+    unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+    middle = points[unique].mean(axis=1)
+    return np.vstack([points, middle]), np.hstack([cells, len(points) + inverse.reshape(-1, 6)])
+
+
+def block(
+    cell_type: str, x: NDArray, y: NDArray, z: NDArray, layer: float = 0.0, jitter: float = 0.0
+) -> Mesh:
+    """A block over the grid lines ``x, y, z``; region ``skin`` above ``z.max() - layer``, else ``muscle``.
+
+    Node sets ``bottom``; face set ``top``.  ``jitter`` moves inner nodes at random (fixed seed), mm.
+    """
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+    points = grid.reshape(-1, 3).astype(float)
+    index = np.arange(len(points)).reshape(grid.shape[:3])
+    corner = [index[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    boxes = np.stack([c.ravel() for c in corner], axis=1)  # numbered 4 i + 2 j + k
+    low, high = points.min(axis=0), points.max(axis=0)
+    inner = ((points > low) & (points < high)).all(axis=1)
+    points[inner] += jitter * np.random.default_rng(1).uniform(-1, 1, (inner.sum(), 3))
+    if cell_type == "hex8":
+        cells = boxes[:, [0, 4, 6, 2, 1, 5, 7, 3]]
+    else:
+        cells = boxes[:, SIX_TETS].reshape(-1, 4)
+        edges = points[cells[:, 1:]] - points[cells[:, :1]]
+        flip = np.linalg.det(edges) < 0
+        cells[flip] = cells[flip][:, [0, 2, 1, 3]]
+    centres = points[cells].mean(axis=1)
+    regions = (centres[:, 2] < high[2] - layer).astype(int)
+    if cell_type == "tet10":
+        points, cells = quadratic(points, cells)
+    tolerance = 1e-9
+    faces = boundary(cells, cell_type)
+    top = faces[(points[faces][:, :, 2] > high[2] - tolerance).all(axis=1)]
+    bottom = np.flatnonzero(points[:, 2] < low[2] + tolerance)
+    return Mesh(points, cells, cell_type, regions, ("skin", "muscle"), {"bottom": bottom}, {"top": top})
+
+
+def boundary(cells: NDArray, cell_type: str) -> NDArray:
+    """Outward boundary faces in VTK order."""
+    local = HEX_FACES if cell_type == "hex8" else TET_FACES
+    if cell_type == "tet10":
+        edge = {tuple(sorted(pair)): 4 + i for i, pair in enumerate(TET10_EDGES.tolist())}
+        local = np.array([[*f, *(edge[tuple(sorted((f[i], f[(i + 1) % 3])))] for i in range(3))] for f in local])
+    faces = cells[:, local].reshape(-1, local.shape[1])
+    corners = 4 if cell_type == "hex8" else 3
+    _, first, count = np.unique(np.sort(faces[:, :corners], axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[count == 1]]
+
+
+SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)
+
+
+def graded(half: float, inner: float, n_inner: int, n_outer: int) -> NDArray:
+    """Grid lines from -half to half, even within +-inner, growing outside."""
+    out = inner + (half - inner) * (np.arange(1, n_outer + 1) / n_outer) ** 1.5
+    return np.concatenate([-out[::-1], np.linspace(-inner, inner, n_inner + 1), out])
+
+
+def punch(
+    cell_type: str = "tet10", n: int = 6, outer: int = 2, depth: float = 6.0, speed: float = 0.96, **changes
+) -> Problem:
+    """A two-layer block of 60 x 60 x 30 mm under a square punch of 20 mm."""
+    lines = graded(30.0, 11.0, n, outer)
+    z = np.concatenate([np.linspace(-30.0, -9.0, 3), np.array([-6.0, -3.0, 0.0])])
+    mesh = block(cell_type, lines, lines, z, layer=3.0)
+    history = History(np.array([0.0, depth / speed, 2 * depth / speed]), np.array([0.0, depth, 0.0]))
+    values = dict(
+        mesh=mesh, materials={"skin": SKIN, "muscle": MUSCLE}, fixed=mesh.node_sets["bottom"],
+        contact_faces=mesh.face_sets["top"], indenter=Indenter(axis=(0, 0, -1), centre=(0.0, 0.0, 1.0)),
+        history=history,
+    )  # fmt: skip
+    return Problem(**{**values, **changes})
