@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pyvista as pv
 
+from limbfit.mesh import Mesh, write_vtu
+
 SITES = (
     ("PT-1", "patellar tendon", True, -1.45, 10.0),
     ("TI-2", "tibia", True, -1.2, -40.0),
@@ -82,7 +84,8 @@ def _run(sites: tuple, name: str) -> dict:
         "limbfit": "0.1.0",
         "versions": {"numpy": "2.1.0", "scipy": "1.14.1", "vtk": "9.4.0"},
         "settings": settings,
-        "inputs": {"study.toml": "9f" * 32} | {f"traces/{row[0]}.csv": f"{i:02x}" * 32 for i, row in enumerate(sites)},
+        "inputs": {"study.toml": "9f" * 32}
+        | {f"traces/{row[0]}.csv": f"{i:02x}" * 32 for i, row in enumerate(sites)},
         "stages": {
             stage: {"seconds": seconds, "finished": "2026-03-01T10:00:00+00:00"}
             for stage, seconds in stages.items()
@@ -95,10 +98,13 @@ def _surfaces(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     z, angle = np.meshgrid(np.linspace(-129.5, 60, 80), np.linspace(0, 2 * np.pi, 90), indexing="ij")
     r = radius(z)
-    wall = pv.StructuredGrid(r * np.cos(angle), r * np.sin(angle), z).extract_surface(algorithm="dataset_surface")
+    wall = pv.StructuredGrid(r * np.cos(angle), r * np.sin(angle), z).extract_surface(
+        algorithm="dataset_surface"
+    )
     wall.triangulate().clean().fill_holes(500.0).save(folder / "skin.stl")
-    for name, centre, size, low in (("tibia", (8, -26), 13.0, -95.0), ("fibula", (30, 6), 6.0, -80.0)):
-        bone = pv.Cylinder((*centre, (low + 60) / 2), (0, 0, 1), size, 60 - low, resolution=40)
+    for name, centre, size, low in (("tibia", (6, -20), 12.0, -85.0), ("fibula", (24, 6), 5.0, -75.0)):
+        middle = (*centre, (low + 60) / 2)
+        bone = pv.Cylinder(center=middle, direction=(0, 0, 1), radius=size, height=60 - low, resolution=40)
         bone.triangulate().save(folder / f"bone-{name}.stl")
     _json(
         folder / "surfaces.json",
@@ -158,32 +164,37 @@ def _traces(folder: Path, sites: tuple) -> None:
     _json(folder / "traces.json", {"sites": facts})
 
 
-def _limb_grid() -> pv.UnstructuredGrid:
+def _limb_mesh() -> Mesh:
     """Tetrahedra of the limb in rings: region 0 in the outermost 3 mm, bones left out."""
-    share = np.array([0.02, 0.2, 0.38, 0.54, 0.68, 0.8, 0.9, 0.95, 1.0])
-    z = np.linspace(-128, 60, 34)
-    angle = np.linspace(0, 2 * np.pi, 45)
-    s, zz, a = np.meshgrid(share, z, angle, indexing="ij")
-    r = s * radius(zz)
+    z = np.linspace(-126, 60, 36)
+    angle = np.linspace(0, 2 * np.pi, 49)
+    ring, zz, a = np.meshgrid(np.arange(12), z, angle, indexing="ij")
+    inner = radius(zz) - 3.0
+    r = np.where(ring < 10, inner * (0.02 + 0.98 * ring / 9), inner + 1.5 * (ring - 9))
     grid = pv.StructuredGrid(r * np.cos(a), r * np.sin(a), zz).cast_to_unstructured_grid()
     centre = np.asarray(grid.cell_centers().points)
-    tibia = np.hypot(centre[:, 0] - 8, centre[:, 1] + 26) < 13
-    fibula = np.hypot(centre[:, 0] - 30, centre[:, 1] - 6) < 6
-    grid = grid.extract_cells(np.flatnonzero(~(tibia | fibula)))
+    tibia = np.hypot(centre[:, 0] - 6, centre[:, 1] + 20) < 12
+    fibula = np.hypot(centre[:, 0] - 24, centre[:, 1] - 6) < 5
+    grid = grid.extract_cells(
+        np.flatnonzero(~((tibia & (centre[:, 2] > -85)) | (fibula & (centre[:, 2] > -75))))
+    )
     centre = np.asarray(grid.cell_centers().points)
-    muscle = np.hypot(centre[:, 0], centre[:, 1]) < radius(centre[:, 2]) - 3
-    clean = pv.UnstructuredGrid(grid.cells, grid.celltypes, np.asarray(grid.points))
-    clean.cell_data["region"] = muscle.astype(np.int64)
-    return clean.triangulate()
+    muscle = np.hypot(centre[:, 0], centre[:, 1]) < radius(centre[:, 2]) - 2.9
+    plain = pv.UnstructuredGrid(grid.cells, grid.celltypes, np.asarray(grid.points))
+    plain.cell_data["region"] = muscle.astype(np.int64)
+    tets = plain.triangulate()
+    cells = np.asarray(tets.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
+    points = np.asarray(tets.points, dtype=float)
+    return Mesh(points, cells, "tet4", np.asarray(tets.cell_data["region"]), ("skin", "muscle"))
 
 
 def _meshes(folder: Path, sites: tuple) -> None:
     (folder / "mesh").mkdir(parents=True, exist_ok=True)
     (folder / "predict").mkdir(parents=True, exist_ok=True)
-    grid = _limb_grid()
+    mesh = _limb_mesh()
     facts = {}
     for i, row in enumerate(sites):
-        grid.save(folder / "mesh" / f"{row[0]}.vtu")
+        write_vtu(mesh, folder / "mesh" / f"{row[0]}.vtu")
         facts[row[0]] = {
             "nodes": 61234 + i,
             "cells": 41987,
@@ -195,27 +206,25 @@ def _meshes(folder: Path, sites: tuple) -> None:
             "seconds": 15.2,
         }
         if row[2]:
-            _peak_fields(grid, skin_point(row[3], row[4]), _depth(i)).save(folder / "predict" / f"{row[0]}.vtu")
+            _peak_fields(mesh, skin_point(row[3], row[4]), _depth(i), folder / "predict" / f"{row[0]}.vtu")
     _json(folder / "mesh" / "mesh.json", {"sites": facts})
 
 
-def _peak_fields(grid: pv.UnstructuredGrid, site: np.ndarray, depth: float) -> pv.UnstructuredGrid:
-    fields = grid.copy()
+def _peak_fields(mesh: Mesh, site: np.ndarray, depth: float, file: Path) -> None:
     inward = -np.array([site[0], site[1], 0]) / np.hypot(site[0], site[1])
-    near = np.exp(-(np.linalg.norm(np.asarray(fields.points) - site, axis=1) ** 2) / 300)
-    fields.point_data["displacement_mm"] = depth * near[:, None] * inward
-    centres = np.asarray(fields.cell_centers().points)
-    fields.cell_data["von_mises_kPa"] = 14 * np.exp(-(np.linalg.norm(centres - site, axis=1) ** 2) / 250)
-    fields.cell_data["J"] = np.full(fields.n_cells, 0.998)
-    return fields
+    near = np.exp(-(np.linalg.norm(mesh.points - site, axis=1) ** 2) / 300)
+    centres = mesh.points[mesh.cells].mean(axis=1)
+    stress = 14 * np.exp(-(np.linalg.norm(centres - site, axis=1) ** 2) / 250)
+    moved = depth * near[:, None] * inward
+    write_vtu(
+        mesh, file, {"displacement_mm": moved}, {"von_mises_kPa": stress, "J": np.full(len(centres), 0.998)}
+    )
 
 
 def _iterations(first: dict, last: dict, start_error: float, end_error: float, sites: tuple) -> list[dict]:
     steps = []
     for i, share in enumerate((0.0, 0.45, 0.8, 0.96, 1.0)):
-        values = {
-            t: {n: first[t][n] ** (1 - share) * last[t][n] ** share for n in first[t]} for t in first
-        }
+        values = {t: {n: first[t][n] ** (1 - share) * last[t][n] ** share for n in first[t]} for t in first}
         error = start_error ** (1 - share) * end_error**share
         by_site = {row[0]: error * (0.8 + 0.1 * k) for k, row in enumerate(sites) if row[2]}
         steps.append(
@@ -244,10 +253,16 @@ def _calibration(sites: tuple) -> dict:
         }
 
     matrix = np.array([[(-0.9) ** abs(i - j) for j in range(8)] for i in range(8)])
-    verdict = dict.fromkeys(NAMES, "determined") | {"skin.m": "weakly determined", "skin.gamma": "not determined"}
+    verdict = dict.fromkeys(NAMES, "determined") | {
+        "skin.m": "weakly determined",
+        "skin.gamma": "not determined",
+    }
     uncertainty = {
         "intervals_95": {
-            t: {n: [TWO[t][n] * (0.6 if t == "skin" else 0.93), TWO[t][n] * (1.7 if t == "skin" else 1.07)] for n in TWO[t]}
+            t: {
+                n: [TWO[t][n] * (0.6 if t == "skin" else 0.93), TWO[t][n] * (1.7 if t == "skin" else 1.07)]
+                for n in TWO[t]
+            }
             for t in TWO
         },
         "correlation": {"names": NAMES, "matrix": matrix.tolist()},

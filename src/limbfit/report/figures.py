@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
+from matplotlib.ticker import MaxNLocator
 
 from .ink import (
     FITTED,
@@ -26,7 +27,7 @@ from .page import Figure
 from .store import PARAMETERS, TISSUES, Curves, Json, Store
 from .tables import SYMBOLS, UNITS, fixed, interval, number
 
-PANEL_WIDTH_IN, MOST_POINTS = 9.6, 2500
+PANEL_WIDTH_IN, MOST_POINTS, LONGEST_TITLE = 9.6, 2500, 44
 
 
 def _thin(curves: Curves) -> Curves:
@@ -117,7 +118,11 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
 def _site_title(store: Store, row: Json, columns: int) -> str:
     region = str(row.get("region") or "")
     head = f"{row['site']}, {region}" if region and columns < 3 else str(row["site"])
-    return f"{head}: {fixed(row.get('error_percent'))} %"
+    return f"{_short(head, LONGEST_TITLE // (columns - 1 or 1))}: {fixed(row.get('error_percent'))} %"
+
+
+def _short(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def _draw_forces(ax: Axes, curves: Curves, against: str) -> None:
@@ -191,7 +196,7 @@ def _finish_convergence(axes: list[Axes], store: Store, stages: list[Json]) -> N
                 ax.axhline(truth[tissue][name], color=TRUTH, lw=1, ls=line, label=f"truth, {tissue}")
     for ax in axes:
         ax.set_xlabel("Iterate")
-        ax.xaxis.get_major_locator().set_params(integer=True)
+        ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 def error_figure(store: Store) -> Figure | None:
@@ -283,5 +288,3 @@ def _draw_ratio(ax: Axes, store: Store, at: int, tissue: str, name: str) -> None
                 markerfacecolor="none" if marker == "D" else color,
                 label=label if first else None,
             )
-
-

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import re
 from html import escape
+from typing import Any
 
 import matplotlib
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure as Drawing
 INK, GRID, MUTED = "#010101", "#010102", "#010103"
 MEASURED, SIMULATED, ONE_MATERIAL, TRUTH = "#010104", "#010105", "#010106", "#010107"
 FITTED, HELD_OUT = SIMULATED, ONE_MATERIAL
+POINT_PX = 1.5  # a drawing of 9.6 in fills the page; smaller ones keep the same size of letters
 _VARIABLES = {
     INK: "--ink",
     GRID: "--grid",
@@ -28,7 +30,7 @@ _VARIABLES = {
     TRUTH: "--truth",
 }
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "limbfit",
     "font.family": "sans-serif",
@@ -41,6 +43,7 @@ STYLE = {
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.axisbelow": True,
     "axes.grid": True,
     "axes.unicode_minus": True,
     "grid.color": GRID,
@@ -76,4 +79,6 @@ def themed(text: str, name: str, alt: str) -> str:
     box = re.search(r'viewBox="([^"]*)"', body[: body.index(">")])
     inside = body[body.index(">") + 1 :]
     view = box.group(1) if box else "0 0 100 100"
-    return f'<svg viewBox="{view}" role="img"><title>{escape(alt)}</title>{inside.strip()}'
+    width = float(view.split()[2]) * POINT_PX
+    head = f'<svg viewBox="{view}" style="max-width:{width:.0f}px" role="img"><title>{escape(alt)}</title>'
+    return head + inside.strip()

@@ -9,22 +9,28 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import numpy as np
 import pyvista as pv
 from matplotlib import colormaps
 from numpy.typing import NDArray
+from vtkmodules.vtkCommonCore import vtkLogger
 
 from .page import Figure
 from .store import Json, Store
+from .tables import number
 
 PAPER = "#f6f5f1"
-SKIN, MUSCLE, BONE = "#dcc27a", "#b8565f", "#8d99a6"
+SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
+SKIN_SURFACE = "#d9a07c"
+MATT: dict[str, Any] = {"ambient": 0.35, "diffuse": 0.75, "specular": 0.0}
 FITTED, HELD_OUT = "#0072b2", "#d55e00"
 FIELD_MAP = "viridis"
 FIELDS = (
@@ -33,6 +39,7 @@ FIELDS = (
     ("J", "volume ratio J (–)"),
 )
 Array = NDArray[np.float64]
+Grid = Any  # a pyvista data set; what its stubs promise differs between its releases
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,9 @@ class Mark:
     axis: Array | None = None
 
 
+Shot = tuple[Array, View, list[Mark]]
+
+
 def _unit(values: Iterable[float]) -> Array:
     v = np.asarray(tuple(values), dtype=float)
     return v / np.linalg.norm(v)
@@ -84,7 +94,18 @@ def limb_frame(store: Store) -> Array:
     return np.array([np.cross(back, up), back, up])
 
 
-def _shoot(plotter: pv.Plotter, view: View) -> Array:
+@contextmanager
+def _without_display_warning() -> Iterator[None]:
+    """VTK warns on the terminal that there is no display before it draws without one, as it should."""
+    before = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    try:
+        yield
+    finally:
+        vtkLogger.SetStderrVerbosity(before)
+
+
+def _shoot(plotter: Any, view: View) -> Array:
     """The picture (rows, columns, 3) of what the plotter holds, seen by a view."""
     camera = plotter.camera
     camera.parallel_projection = True
@@ -92,13 +113,13 @@ def _shoot(plotter: pv.Plotter, view: View) -> Array:
     camera.position = tuple(view.focal - 2000.0 * view.direction)
     camera.up = tuple(view.up)
     camera.parallel_scale = view.half_height_mm
-    plotter.window_size = list(view.size)
+    plotter.render_window.SetSize(*view.size)
     plotter.renderer.ResetCameraClippingRange()
     plotter.render()
     return np.asarray(plotter.screenshot(return_img=True))
 
 
-def _plotter() -> pv.Plotter:
+def _plotter() -> Any:
     plotter = pv.Plotter(off_screen=True, lighting="light kit")
     plotter.set_background(PAPER)
     plotter.enable_anti_aliasing("ssaa")
@@ -111,6 +132,7 @@ def _png(pixels: Array) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
+@_without_display_warning()
 def surface_figure(store: Store) -> Figure | None:
     """The limb from four sides: skin translucent, bones inside, sites named on the side that shows them."""
     files = store.surface_files
@@ -119,10 +141,10 @@ def surface_figure(store: Store) -> Figure | None:
     plotter = _plotter()
     skin = pv.read(files["skin"])
     plotter.enable_depth_peeling(8)
-    plotter.add_mesh(skin, color=SKIN, opacity=0.38, smooth_shading=True, specular=0.1)
+    plotter.add_mesh(skin, color=SKIN_SURFACE, opacity=0.36, smooth_shading=True, **MATT)
     for name, file in files.items():
         if name != "skin":
-            plotter.add_mesh(pv.read(file), color=BONE, smooth_shading=True, specular=0.2)
+            plotter.add_mesh(pv.read(file), color=BONE, **MATT)
     left, back, up = limb_frame(store)
     sides = (("anterior", back), ("left", -left), ("posterior", -back), ("right", left))
     points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
@@ -157,12 +179,14 @@ def _mark(row: Json, axis: bool = False) -> Mark:
     return Mark(str(row["site"]), position, color, fitted, direction)
 
 
+@_without_display_warning()
 def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
     rows = _drawable(store, sites, "mesh")
     if not rows:
         return None
-    whole, near = [], []
+    whole: list[Shot] = []
+    near: list[Shot] = []
     for row, file in rows:
         view, close = _cut_views(store, row, file)
         plotter = _plotter()
@@ -182,6 +206,7 @@ def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     return Figure("mesh-cut", markup, caption)
 
 
+@_without_display_warning()
 def field_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
     rows = _drawable(store, sites, "predict")
@@ -190,20 +215,28 @@ def field_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     field = next(((name, title) for name, title in FIELDS if name in stored), None)
     if not grids or field is None or "displacement_mm" not in stored:
         return None
-    limits = _limits([grid for _, _, grid in grids], field[0])
-    shots = []
-    for row, file, grid in grids:
-        _, close = _cut_views(store, row, file)
-        plotter = _plotter()
-        cut = _far_side(grid, close, smooth=True).warp_by_vector("displacement_mm")
-        scalars = {"scalars": field[0], "clim": limits, "cmap": FIELD_MAP, "show_scalar_bar": False}
-        plotter.add_mesh(cut.extract_surface(algorithm="dataset_surface"), **scalars, lighting=False)
-        shots.append((_shoot(plotter, close), close, []))
-        plotter.close()
+    views = [_cut_views(store, row, file)[1] for row, file, _ in grids]
+    cuts = [_far_side(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
+    limits = _limits(cuts, views, field[0])
+    shots: list[Shot] = [
+        (_shoot_field(cut, view, field[0], limits), view, []) for view, cut in zip(views, cuts, strict=True)
+    ]
     names = [row["site"] for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
     caption = f"Deformed cut through each fitted site at the largest indentation; colour: {field[1]}."
     return Figure("field", _strip(shots, names, alt) + _colour_bar(limits, field[1]), caption)
+
+
+def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
+    """A deformed cut, coloured by a field without shading, so that colours can be read off the bar."""
+    plotter = _plotter()
+    surface = cut.warp_by_vector("displacement_mm").extract_surface(algorithm="dataset_surface")
+    plotter.add_mesh(
+        surface, scalars=field, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, lighting=False
+    )
+    pixels = _shoot(plotter, view)
+    plotter.close()
+    return pixels
 
 
 def _drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
@@ -213,7 +246,7 @@ def _drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json
     return [(row, file) for row, file in found if file is not None]
 
 
-def _linear(file: Path) -> pv.UnstructuredGrid:
+def _linear(file: Path) -> Grid:
     """The stored mesh with straight-edged elements, which draw much faster."""
     return pv.read(file).linear_copy()
 
@@ -234,7 +267,7 @@ def _cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
     return whole, close
 
 
-def _far_side(grid: pv.UnstructuredGrid, view: View, smooth: bool = False) -> pv.DataSet:
+def _far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
     """What lies behind the plane through the middle of the view: whole cells, or cut through."""
     if smooth:
         return grid.clip(normal=tuple(view.direction), origin=tuple(view.focal), invert=False)
@@ -242,33 +275,37 @@ def _far_side(grid: pv.UnstructuredGrid, view: View, smooth: bool = False) -> pv
     return grid.extract_cells(np.flatnonzero((centres - view.focal) @ view.direction > 0))
 
 
-def _add_regions(plotter: pv.Plotter, grid: pv.DataSet) -> None:
-    regions = np.asarray(grid.cell_data[_region_name(grid)])
-    for index, color in ((0, SKIN), (1, MUSCLE)):
+def _add_regions(plotter: Any, grid: Grid) -> None:
+    names = [str(name) for name in grid.field_data.get("region_names", ("skin", "muscle"))]
+    regions = np.asarray(grid.cell_data["region"])
+    for index, name in enumerate(names):
         part = grid.extract_cells(np.flatnonzero(regions == index))
         if part.n_cells:
             surface = part.extract_surface(algorithm="dataset_surface")
-            plotter.add_mesh(surface, color=color, show_edges=True, edge_color="#3b2f2f", line_width=1)
+            color = SKIN if name == "skin" else MUSCLE
+            plotter.add_mesh(
+                surface, color=color, show_edges=True, edge_color="#5a4040", line_width=1, **MATT
+            )
 
 
-def _region_name(grid: pv.DataSet) -> str:
-    return next(name for name in ("regions", "region") if name in grid.cell_data)
-
-
-def _limits(grids: Sequence[pv.UnstructuredGrid], field: str) -> tuple[float, float]:
-    """Colour limits shared by all pictures: the 0.5 and 99.5 percentile, so that a corner does not rule."""
-    values = [np.asarray(grid[field]) for grid in grids if field in grid.array_names]
-    flat = np.concatenate([np.linalg.norm(v, axis=1) if v.ndim == 2 else v for v in values])
-    low, high = np.percentile(flat, [0.5, 99.5])
+def _limits(cuts: Sequence[Grid], views: Sequence[View], field: str) -> tuple[float, float]:
+    """Colour limits shared by all pictures: percentiles of what they show, so that a corner does not rule."""
+    shown = []
+    for cut, view in zip(cuts, views, strict=True):
+        where = cut.points if field in cut.point_data else cut.cell_centers().points
+        values = np.asarray(cut[field], dtype=float)
+        seen = np.linalg.norm(np.asarray(where) - view.focal, axis=1) < view.half_height_mm
+        shown.append((np.linalg.norm(values, axis=1) if values.ndim == 2 else values)[seen])
+    low, high = np.percentile(np.concatenate(shown), [1, 99])
     return float(low), float(max(high, low + 1e-9))
 
 
 # ---- pictures as SVG ------------------------------------------------------------------------------------
 
-_GAP, _TITLE = 14, 34
+_GAP, _TITLE = 14, 46
 
 
-def _strip(shots: Sequence[tuple[Array, View, list[Mark]]], titles: Sequence[str], alt: str) -> str:
+def _strip(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
     """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
     width = sum(view.size[0] for _, view, _ in shots) + _GAP * (len(shots) - 1)
     height = max(view.size[1] for _, view, _ in shots) + _TITLE
@@ -299,10 +336,10 @@ def _labels(view: View, marks: list[Mark]) -> str:
             fill = mark.color if mark.filled else PAPER
             parts.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="9" fill="{fill}" stroke="{mark.color}"/>')
             ly = y
-            while any(abs(ly - py) < 26 and abs(x - px) < 22 * (2 + len(mark.text)) for px, py in placed):
+            while any(abs(ly - py) < 32 and abs(x - px) < 24 * (2 + len(mark.text)) for px, py in placed):
                 ly += 4
             placed.append((x, ly))
-            parts.append(f'<text class="site" x="{x + 15:.0f}" y="{ly + 8:.0f}">{escape(mark.text)}</text>')
+            parts.append(f'<text class="site" x="{x + 15:.0f}" y="{ly + 11:.0f}">{escape(mark.text)}</text>')
     return "".join(parts)
 
 
@@ -315,9 +352,8 @@ def _arrow(view: View, mark: Mark) -> str:
     tail, wing = tip - 70 * step, tip - 22 * step
     head = " ".join(f"{p[0]:.0f},{p[1]:.0f}" for p in (tip, wing + 10 * side, wing - 10 * side))
     shaft = f'x1="{tail[0]:.0f}" y1="{tail[1]:.0f}" x2="{wing[0]:.0f}" y2="{wing[1]:.0f}"'
-    return (
-        f'<line {shaft} stroke="{mark.color}" stroke-width="6"/><polygon points="{head}" fill="{mark.color}"/>'
-    )
+    line = f'<line {shaft} stroke="{mark.color}" stroke-width="6"/>'
+    return f'{line}<polygon points="{head}" fill="{mark.color}"/>'
 
 
 def _scale_bar(view: View) -> str:
@@ -337,8 +373,9 @@ def _legend(entries: Iterable[tuple[str, str]]) -> str:
 
 def _colour_bar(limits: tuple[float, float], title: str) -> str:
     stops = ", ".join(
-        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[FIELD_MAP](t)[:3]) for t in np.linspace(0, 1, 9)
+        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[FIELD_MAP](t)[:3])
+        for t in np.linspace(0, 1, 9)
     )
     bar = f'<i class="colour-bar" style="background:linear-gradient(90deg, {stops})"></i>'
-    low, high = (f"{value:.3g}" for value in limits)
+    low, high = (number(value) for value in limits)
     return f'<div class="legend"><span>{low}</span>{bar}<span>{high}</span><span>{escape(title)}</span></div>'

@@ -109,18 +109,18 @@ def _how_well(store: Store) -> str:
     worst = f" (largest {tables.fixed(max(errors))} %)" if errors else ""
     return (
         f"At {places} not used, the model predicts the force with a mean error of "
-        f"{tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted sites it "
-        f"is {tables.mean_and_deviation(store, 'fitted')} %."
+        f"{tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted sites "
+        f"it is {tables.mean_and_deviation(store, 'fitted')} %."
     )
 
 
 def _one_or_two(store: Store) -> str:
     held = [row for row in store.predicted if not row.get("fitted")]
-    one = [row.get("error_one_material_percent") for row in held]
-    two = [row.get("error_percent") for row in held]
-    if not held or None in one or None in two:
+    pairs = [(row.get("error_one_material_percent"), row.get("error_percent")) for row in held]
+    known = [(one, two) for one, two in pairs if one is not None and two is not None]
+    if not known:
         return ""
-    first, second = statistics.fmean(one), statistics.fmean(two)
+    first, second = (statistics.fmean(column) for column in zip(*known, strict=True))
     start = f"With one material for all soft tissue the held-out error is {tables.fixed(first)} %: "
     if abs(first - second) < 0.1 * max(first, second):
         return start + "here two materials predict no better than one."
@@ -215,7 +215,9 @@ def parameters(store: Store) -> Section:
         blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
     noise = (store.calibration.get("uncertainty") or {}).get("noise_N")
     if noise is not None:
-        text = f"The intervals rest on a force noise of {tables.number(noise)} N, estimated from the records."
+        text = (
+            f"The intervals rest on a force noise of {tables.fixed(noise, 3)} N, estimated from the records."
+        )
         blocks = (*blocks, Prose(text))
     return Section("parameters", "Parameters", blocks)
 
@@ -224,7 +226,7 @@ def convergence(store: Store) -> Section:
     """How the identification went."""
     stages = store.stages
     texts = tuple(
-        f"{str(stage['name']).capitalize()}: {'converged' if stage.get('converged') else 'not converged'} after "
+        f"{str(stage['name']).capitalize()}: {'' if stage.get('converged') else 'not '}converged after "
         f"{len(stage.get('iterations') or ())} iterates and {stage.get('evaluations', tables.NOTHING)} "
         f"evaluations; {stage.get('reason') or 'no reason stored'}."
         for stage in stages
@@ -249,7 +251,9 @@ def solver(store: Store) -> Section:
     }
     known = {key: value for key, value in facts.items() if value is not None}
     failed = [str(row["site"]) for row in store.predicted if not row.get("completed")]
-    warning = f"The simulation did not reach the end of the record at: {', '.join(failed)}." if failed else None
+    warning = (
+        f"The simulation did not reach the end of the record at: {', '.join(failed)}." if failed else None
+    )
     blocks = _blocks(
         Note(warning) if warning else None,
         tables.solver_table(store) if store.predicted else None,
@@ -265,9 +269,9 @@ def method(store: Store) -> Section:
     """The method in words that a paper's supplement can take over."""
     options = store.run.get("settings") or {}
     geometry, indenter = options.get("geometry") or {}, options.get("indenter") or {}
-    kappa = (options.get("material") or {}).get("kappa_ratio")
-    layer = tables.number(geometry.get("skin_layer_mm"))
-    width = tables.number(indenter.get("width_mm"))
+    kappa = (options.get("material") or {}).get("kappa_ratio", tables.NOTHING)
+    layer = geometry.get("skin_layer_mm", tables.NOTHING)
+    width = indenter.get("width_mm", tables.NOTHING)
     return Section(
         "method",
         "Method",
@@ -276,7 +280,7 @@ def method(store: Store) -> Section:
                 "The method follows Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater.): "
                 "both tissues obey the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with "
                 "quasi-linear viscoelasticity, G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress. "
-                f"The bulk modulus κ is c times {tables.number(kappa)}. The skin–adipose layer is {layer} mm "
+                f"The bulk modulus κ is c times {kappa}. The skin–adipose layer is {layer} mm "
                 "thick; bones are voids whose surfaces, like the proximal cut, do not move."
             ),
             Prose(
@@ -324,7 +328,9 @@ def provenance(store: Store) -> Section:
     known = {name: value for name, value in versions.items() if value}
     blocks = _blocks(
         tables.pair_table("versions", "Software.", ("Library", "Version"), known) if known else None,
-        tables.pair_table("inputs", "Inputs and their SHA-256.", ("File", "SHA-256"), inputs) if inputs else None,
+        tables.pair_table("inputs", "Inputs and their SHA-256.", ("File", "SHA-256"), inputs)
+        if inputs
+        else None,
         otherwise="No versions and input hashes are stored.",
     )
     return Section("provenance", "Versions and inputs", blocks)

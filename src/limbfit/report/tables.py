@@ -17,7 +17,7 @@ MEANING = {
     "gamma": "relaxation amplitude",
     "tau_s": "relaxation time",
 }
-TISSUE_NAMES = {"skin": "Skin–adipose layer", "muscle": "Muscle–soft tissue"}
+TISSUE_NAMES = {"skin": "Skin–adipose", "muscle": "Muscle"}
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -364,7 +364,7 @@ def timing_table(store: Store) -> Table:
     seconds = {name: facts.get("seconds") for name, facts in (store.run.get("stages") or {}).items()}
     known = {name: value for name, value in seconds.items() if isinstance(value, int | float)}
     longest = max([*known.values(), 1e-9])
-    finished = {name: str(facts.get("finished", NOTHING)) for name, facts in store.run["stages"].items()}
+    finished = {name: _moment(facts.get("finished")) for name, facts in store.run["stages"].items()}
     rows = tuple(
         Row((_h(name), _n(duration(value), share=value / longest), Cell(finished[name])))
         for name, value in known.items()
@@ -372,6 +372,11 @@ def timing_table(store: Store) -> Table:
     total = Row((_h("Total"), _n(duration(sum(known.values()))), Cell("")))
     caption = "How long each stage took."
     return Table("timing", caption, ("Stage", "Time", "Finished"), rows, (total,))
+
+
+def _moment(text: Any) -> str:
+    """An ISO time as people read it: date, hour, minute."""
+    return str(text)[:16].replace("T", " ") if text else NOTHING
 
 
 def pair_table(name: str, caption: str, head: tuple[str, str], pairs: Mapping[str, Any]) -> Table:

@@ -1,0 +1,248 @@
+"""The report of a finished study, and of studies in which something is missing or hostile."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from stored_results import SITES, write_results
+
+from limbfit.errors import InputError
+from limbfit.report import build_report
+
+VOID = {"meta", "link", "br", "img", "input", "hr", "path", "image", "use", "line", "circle"}
+
+
+class Outline(HTMLParser):
+    """Collects tags with attributes, identifiers, and checks that what opens also closes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_results(tmp_path_factory.mktemp("study") / "results")
+
+
+@pytest.fixture(scope="module")
+def report(results: Path) -> str:
+    return build_report(results, results / "report").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def copy(results: Path, tmp_path: Path) -> Path:
+    """The results without the geometry that only pictures need, to change and to break."""
+    left_out = shutil.ignore_patterns("report", "*.vtu", "*.stl")
+    return Path(shutil.copytree(results, tmp_path / "results", ignore=left_out))
+
+
+def _section(text: str, name: str) -> str:
+    found = re.search(rf'<section id="{name}".*?</section>', text, re.DOTALL)
+    assert found, name
+    return found.group()
+
+
+def test_one_file_without_requests(report: str) -> None:
+    outline = Outline(report)
+    links = [a.get(key, "") for _, a in outline.tags for key in ("src", "href", "xlink:href", "srcset")]
+    assert [link[:40] for link in links if link and not link.startswith(("#", "data:"))] == []
+    assert "http:" not in report
+    assert "https:" not in report
+    assert not outline.all("script")
+    assert re.findall(r"@import|url\((?!#)", report) == []
+
+
+def test_well_formed_and_accessible(report: str) -> None:
+    outline = Outline(report)
+    assert outline.open == []
+    names = [a["id"] for _, a in outline.tags if "id" in a]
+    assert len(names) == len(set(names))
+    assert set(re.findall(r'(?:url\(#|href="#)([^")]+)', report)) <= set(names)
+    assert len(outline.all("table")) == report.count("<caption") >= 8
+    assert all(header.get("scope") in ("col", "row") for header in outline.all("th"))
+    pictures = re.findall(r"<svg[^>]*role=\"img\"[^>]*><title>([^<]*)</title>", report)
+    assert len(pictures) == report.count("<svg") >= 9
+    assert all(len(title) > 20 for title in pictures)
+
+
+def test_small_and_quick(results: Path, tmp_path: Path) -> None:
+    start = time.perf_counter()
+    file = build_report(results, tmp_path)
+    assert time.perf_counter() - start < 40
+    assert file == tmp_path / "report.html"
+    assert file.stat().st_size < 8e6
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.parametrize("section", ["model", "meshes", "records", "prediction", "solver"])
+def test_every_site_in_every_table(report: str, section: str) -> None:
+    text = _section(report, section)
+    for site, *_ in SITES:
+        assert f'<th scope="row">{site}</th>' in text
+
+
+def test_numbers_with_units(report: str) -> None:
+    assert re.search(r"<dd>1\.6 ± 0\.2 <small>%</small></dd>", report)
+    assert re.search(r"<dd>5\.43 <small>kPa</small></dd>", report)
+    assert "(3.26 to 9.23 kPa)" in report
+    for label in (
+        "Time (s)",
+        "Force (N)",
+        "Displacement (mm)",
+        "Largest force (N)",
+        "von Mises stress (kPa)",
+    ):
+        assert label in report
+    assert "At the 3 sites that were not used, the model predicts the force with a mean error of" in report
+
+
+def test_parameter_table_shows_start_both_stages_interval_and_truth(report: str) -> None:
+    table = re.search(r'<table id="table-parameters">.*?</table>', report, re.DOTALL)
+    assert table
+    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table.group(), re.DOTALL)
+    cells = [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
+    assert cells[0][3:] == ["Start", "One material", "Two materials", "95 % interval", "Verdict", "Truth"]
+    assert cells[2][3:] == ["3.00", "4.82", "4.52", "2.71 to 7.68", "weakly determined", "4.40"]
+    assert len(cells) == 9
+
+
+def test_site_table_marks_the_fitted(report: str) -> None:
+    table = re.search(r'<table id="table-sites">.*?</table>', report, re.DOTALL)
+    assert table
+    marked = re.findall(r'<tr class="marked">\s*<th scope="row">([^<]*)</th>', table.group())
+    assert marked == [site for site, _, fitted, *_ in SITES if fitted]
+    assert "0.9 ± 0.3" in table.group()
+
+
+def test_correlations_are_coloured_by_sign(report: str) -> None:
+    text = _section(report, "parameters")
+    assert re.search(r'class="number cold" style="--shade:68%">−0\.90<', text)
+    assert re.search(r'class="number warm" style="--shade:75%">1\.00<', text)
+
+
+def test_pictures_show_the_model(report: str) -> None:
+    images = [a["href"] for a in Outline(report).all("image") if a["href"].startswith("data:image/png")]
+    fitted = sum(fitted for _, _, fitted, *_ in SITES)
+    assert len(images) == 4 + 3 * fitted  # four sides; per fitted site the cut, its neighbourhood, the field
+    assert len(set(images)) == len(images)
+    assert min(len(image) for image in images) > 20_000  # an empty picture compresses to far less
+
+
+def test_names_are_escaped(copy: Path) -> None:
+    evil = '<script>alert("x")</script> & $x^2$'
+    for file in copy.rglob("*.json"):
+        text = file.read_text()
+        file.write_text(
+            text.replace('"tibia"', json.dumps(evil)).replace("Phantom 7 (coarse)", "a <b>bold</b> limb")
+        )
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert "<script" not in text
+    assert "<b>" not in text
+    assert "a &lt;b&gt;bold&lt;/b&gt; limb" in text
+    assert "&lt;script&gt;" in text
+    assert Outline(text).open == []
+
+
+@pytest.mark.parametrize(
+    ("gone", "section", "sentence"),
+    [
+        ("surfaces", "model", "Label map (cm³)"),
+        ("mesh", "meshes", "No meshes are stored yet."),
+        ("traces", "records", "No indentation records are stored yet."),
+        ("calibrate", "parameters", "No parameters have been identified yet."),
+        ("predict", "prediction", "No predictions are stored yet."),
+        ("run.json", "timing", "No times are stored."),
+    ],
+)
+def test_missing_parts_are_said(copy: Path, gone: str, section: str, sentence: str) -> None:
+    path = copy / gone
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert sentence in _section(text, section)
+    assert Outline(text).open == []
+
+
+def test_an_empty_folder_gives_a_report_that_says_so(tmp_path: Path) -> None:
+    text = build_report(tmp_path, tmp_path / "report").read_text(encoding="utf-8")
+    assert "Nothing has been computed yet" in text
+    assert text.count('role="note"') >= 9
+
+
+def test_no_truth_no_uncertainty_no_band(copy: Path) -> None:
+    (copy / "truth.json").unlink()
+    file = copy / "calibrate" / "calibration.json"
+    content = json.loads(file.read_text())
+    del content["uncertainty"]
+    file.write_text(json.dumps(content))
+    for curve in (copy / "predict").glob("*.csv"):
+        rows = [",".join(line.split(",")[:4]) for line in curve.read_text().splitlines()]
+        curve.write_text("\n".join(rows))
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert "Truth" not in text
+    assert "No uncertainty is stored" in text
+    assert ">95 % interval</text>" not in text
+
+
+def test_a_failed_simulation_is_named(copy: Path) -> None:
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    content["sites"][5] |= {
+        "completed": False,
+        "reason": "the step fell below its limit",
+        "error_percent": None,
+    }
+    file.write_text(json.dumps(content))
+    text = _section(build_report(copy, copy / "report").read_text(encoding="utf-8"), "solver")
+    assert "did not reach the end of the record at: PO-6" in text
+    assert "no: the step fell below its limit" in text
+
+
+def test_broken_summary_names_the_file(copy: Path) -> None:
+    (copy / "predict" / "predict.json").write_text('{"sites": [')
+    with pytest.raises(InputError, match=r"predict\.json: not readable.*run its stage again"):
+        build_report(copy, copy / "report")
+    assert not (copy / "report").exists()
+
+
+def test_broken_curve_names_the_file(copy: Path) -> None:
+    (copy / "predict" / "PT-1.csv").write_text("time_s,force_measured_N\n1.0\n")
+    with pytest.raises(InputError, match=r"PT-1\.csv: its rows do not fit its header"):
+        build_report(copy, copy / "report")
+
+
+def test_no_results_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no results there; run the study first"):
+        build_report(tmp_path / "nowhere", tmp_path)
+
+
+def test_the_report_never_loads_a_solver() -> None:
+    code = (
+        "import sys, limbfit.report\n"
+        "rooms = ('fe', 'identify', 'phantom', 'pipeline', 'indentation', 'study', 'anatomy')\n"
+        "print([n for n in sys.modules if n.startswith(tuple('limbfit.' + r for r in rooms))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,54 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from limbfit.report.tables import duration, fixed, flatten, number
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (4.7, "4.70"),
+        (-0.0123456, "−0.0123"),
+        (0.000012, "1.20e−05"),
+        (0, "0.00"),
+        (100.0, "100"),
+        (41987.4, "41 987"),
+        (3e7, "3.00e+07"),
+        (math.nan, "–"),
+        (math.inf, "∞"),
+        (None, "–"),
+    ],
+)
+def test_number(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_fixed() -> None:
+    assert [fixed(6.749), fixed(-0.26, 2), fixed(None), fixed(math.nan)] == ["6.7", "−0.26", "–", "–"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(4.26, "4.3 s"), (151.2, "2 min 31 s"), (5700, "1 h 35 min"), (None, "–")],
+)
+def test_duration(seconds: float | None, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_flatten_names_sites_and_keeps_order() -> None:
+    settings = {
+        "mesh": {"element": "tet10"},
+        "sites": [{"name": "A", "axis": [0, 0, 1], "fitted": True, "near": None}],
+    }
+    assert flatten(settings) == {
+        "mesh.element": "tet10",
+        "sites.A.name": "A",
+        "sites.A.axis": "0, 0, 1",
+        "sites.A.fitted": "yes",
+        "sites.A.near": "–",
+    }
