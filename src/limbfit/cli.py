@@ -17,7 +17,14 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from . import __version__, pipeline
@@ -35,7 +42,9 @@ app = typer.Typer(
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
 
-StudyPath = Annotated[Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)]
+StudyPath = Annotated[
+    Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
+]
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object and nothing else")]
 
 
@@ -73,9 +82,7 @@ def demo(
     """Make a coarse synthetic patient and identify it: the whole path, from DICOM to report."""
     start = perf_counter()
     with listening() as listener:
-        if not (folder / "truth.json").is_file():
-            pipeline.make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)
-        summary = pipeline.run_study(load_study(folder), listener=listener)
+        summary = pipeline.run_demo(folder, seed=seed, listener=listener)
     summary["seconds"] = round(perf_counter() - start, 1)
     show_summary(summary, as_json)
 
@@ -83,7 +90,9 @@ def demo(
 @app.command()
 def phantom(
     folder: Annotated[Path, typer.Argument(help="a folder that does not exist yet", show_default=False)],
-    detail: Annotated[Detail, typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")] = Detail.coarse,
+    detail: Annotated[
+        Detail, typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
+    ] = Detail.coarse,
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -252,9 +261,7 @@ def listening() -> Iterator[Callable[[pipeline.Progress], None]]:
         def listen(event: pipeline.Progress) -> None:
             if event.stage not in tasks:
                 tasks[event.stage] = bars.add_task(event.stage, text="", total=None)
-            bars.update(
-                tasks[event.stage], completed=event.done, total=event.total or None, text=event.text
-            )
+            bars.update(tasks[event.stage], completed=event.done, total=event.total or None, text=event.text)
 
         yield listen
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fe import History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
-from .mesh import Mesh, read_vtu
+from .mesh import Mesh, read_vtu, write_vtu
 from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable
 
 Parameters = dict[str, dict[str, float]]
@@ -70,7 +70,6 @@ class SimulationJob:
     parameters: tuple[float, ...]
     times_s: tuple[float, ...]
     sensitivities: bool = True
-    store: str = "none"
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     )
 
 
-_KEPT = 6  # meshes and last results that a worker keeps: its share of the sites of one study
+_KEPT = 9  # meshes and last results that a worker keeps: its share of the sites of one study
 _meshes: OrderedDict[str, Mesh] = OrderedDict()
 _last: OrderedDict[str, Result] = OrderedDict()
 
@@ -139,32 +138,67 @@ def _keep(cache: OrderedDict, key: str, value: Any) -> Any:
     return value
 
 
-def solve_site(
-    model: SiteModel, parameters: Parameters, *, sensitivities: bool = False, store: str = "peak"
-) -> Result:
-    """Simulate one indentation and return the solver's full result (see :class:`limbfit.fe.Result`)."""
-    mesh = _meshes.get(model.mesh_digest) or _keep(_meshes, model.mesh_digest, read_vtu(model.mesh))
-    steps = StepControl(load_steps=model.steps.load_steps, unload_steps=model.steps.unload_steps)
-    return solve(
-        build_problem(model, mesh, parameters), steps=steps, sensitivities=sensitivities, store=store
-    )
+def _mesh(model: SiteModel) -> Mesh:
+    return _meshes.get(model.mesh_digest) or _keep(_meshes, model.mesh_digest, read_vtu(model.mesh))
+
+
+def _steps(model: SiteModel) -> StepControl:
+    return StepControl(load_steps=model.steps.load_steps, unload_steps=model.steps.unload_steps)
 
 
 def simulate(job: SimulationJob) -> Simulation:
-    """Simulate a job; a failure is a result with a reason, never an exception."""
-    result = solve_site(
-        job.model, to_parameters(np.array(job.parameters)), sensitivities=job.sensitivities, store=job.store
+    """Simulate a job; a failure is a result with a reason, never an exception.
+
+    The last simulation of the same site in this process gives the first guesses.
+    """
+    model = job.model
+    problem = build_problem(model, _mesh(model), to_parameters(np.array(job.parameters)))
+    result = solve(
+        problem,
+        steps=_steps(model),
+        sensitivities=job.sensitivities,
+        warm_start=_last.get(model.mesh_digest),
+        store="all",
     )
+    if result.completed:
+        _keep(_last, model.mesh_digest, result)
     times = np.array(job.times_s)
     return Simulation(
-        site=job.model.name,
+        site=model.name,
         force_N=result.force_at(times),
         jacobian=_in_user_units(result, times) if job.sensitivities else None,
         completed=result.completed,
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
-        facts=result.statistics.as_dict(),
+        facts=dict(result.statistics),
     )
+
+
+def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
+    """Simulate an indentation and store its fields at the deepest point as VTU.
+
+    Point data ``displacement_mm``; cell data ``J``, ``von_mises_kPa`` (Cauchy), ``largest_stretch``,
+    ``smallest_stretch`` and ``energy_kPa`` (long-term elastic energy density).
+    """
+    mesh = _mesh(model)
+    result = solve(build_problem(model, mesh, parameters), steps=_steps(model), store="peak")
+    fields = result.fields()
+    cell_data = {
+        "J": fields.J,
+        "von_mises_kPa": von_mises(fields.cauchy) / KPA,
+        "largest_stretch": fields.stretches[:, 0],
+        "smallest_stretch": fields.stretches[:, 2],
+        "energy_kPa": fields.energy / KPA,
+    }
+    write_vtu(mesh, file, point_data={"displacement_mm": result.states[0].u}, cell_data=cell_data)
+    return result
+
+
+def von_mises(cauchy: Array) -> Array:
+    """Equivalent stress (m,) of stresses (m, 6) in the order xx, yy, zz, xy, yz, zx."""
+    xx, yy, zz, xy, yz, zx = cauchy.T
+    normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
+    return np.sqrt(0.5 * normal + 3.0 * (xy**2 + yz**2 + zx**2))
 
 
 def _in_user_units(result: Result, times: Array) -> Array:

@@ -62,7 +62,8 @@ def label_volumes(labels: LabelMap) -> dict[str, float]:
     """Volume of each label in cubic centimetres."""
     voxel_cm3 = float(np.prod(labels.spacing)) / 1000
     return {
-        name: round(float((labels.array == value).sum()) * voxel_cm3, 2) for value, name in labels.names.items()
+        name: round(float((labels.array == value).sum()) * voxel_cm3, 2)
+        for value, name in labels.names.items()
     }
 
 
@@ -71,7 +72,7 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     context.tell("surfaces", 0, 2, "building surfaces")
     if study.surfaces is not None:
-        anatomy = _given_anatomy(study)
+        anatomy = given_anatomy(study)
     else:
         anatomy = _imaged_anatomy(context)
         if study.image is not None and study.image.markers is not None:
@@ -98,7 +99,7 @@ def _imaged_anatomy(context: Context) -> Anatomy:
     )
 
 
-def _given_anatomy(study: Study) -> Anatomy:
+def given_anatomy(study: Study) -> Anatomy:
     """The anatomy from closed surfaces; without a stated cut the most proximal (highest z) face of the skin."""
     assert study.surfaces is not None
     tables = study.surfaces
@@ -121,7 +122,7 @@ def run_sites(context: Context, folder: Path) -> dict[str, Any]:
     anatomy = load_anatomy(context.store["surfaces"])
     context.tell("sites", 0, 1, "placing sites")
     markers = _matched_markers(context, anatomy)
-    placed = [_place(site, study, anatomy, markers) for site in study.sites]
+    placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]
     write_json(folder / "sites.json", {"sites": placed})
     return {}
 
@@ -134,8 +135,14 @@ def _matched_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
     return dict(match_markers(find_markers(marked, anatomy.skin), hints))
 
 
-def _place(site: Site, study: Study, anatomy: Anatomy, markers: dict[str, Any]) -> dict[str, Any]:
-    marker = markers.get(site.name)
+def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[str, Any]:
+    """A site on the skin with its axis; ``marker`` is what was matched to it, or None.
+
+    Raises
+    ------
+    SiteError
+        When the site is too far off the skin.
+    """
     wanted = np.array(site.position) if marker is None else marker.position
     try:
         point, off = anatomy_sites.project_to_skin(anatomy, wanted)
@@ -219,7 +226,8 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
         facts[job.site] = made
         context.tell("mesh", len(facts), len(jobs), f"site {job.site}: {made['nodes']} nodes")
     write_json(
-        folder / "mesh.json", {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
+        folder / "mesh.json",
+        {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}},
     )
     for job in jobs:
         job.file.with_suffix(".json").unlink()

@@ -1,0 +1,74 @@
+"""Read every input of a study and say what is wrong with it, before anything runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..anatomy.imaging import read_labels, read_volume
+from ..anatomy.surfaces import check_anatomy
+from ..study import Study
+from .context import Listener, Progress
+from .geometry_stages import given_anatomy, place_site
+from .model_stages import read_site_trace
+
+
+def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
+    """Facts about a study's inputs; raises at the first that cannot be used.
+
+    Returns
+    -------
+    dict
+        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down per recorded site).
+
+    Raises
+    ------
+    InputError
+        For an image, label map, surface, site or record that cannot be used.
+    """
+    facts: list[str] = []
+    listener(Progress("check", 0, 2, "geometry"))
+    facts += _image_facts(study) if study.image is not None else _surface_facts(study)
+    listener(Progress("check", 1, 2, "records"))
+    sites = {site.name: read_site_trace(study, site)[2] for site in study.sites if site.trace is not None}
+    for name, record in sites.items():
+        facts.append(
+            f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
+            f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} mm"
+        )
+    facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
+    listener(Progress("check", 2, 2))
+    return {"study": study.study.name, "facts": facts, "sites": sites}
+
+
+def _image_facts(study: Study) -> list[str]:
+    assert study.image is not None
+    facts = []
+    for name, path, series in (
+        ("image", study.image.path, study.image.series),
+        ("image with markers", study.image.markers, study.image.markers_series),
+    ):
+        if path is None:
+            continue
+        volume = read_volume(study.path(path), series)
+        size = " x ".join(str(n) for n in volume.array.shape[::-1])
+        spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
+        facts.append(f"{name}: {size} voxels of {spacing} mm")
+        if name == "image" and study.segmentation.labels is not None:
+            labels = read_labels(study.path(study.segmentation.labels), volume)
+            facts.append("corrected labels: " + ", ".join(labels.names.values()))
+    return facts
+
+
+def _surface_facts(study: Study) -> list[str]:
+    anatomy = given_anatomy(study)
+    check_anatomy(anatomy)
+    facts = [
+        f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
+        for name, surface in {"skin": anatomy.skin, **anatomy.bones}.items()
+    ]
+    for site in study.sites:
+        place_site(site, study, anatomy, None)
+    largest = np.ptp(anatomy.skin.points, axis=0)
+    return [*facts, "extent of the skin: " + " x ".join(f"{x:.0f}" for x in largest) + " mm"]

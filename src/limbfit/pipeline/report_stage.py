@@ -1,0 +1,20 @@
+"""The last stage: the report from what is stored."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ..report import build_report
+from .context import Context
+
+
+def run_report(context: Context, folder: Path) -> dict[str, Any]:
+    """``report.html``; a phantom's ``truth.json`` beside the study is shown in it."""
+    context.tell("report", 0, 1, "drawing figures")
+    truth = context.study.folder / "truth.json"
+    if truth.is_file():
+        shutil.copyfile(truth, context.store.folder / "truth.json")
+    build_report(context.store.folder, folder)
+    return {}

@@ -1,0 +1,75 @@
+"""One indentation of a study, simulated and stored for ParaView."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..execution import SerialExecutor
+from ..indentation import Parameters, peak_fields
+from ..study import TISSUES, Study
+from .context import Context, Listener
+from .model_stages import write_curves
+from .run import run_study
+from .simulations import CURVE_POINTS, planned_model, recorded_model
+from .store import Store, write_json
+
+
+def simulate_site(
+    study: Study, name: str, *, parameters: Parameters | None, listener: Listener
+) -> dict[str, Any]:
+    """Simulate one indentation: as recorded, or as the study plans it; meshes are made where missing.
+
+    Curve and fields at the deepest point go to ``results/simulate``.
+
+    Parameters
+    ----------
+    parameters : per tissue; by default the identified ones, else the study's start.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have, or any input of the stages before.
+    """
+    site = study.site(name)
+    run_study(study, until="mesh", listener=listener)
+    store = Store(study.results)
+    context = Context(study, store, SerialExecutor(), listener)
+    used, origin = (parameters, "given") if parameters else _known_parameters(study, store)
+    model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
+    folder = store["simulate"]
+    folder.mkdir(exist_ok=True)
+    context.tell("simulate", 0, 1, f"site {name}")
+    result = peak_fields(model, used, folder / f"{name}.vtu")
+    context.tell("simulate", 1, 1, f"site {name}")
+    times = np.linspace(0.0, model.knots_s[-1], CURVE_POINTS)
+    curve = folder / f"{name}.csv"
+    write_curves(
+        curve,
+        time_s=times,
+        displacement_mm=np.interp(times, model.knots_s, model.knots_mm),
+        force_N=result.force_at(times),
+    )
+    found = {
+        "site": name,
+        "parameters": used,
+        "parameters_from": origin,
+        "peak_force_N": result.peak_force,
+        "depth_mm": max(model.knots_mm),
+        "penetration_mm": float(result.penetration.max(initial=0.0)),
+        "completed": result.completed,
+        "reason": result.reason,
+        "element": result.statistics["element"],
+        "unknowns": result.statistics["unknowns"],
+        "curve": str(curve),
+        "fields": str(folder / f"{name}.vtu"),
+    }
+    write_json(folder / f"{name}.json", found)
+    return found
+
+
+def _known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
+    if (store["calibrate"] / "calibration.json").is_file():
+        return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], "identified"
+    return {tissue: study.material.start.model_dump() for tissue in TISSUES}, "start of the study"

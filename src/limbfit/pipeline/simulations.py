@@ -1,0 +1,118 @@
+"""Simulations of a study that are never done twice: kept on disk as they finish, keyed by what decides them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..execution import Executor
+from ..indentation import Simulation, SimulationJob, SiteModel, simulate
+from ..study import Site, Study
+from .context import Context
+from .store import atomic, digest, file_digest
+
+CURVE_POINTS = 81  # times, evenly over the indentation, at which measured and simulated force are compared
+
+
+class SimulationCache:
+    """Finished simulations in ``folder``, one file each; ``also`` are folders of earlier stages to look in."""
+
+    def __init__(self, folder: Path, also: Sequence[Path] = ()) -> None:
+        self.folder = folder
+        self.places = (folder, *also)
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def run(self, jobs: Sequence[SimulationJob], executor: Executor) -> Iterator[Simulation]:
+        """The jobs' simulations, in order; those not found are done on the executor and kept."""
+        found = {i: kept for i, job in enumerate(jobs) if (kept := self._find(job)) is not None}
+        missing = [job for i, job in enumerate(jobs) if i not in found]
+        made = executor.map(simulate, missing, keys=[job.model.name for job in missing])
+        for i, job in enumerate(jobs):
+            if i in found:
+                yield found[i]
+                continue
+            simulation = next(made)
+            self._keep(job, simulation)
+            yield simulation
+
+    def example(self) -> Simulation | None:
+        """Any kept simulation, for what they all have in common; None where there is none."""
+        file = next(self.folder.glob("*.npz"), None)
+        return None if file is None else _load(file)
+
+    def __len__(self) -> int:
+        return len(list(self.folder.glob("*.npz")))
+
+    def _find(self, job: SimulationJob) -> Simulation | None:
+        for place in self.places:
+            file = place / f"{job_digest(job)}.npz"
+            if file.is_file():
+                return _load(file)
+        return None
+
+    def _keep(self, job: SimulationJob, simulation: Simulation) -> None:
+        with atomic(self.folder / f"{job_digest(job)}.npz") as stream:
+            arrays = {"force_N": simulation.force_N}
+            if simulation.jacobian is not None:
+                arrays["jacobian"] = simulation.jacobian
+            facts = {
+                "site": simulation.site,
+                "completed": simulation.completed,
+                "reason": simulation.reason,
+                "penetration_mm": simulation.penetration_mm,
+                "facts": simulation.facts,
+            }
+            np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
+
+
+def _load(file: Path) -> Simulation:
+    with np.load(file, allow_pickle=False) as stored:
+        facts: dict[str, Any] = json.loads(str(stored["facts"]))
+        jacobian = stored["jacobian"] if "jacobian" in stored else None
+        return Simulation(force_N=stored["force_N"], jacobian=jacobian, **facts)
+
+
+def job_digest(job: SimulationJob) -> str:
+    """What decides a simulation, wherever its mesh file happens to lie."""
+    model = {key: value for key, value in vars(job.model).items() if key != "mesh"}
+    model |= {"indenter": job.model.indenter.model_dump(), "steps": job.model.steps.model_dump()}
+    return digest(model, job.parameters, job.times_s, job.sensitivities)
+
+
+def site_model(
+    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float]
+) -> SiteModel:
+    """The stored mesh and place of a site with a displacement history."""
+    study: Study = context.study
+    placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
+    mesh = context.store["mesh"] / f"{site.name}.vtu"
+    return SiteModel(
+        name=site.name,
+        mesh=mesh,
+        mesh_digest=file_digest(mesh),
+        position=tuple(placed["position_mm"]),
+        axis=tuple(placed["axis"]),
+        knots_s=tuple(knots_s),
+        knots_mm=tuple(knots_mm),
+        edge=site.edge,
+        indenter=study.indenter,
+        kappa_ratio=study.material.kappa_ratio,
+        steps=study.solver,
+    )
+
+
+def recorded_model(context: Context, site: Site) -> SiteModel:
+    """The site driven by its record, from touch-down."""
+    facts = context.stored("traces", "traces.json")["sites"][site.name]
+    return site_model(context, site, facts["knots_s"], facts["knots_mm"])
+
+
+def planned_model(context: Context, site: Site) -> SiteModel:
+    """The site driven by the depth and speed that the study plans for it, in and out."""
+    assert site.depth_mm is not None
+    ramp = site.depth_mm / site.speed_mm_s
+    return site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
