@@ -87,9 +87,9 @@ class Limb:
         """Points (..., 3) from LPS to the limb frame."""
         return (points - self.origin.astype(points.dtype)) @ self.rotation.astype(points.dtype)
 
-    def to_patient(self, points: Array) -> Array:
+    def to_patient(self, points: Array) -> NDArray[np.float64]:
         """Points (..., 3) from the limb frame to LPS."""
-        return points @ self.rotation.T + self.origin
+        return np.asarray(points, np.float64) @ self.rotation.T + self.origin
 
     def skin(self, points: Array) -> Array:
         """Skin field at LPS points (..., 3), unbounded proximally."""
@@ -105,7 +105,7 @@ class Limb:
         return np.minimum.reduce([bone_field(self.shape, name, local) for name in BONES])
 
     def skin_point(self, angle: float, height: float) -> NDArray[np.float64]:
-        """The LPS point of the skin at an angle around the limb and a height above its tip (above the dome)."""
+        """The LPS point of the skin at an angle around the limb and a height above its tip."""
         return self.to_patient(surface_point(self.shape, np.asarray(angle), np.asarray(height)))
 
     def inward(self, points: Array) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from pydicom.dataset import FileDataset, FileMetaDataset
-from pydicom.uid import ExplicitVRLittleEndian, MRImageStorage, generate_uid
+from pydicom.uid import UID, ExplicitVRLittleEndian, MRImageStorage, generate_uid
 from pydicom.valuerep import format_number_as_ds
 from scipy.special import ndtr
 
@@ -33,7 +33,7 @@ REACH_MM = 85.0  # no tissue or marker lies further from the limb's axis
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the voxels are: ``shape`` (k, j, i), ``spacing`` and ``direction`` columns for i, j, k, LPS mm."""
+    """Where the voxels are: ``shape`` (k, j, i); ``spacing``, ``direction`` columns for i, j, k (LPS mm)."""
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
@@ -91,7 +91,7 @@ def _occupancy(
     steps = [np.gradient(field, axis=axis) for axis in range(3)]
     per_voxel = np.sqrt(sum(g * g for g in steps))
     per_mm = np.sqrt(sum((g / h) ** 2 for g, h in zip(steps, spacing[::-1], strict=True)))
-    per_mm = np.maximum(per_mm, 0.2)
+    per_mm = np.clip(per_mm, 0.2, 1.6)  # fields are near-distances; their ridges and centres are not
     distance, width = field / per_mm, np.maximum(per_voxel / per_mm, 0.5 * min(spacing))
     return [ndtr(-np.sqrt(12.0, dtype=field.dtype) * (distance + offset) / width) for offset in offsets]
 
@@ -202,7 +202,7 @@ def write_series(
             progress(k.stop / grid.shape[0])
 
 
-def _uid(seed: int, *names: object) -> str:
+def _uid(seed: int, *names: object) -> UID:
     """The same seed gives the same identifiers, so that a phantom is reproduced to the byte."""
     return generate_uid(entropy_srcs=["limbfit phantom", str(seed), *map(str, names)])
 
@@ -212,7 +212,7 @@ def _decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
 
 
 def _slice_dataset(
-    grid: Grid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: str
+    grid: Grid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: UID
 ) -> FileDataset:
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = MRImageStorage
@@ -230,7 +230,7 @@ def _slice_dataset(
     return data
 
 
-def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: str) -> None:
+def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: UID) -> None:
     """Tags of a made-up scan; nobody is behind them."""
     data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
     data.StudyInstanceUID, data.SeriesInstanceUID = _uid(seed, "study"), series

@@ -1,0 +1,219 @@
+"""A synthetic patient with known truth, as a study folder.
+
+DIR/
+  mri/plain/, mri/markers/    DICOM series without and with skin markers
+  traces/site-<name>.csv      what the robot recorded
+  truth/                      the true surfaces
+  truth.json                  parameters, sites, limb, how the forces were made
+  study.toml                  what a user would write
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..anatomy.surfaces import save_anatomy
+from ..errors import InputError
+from .forces import MESHES, ForceJob, TrueForce, site_force
+from .geometry import Limb, make_limb
+from .mri import DETAIL_GRIDS, make_grid, write_series
+from .record import Ramp, record
+from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
+from .studyfile import study_text
+from .surfaces import true_anatomy
+
+Mapping = Callable[[Callable[[ForceJob], TrueForce], Iterable[ForceJob]], Iterable[TrueForce]]
+Listener = Callable[[str, float, float], None]
+Parameters = dict[str, dict[str, float]]
+
+PARAMETER_BASE: Parameters = {
+    "skin": {"c_kPa": 7.5, "m": 6.0, "gamma": 2.5, "tau_s": 0.5},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.2, "tau_s": 0.3},
+}
+PARAMETER_SPREAD = 0.15
+KAPPA_RATIO = 100.0
+
+
+def true_parameters(seed: int) -> Parameters:
+    """The tissues of a seed: within 15 % of the base, three digits."""
+    random = np.random.default_rng([seed, 7])
+    return {
+        tissue: {
+            name: float(f"{value * (1 + PARAMETER_SPREAD * random.uniform(-1, 1)):.3g}")
+            for name, value in values.items()
+        }
+        for tissue, values in PARAMETER_BASE.items()
+    }
+
+
+def make_phantom(
+    folder: str | Path,
+    detail: str = "coarse",
+    seed: int = 0,
+    sites: Sequence[str] | None = None,
+    mapping: Mapping = map,
+    progress: Listener | None = None,
+) -> dict[str, Any]:
+    """Make a synthetic patient in ``folder``; nothing is left there unless all of it was made.
+
+    Parameters
+    ----------
+    folder : must not exist, or be empty.
+    detail : ``coarse`` (2.4 mm voxels, 6 sites) or ``paper`` (the paper's voxels, 18 sites).
+    seed : which patient; the same seed gives the same files.
+    sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
+    mapping : like ``map``; given one that works in several processes, sites are simulated side by side.
+    progress : called with what is being done, how much of it is done, and of how much.
+
+    Returns
+    -------
+    dict
+        What ``truth.json`` holds.
+
+    Raises
+    ------
+    InputError
+        For a folder that is not empty, or an unknown detail or site.
+    """
+    folder = Path(folder)
+    tell = progress or (lambda text, done, total: None)
+    if detail not in DETAIL_GRIDS:
+        raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
+    limb = make_limb(seed)
+    everywhere = true_sites(limb, seed)
+    indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
+    with _appearing(folder) as work:
+        _write_images(work, limb, everywhere, detail, seed, tell)
+        truth = _truth(limb, everywhere, detail, seed)
+        truth["sites"] = _write_traces(work, limb, indented, detail, seed, mapping, tell)
+        (work / "study.toml").write_text(study_text(indented, detail, seed), encoding="utf-8")
+        (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
+    return truth
+
+
+@contextmanager
+def _appearing(folder: Path) -> Iterator[Path]:
+    """A hidden folder beside ``folder`` that takes its name when the block ends well."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise InputError("there is something already", file=folder, remedy="give a new or an empty folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield work
+        if folder.is_dir():
+            folder.rmdir()
+        work.chmod(0o755)
+        work.rename(folder)
+    except BaseException:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
+
+
+def _write_images(
+    work: Path, limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, tell: Listener
+) -> None:
+    grid = make_grid(limb, detail, seed)
+    series = (("plain", (), "UTE residuum"), ("markers", markers_of(everywhere), "UTE residuum, markers"))
+    for number, (name, markers, description) in enumerate(series, start=1):
+        write_series(
+            work / "mri" / name,
+            limb,
+            grid,
+            markers,
+            seed=seed,
+            number=number,
+            description=description,
+            progress=lambda share, before=number - 1: tell("image", before + share, 2),  # type: ignore[misc]
+        )
+
+
+def _write_traces(
+    work: Path,
+    limb: Limb,
+    indented: Sequence[TrueSite],
+    detail: str,
+    seed: int,
+    mapping: Mapping,
+    tell: Listener,
+) -> list[dict[str, Any]]:
+    """Simulate and record every site; what is true of each, for ``truth.json``."""
+    truth, traces = work / "truth", work / "traces"
+    truth.mkdir()
+    traces.mkdir()
+    save_anatomy(truth, true_anatomy(limb))
+    parameters = true_parameters(seed)
+    flat = tuple(value for values in parameters.values() for value in values.values())
+    jobs = [
+        ForceJob(
+            site.name, truth, _triple(site.position), _triple(site.axis), _ramp(site), flat, MESHES[detail]
+        )
+        for site in indented
+    ]
+    tell("forces", 0, len(jobs))
+    told = []
+    for i, (site, found) in enumerate(zip(indented, mapping(site_force, jobs), strict=True)):
+        told.append(_record_site(traces, site, found, seed))
+        tell("forces", i + 1, len(jobs))
+    return told
+
+
+def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> dict[str, Any]:
+    random = np.random.default_rng([seed, 8, int(site.name)])
+    made = record(_ramp(site), lambda t: np.interp(t, found.times, found.force), random)
+    made.write(traces / f"site-{site.name}.csv")
+    return {
+        **_site_facts(site),
+        "depth_mm": site.depth,
+        "speed_mm_s": site.speed,
+        "fitted": site.fitted,
+        "peak_force_N": float(found.force.max()),
+        "clearance_mm": made.clearance,
+        "touch_down_s": made.touch_s,
+        "force_noise_N": made.force_noise,
+        "simulation": found.facts,
+    }
+
+
+def _ramp(site: TrueSite) -> Ramp:
+    return Ramp(site.depth, site.speed)
+
+
+def _triple(vector: Any) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in vector)
+    return x, y, z
+
+
+def _site_facts(site: TrueSite) -> dict[str, Any]:
+    return {
+        "name": site.name,
+        "region": site.region,
+        "position_mm": site.position.tolist(),
+        "axis": site.axis.tolist(),
+        "tissue_mm": site.thickness,
+    }
+
+
+def _truth(limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int) -> dict[str, Any]:
+    return {
+        "seed": seed,
+        "detail": detail,
+        "parameters": true_parameters(seed),
+        "kappa_ratio": KAPPA_RATIO,
+        "indenter_mm": INDENTER_MM,
+        "limb": {
+            "shape_mm_rad": asdict(limb.shape),
+            "rotation": limb.rotation.tolist(),
+            "origin_mm": limb.origin.tolist(),
+        },
+        "markers": [_site_facts(site) for site in everywhere],
+        "mesh": asdict(MESHES[detail]),
+    }

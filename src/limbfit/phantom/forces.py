@@ -1,0 +1,84 @@
+"""The phantom's true forces: its implicit anatomy, meshed and solved otherwise than a calibration does.
+
+The mesh comes from the exact surfaces, not from the segmented image, and is finer than the study's; the
+element is the quadratic tetrahedron with one mean dilatation and pressure per element, while a calibration
+uses the plain one. So what a calibration recovers, it does not recover by repeating the truth's errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.meshing import MeshSettings, mesh_site
+from ..anatomy.surfaces import load_anatomy
+from ..errors import RunError
+from ..fe import StepControl, solve
+from ..indentation import SiteModel, build_problem, to_parameters
+from .record import Ramp
+
+ELEMENT = "tet10p0"
+STEPS = StepControl(load_steps=14, unload_steps=10)
+MESHES = {
+    "coarse": MeshSettings(element="tet10", edge_near_mm=3.2, edge_far_mm=14.0, near_radius_mm=16.0),
+    "paper": MeshSettings(element="tet10", edge_near_mm=2.5, edge_far_mm=12.0, near_radius_mm=18.0),
+}
+
+
+@dataclass(frozen=True)
+class ForceJob:
+    """One indentation to be simulated: where the anatomy is stored, place, ramp, flat parameters (kPa)."""
+
+    site: str
+    anatomy: Path
+    position: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    ramp: Ramp
+    parameters: tuple[float, ...]
+    mesh: MeshSettings
+
+
+@dataclass(frozen=True)
+class TrueForce:
+    """What came back: force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``."""
+
+    site: str
+    times: NDArray[np.float64]
+    force: NDArray[np.float64]
+    facts: dict[str, float | int | str]
+
+
+def site_force(job: ForceJob) -> TrueForce:
+    """Mesh and solve one site.
+
+    Raises
+    ------
+    RunError
+        When the simulation does not complete.
+    """
+    anatomy = load_anatomy(job.anatomy)
+    mesh, _ = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.mesh)
+    knots_s, knots_mm = job.ramp.knots
+    model = SiteModel(
+        name=job.site,
+        mesh=Path(),
+        mesh_digest="",
+        position=job.position,
+        axis=job.axis,
+        knots_s=knots_s,
+        knots_mm=knots_mm,
+    )
+    problem = build_problem(model, mesh, to_parameters(np.array(job.parameters)))
+    result = solve(replace(problem, element=ELEMENT), steps=STEPS)
+    if not result.completed:
+        raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
+    times = np.linspace(0.0, knots_s[-1], 401)
+    facts: dict[str, float | int | str] = {
+        "element": ELEMENT,
+        "nodes": len(mesh.points),
+        "cells": len(mesh.cells),
+    }
+    return TrueForce(job.site, times, result.force_at(times), facts)

@@ -1,0 +1,95 @@
+"""What the indentation robot writes down: a clean force history as a noisy 500 Hz record with slack.
+
+The robot starts clear of the skin, moves at constant speed to its depth, straight back to where it started,
+and records a little longer. Its displacement counts from the start, not from touch-down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SiteError
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 500.0
+AFTER_S = 0.4
+CLEARANCE_MM = (0.3, 0.6)
+FORCE_NOISE_N = (0.03, 0.05)
+DISPLACEMENT_NOISE_MM = 0.005
+HEADER = "time_s,displacement_mm,force_N"
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A constant-speed indentation: ``depth`` mm under touch-down at ``speed`` mm/s, and back."""
+
+    depth: float
+    speed: float
+
+    def __post_init__(self) -> None:
+        if not (self.depth > 0 and self.speed > 0):
+            raise SiteError(
+                f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s", remedy="give positive numbers"
+            )
+
+    @property
+    def peak_s(self) -> float:
+        """Seconds from touch-down to the peak."""
+        return self.depth / self.speed
+
+    @property
+    def knots(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Times (s) and displacements (mm) from touch-down: start, peak, back."""
+        return (0.0, self.peak_s, 2 * self.peak_s), (0.0, self.depth, 0.0)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record: ``time`` (n,) s, ``displacement`` (n,) mm, ``force`` (n,) N, and what it was made with."""
+
+    time: Array
+    displacement: Array
+    force: Array
+    clearance: float
+    touch_s: float
+    force_noise: float
+
+    def write(self, path: Path) -> None:
+        """Write the CSV as the robot does."""
+        table = np.column_stack([self.time, self.displacement, self.force])
+        np.savetxt(path, table, fmt=("%.3f", "%.4f", "%.4f"), delimiter=",", header=HEADER, comments="")
+
+
+def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Generator) -> Record:
+    """Record an indentation.
+
+    Parameters
+    ----------
+    ramp : depth and speed from touch-down.
+    force : force (n,) in N at times (n,) from touch-down, within ``[0, 2 ramp.peak_s]``.
+    random : source of clearance and noise.
+    """
+    clearance = random.uniform(*CLEARANCE_MM)
+    sd = random.uniform(*FORCE_NOISE_N)
+    touch = clearance / ramp.speed
+    half = touch + ramp.peak_s
+    time = np.arange(0.0, 2 * half + AFTER_S, 1 / RATE_HZ)
+    displacement = np.interp(time, [0, half, 2 * half], [0, clearance + ramp.depth, 0])
+    since = time - touch
+    touching = (since > 0) & (since < 2 * ramp.peak_s)
+    clean = np.zeros_like(time)
+    clean[touching] = force(since[touching])
+    return Record(
+        time=time,
+        displacement=displacement + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size),
+        force=clean + sd * random.standard_normal(time.size),
+        clearance=clearance,
+        touch_s=touch,
+        force_noise=sd,
+    )

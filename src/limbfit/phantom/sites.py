@@ -1,0 +1,134 @@
+"""Where a phantom is indented, how deep, and along which axis: 18 places in four regions, as in the paper.
+
+Places are given around the limb (angle from anterior through medial, radians) and along it (millimetres
+below the knee joint), so that they keep their anatomical meaning when a seed changes the limb.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SiteError
+from .geometry import Limb
+from .mri import SkinMarker
+
+INDENTER_MM = 20.0
+SAFE_SHARE = 0.4  # of the thinnest soft tissue under the indenter
+HINT_ERROR_MM = (3.0, 5.0)  # how far off a place is when measured by hand
+SPEED_MM_S, SPEED_SPREAD = 0.96, 0.05
+
+PATELLAR, TIBIA, LATERAL, POSTERIOR = "patellar tendon", "tibia", "lateral", "posterior wall"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place on the limb: angle (rad), distance below the joint (mm), wanted depth (mm)."""
+
+    name: str
+    region: str
+    angle: float
+    below_joint: float
+    depth: float
+
+
+def _places(region: str, depth: float, first: int, spots: Sequence[tuple[float, float]]) -> list[Place]:
+    return [Place(f"{first + i:02d}", region, angle, below, depth) for i, (angle, below) in enumerate(spots)]
+
+
+PLACES = (
+    *_places(PATELLAR, 5.0, 1, [(0.0, 7.0), (-0.45, 16.0), (0.45, 16.0)]),
+    *_places(TIBIA, 3.5, 4, [(0.95, 46.0), (0.95, 72.0), (0.95, 98.0), (0.35, 42.0), (1.0, 124.0)]),
+    *_places(LATERAL, 5.0, 9, [(-0.8, 44.0), (-0.85, 72.0), (-0.85, 100.0), (-1.3, 58.0), (-1.3, 86.0)]),
+    *_places(POSTERIOR, 7.0, 14, [(3.14, 38.0), (2.75, 64.0), (-2.7, 64.0), (3.14, 92.0), (3.14, 120.0)]),
+)
+FITTED = ("01", "05", "10", "15")
+DETAIL_SITES = {
+    "coarse": (*FITTED, "13", "17"),
+    "paper": tuple(place.name for place in PLACES),
+}
+
+
+@dataclass(frozen=True)
+class TrueSite:
+    """A site as it is: position on the skin, unit axis into the limb (LPS mm), depth (mm), speed (mm/s).
+
+    ``hint`` is the position as measured by hand, ``thickness`` the thinnest soft tissue under the indenter.
+    """
+
+    name: str
+    region: str
+    fitted: bool
+    position: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    depth: float
+    speed: float
+    thickness: float
+    hint: NDArray[np.float64]
+
+
+def true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
+    """All 18 sites of a limb."""
+    return tuple(
+        _true_site(limb, place, np.random.default_rng([seed, 6, i])) for i, place in enumerate(PLACES)
+    )
+
+
+def chosen(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, ...]:
+    """The named sites, in the order of the limb's list.
+
+    Raises
+    ------
+    SiteError
+        When a name is not among them.
+    """
+    known = {site.name for site in sites}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise SiteError(
+            f"the phantom has no site {unknown[0]!r}", remedy=f"choose from {', '.join(sorted(known))}"
+        )
+    return tuple(site for site in sites if site.name in set(names))
+
+
+def markers_of(sites: Sequence[TrueSite]) -> tuple[SkinMarker, ...]:
+    """A skin marker on every site."""
+    return tuple(SkinMarker(site.position, -site.axis) for site in sites)
+
+
+def _true_site(limb: Limb, place: Place, random: np.random.Generator) -> TrueSite:
+    position = limb.skin_point(place.angle, limb.shape.joint - place.below_joint)
+    footprint = _footprint(limb, position)
+    axis = limb.inward(footprint).mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    thickness = min(limb.tissue_thickness(point, axis) for point in footprint)
+    error = random.normal(size=3)
+    error *= random.uniform(*HINT_ERROR_MM) / np.linalg.norm(error)
+    return TrueSite(
+        name=place.name,
+        region=place.region,
+        fitted=place.name in FITTED,
+        position=position,
+        axis=axis,
+        depth=round(min(place.depth, SAFE_SHARE * thickness), 2),
+        speed=SPEED_MM_S * (1 + SPEED_SPREAD * random.uniform(-1, 1)),
+        thickness=thickness,
+        hint=position + error,
+    )
+
+
+def _footprint(limb: Limb, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Skin points (49, 3) under a square indenter at a position, found along its normal."""
+    normal = -limb.inward(position[None])[0]
+    proximal = limb.proximal_normal - normal * (limb.proximal_normal @ normal)
+    proximal /= np.linalg.norm(proximal)
+    across = np.cross(normal, proximal)
+    ticks = np.linspace(-INDENTER_MM / 2, INDENTER_MM / 2, 7)
+    u, v = np.meshgrid(ticks, ticks)
+    points = position + u.reshape(-1, 1) * across + v.reshape(-1, 1) * proximal
+    for _ in range(8):  # Newton along the normal; the field is close to a distance
+        points = points - limb.skin(points)[:, None] * normal
+    return points

@@ -1,0 +1,49 @@
+"""The phantom's ``study.toml``, written as a user would write it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .sites import INDENTER_MM, TrueSite
+
+_HEAD = """\
+# A synthetic residuum with known truth: compare what limbfit finds with truth.json.
+# Paths are relative to this file; results go to results/ beside it.
+
+[study]
+name = "phantom, seed {seed}"
+description = "Synthetic transtibial residuum, {detail} detail"
+
+[image]
+path = "mri/plain"        # DICOM, ultra-short echo time
+markers = "mri/markers"   # the same limb with skin markers on
+
+[geometry]
+skin_layer_mm = 3.0       # skin and adipose tissue, uniform
+
+[indenter]
+shape = "square"
+width_mm = {width:.1f}
+
+# One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
+# The fitted sites identify the material; all others are predicted and compared.
+"""
+
+_SITE = """
+[[sites]]
+name = "{name}"
+region = "{region}"
+fitted = {fitted}
+trace = "traces/site-{name}.csv"
+near = [{x:.1f}, {y:.1f}, {z:.1f}]
+"""
+
+
+def study_text(sites: Sequence[TrueSite], detail: str, seed: int) -> str:
+    """The content of ``study.toml`` for some sites."""
+    parts = [_HEAD.format(seed=seed, detail=detail, width=INDENTER_MM)]
+    for site in sites:
+        x, y, z = site.hint
+        fitted = "true" if site.fitted else "false"
+        parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
+    return "".join(parts)

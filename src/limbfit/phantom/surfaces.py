@@ -1,0 +1,98 @@
+"""The phantom's surfaces as closed triangles, straight from the implicit fields and not from the image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+
+from ..anatomy.surfaces import Anatomy, Surface
+from ..anatomy.triangles import bodies, from_pyvista, half_edges
+from .geometry import BONES, PROXIMAL_CUT_MM, Limb, bone_field, skin_field
+
+Array = NDArray[np.floating]
+Field = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of the limb frame and the spacing at which a field is sampled in it, mm."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    spacing: float
+
+
+STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is open there
+
+
+def true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
+    """Skin and bones of a limb (LPS mm); the skin is closed by the flat proximal cut.
+
+    Parameters
+    ----------
+    limb : the residuum.
+    spacing : of the grid on which the skin is contoured, mm (bones: two thirds of it).
+    """
+    shape = limb.shape
+    box = Box((-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM), spacing)
+    skin = contour(lambda p: skin_field(shape, p), box)
+    bones = {name: _bone(limb, name, spacing / 1.5) for name in BONES}
+    return Anatomy(
+        skin=_placed(limb, skin),
+        bones={name: _placed(limb, bone) for name, bone in bones.items()},
+        cut_point=limb.to_patient(np.array([0.0, 0.0, PROXIMAL_CUT_MM])),
+        cut_normal=limb.proximal_normal,
+    )
+
+
+def _bone(limb: Limb, name: str, spacing: float) -> Surface:
+    box = Box((-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM), spacing)
+    return contour(lambda p: bone_field(limb.shape, name, p), box)
+
+
+def _placed(limb: Limb, surface: Surface) -> Surface:
+    return Surface(limb.to_patient(surface.points), surface.faces)
+
+
+def contour(field: Field, box: Box) -> Surface:
+    """The closed zero surface of a field (limb frame), capped flat where it leaves the box at the top."""
+    size = [round((h - l) / box.spacing) + 1 for l, h in zip(box.low, box.high, strict=True)]
+    axes = [np.linspace(l, h, n) for l, h, n in zip(box.low, box.high, size, strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    values = field(np.stack([x, y, z], axis=-1))
+    image = pv.ImageData(dimensions=size, spacing=[a[1] - a[0] for a in axes], origin=box.low)
+    image.point_data["field"] = values.ravel()
+    poly = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False).clean()
+    surface = bodies(from_pyvista(poly))[0]
+    surface = _capped(_on_surface(field, surface, box.high[2]), box.high[2])
+    return surface if surface.volume > 0 else surface.flipped
+
+
+def _on_surface(field: Field, surface: Surface, top: float) -> Surface:
+    """Points moved onto the zero of the field by Newton steps; those of the rim stay in the top plane."""
+    points = surface.points.copy()
+    rim = np.abs(points[:, 2] - top) < 1e-3
+    points[rim, 2] = top
+    for _ in range(3):
+        steps = np.eye(3) * 0.02
+        gradient = np.stack([(field(points + d) - field(points - d)) / 0.04 for d in steps], axis=-1)
+        gradient[rim, 2] = 0.0
+        points -= (field(points) / (gradient * gradient).sum(axis=1))[:, None] * gradient
+    return Surface(points, surface.faces)
+
+
+def _capped(surface: Surface, top: float) -> Surface:
+    """Closed with a fan around the middle of its open rim, which lies in the plane z = ``top``."""
+    edges = half_edges(surface.faces)
+    n = len(surface.points)
+    keys, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
+    rim = edges[~np.isin(keys, back)]
+    if not len(rim):
+        return surface
+    middle = np.append(surface.points[np.unique(rim), :2].mean(axis=0), top)
+    fan = np.column_stack([rim[:, 1], rim[:, 0], np.full(len(rim), n)])
+    return Surface(np.vstack([surface.points, middle]), np.vstack([surface.faces, fan]))
