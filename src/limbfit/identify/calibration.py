@@ -180,15 +180,10 @@ def calibrate(
         Where no first simulation completes.
     """
     run = _Run(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), tuple(stages))
-    point = None
-    if state is None:
-        state, point = run.first()
+    for current in run.states(state):
         if on_iterate:
-            on_iterate(state)
-    for state, point in run.go_on(state, point):
-        if on_iterate:
-            on_iterate(state)
-    return run.result(state)
+            on_iterate(current)
+    return run.result(current)
 
 
 class _Run:
@@ -251,10 +246,10 @@ class _Run:
         )
         return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations)
 
-    def go_on(self, state: State, point: Point | None) -> Iterator[tuple[State, Point]]:
-        """Yield a state for every accepted step and every finished stage."""
-        if point is None:
-            point = self._again(state)
+    def states(self, state: State | None) -> Iterator[State]:
+        """The first or resumed state, then one for every accepted step, finished stage and new stage."""
+        state, point = self.first() if state is None else (state, self._again(state))
+        yield state
         while True:
             space = self.space(state.stage)
             steps = () if len(state.stages) > state.stage else self._steps(space, point, state)
@@ -262,11 +257,11 @@ class _Run:
                 point = step.point
                 self.keep_only(space.expand(point.z))
                 state = self._after(state, step)
-                yield state, point
+                yield state
             if len(state.stages) == len(self.stages):
                 return
             state, point = self._next_stage(state, space.logarithms(point.z))
-            yield state, point
+            yield state
 
     def _again(self, state: State) -> Point:
         """The point at which a run was interrupted; its evaluation was counted then."""

@@ -1,0 +1,240 @@
+"""Executors: same answers from all of them, and workers that fail, die, keep state and stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbfit.errors import RunError, TraceError
+from limbfit.execution import THREAD_VARIABLES, ProcessExecutor, SerialExecutor, make_executor, usable_cores
+
+
+def square(x):
+    return x * x
+
+
+def solve(seed):
+    rng = np.random.default_rng(seed)
+    matrix = rng.standard_normal((80, 80))
+    return np.linalg.solve(matrix, rng.standard_normal(80))
+
+
+def nap(seconds):
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def pid(_):
+    return os.getpid()
+
+
+def threads(_):
+    return [os.environ.get(name) for name in THREAD_VARIABLES]
+
+
+def refuse(x):
+    if x == 2:
+        raise TraceError("not finite", file="a.csv", place="row 3", remedy="remove it")
+    return x
+
+
+def unpicklable(_):
+    return lambda: 1
+
+
+def die_once(marker):
+    path = Path(marker)
+    if not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "alive"
+
+
+def die(_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with ProcessExecutor(2) as executor:
+        yield executor
+
+
+def test_every_executor_gives_the_same_answers_in_order(pool):
+    jobs = list(range(12))
+    with SerialExecutor() as serial, ProcessExecutor(1) as single:
+        answers = [list(e.map(solve, jobs)) for e in (serial, single, pool)]
+    for other in answers[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(answers[0], other, strict=True))
+
+
+def test_order_is_kept_where_the_first_job_is_the_slowest(pool):
+    assert list(pool.map(square, range(5))) == [0, 1, 4, 9, 16]
+    slow, *fast = pool.map(nap, [0.4, 0.0, 0.0, 0.0])
+    assert slow not in fast
+
+
+def test_workers_persist_and_keep_their_keys(pool):
+    keys = ["a", "b", "c", "d"]
+    first = dict(zip(keys, pool.map(nap, [0.05] * 4, keys=keys)))
+    second = dict(zip(keys[::-1], pool.map(nap, [0.1, 0.05, 0.0, 0.05], keys=keys[::-1])))
+    assert first == second
+    assert len(set(first.values())) == 2
+    assert os.getpid() not in first.values()
+
+
+def test_threads_are_pinned_in_workers_and_nowhere_else(pool, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    with ProcessExecutor(1, threads=3) as executor:
+        assert next(executor.map(threads, [0])) == ["3"] * len(THREAD_VARIABLES)
+    assert next(pool.map(threads, [0])) == ["1"] * len(THREAD_VARIABLES)
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+
+
+def test_bad_input_passes_through_unharmed(pool):
+    answers = pool.map(refuse, range(6))
+    assert [next(answers), next(answers)] == [0, 1]
+    with pytest.raises(TraceError) as caught:
+        next(answers)
+    assert (caught.value.place, caught.value.remedy) == ("row 3", "remove it")
+    assert "in refuse" in str(caught.value.__cause__)
+    assert list(pool.map(square, [3])) == [9]
+
+
+def test_an_answer_that_cannot_travel_is_an_error_not_a_death(pool):
+    with pytest.raises(RunError, match="pickle"):
+        list(pool.map(unpicklable, [0]))
+
+
+def test_a_dead_worker_costs_one_retry(pool, tmp_path):
+    jobs = [str(tmp_path / f"died-{k}") for k in range(3)]
+    assert list(pool.map(die_once, jobs)) == ["alive"] * 3
+
+
+def test_a_worker_that_dies_while_idle_is_replaced(pool):
+    victim = next(pool.map(pid, [0], keys=["x"]))
+    os.kill(victim, signal.SIGKILL)
+    time.sleep(0.2)
+    assert next(pool.map(pid, [0], keys=["x"])) != victim
+
+
+def test_a_job_that_kills_every_worker_is_named(pool):
+    with pytest.raises(RunError, match="die of 'site-4'"):
+        list(pool.map(die, [0], keys=["site-4"]))
+    assert list(pool.map(square, [3, 4])) == [9, 16]
+
+
+def test_abandoned_answers_do_not_reach_the_next_map(pool):
+    answers = pool.map(nap, [0.0, 0.3, 0.3])
+    next(answers)
+    answers.close()
+    assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
+
+
+def test_two_maps_at_once_are_refused(pool):
+    first = pool.map(square, range(3))
+    next(first)
+    with pytest.raises(RuntimeError, match="already mapping"):
+        next(pool.map(square, range(3)))
+    assert list(first) == [1, 4]
+
+
+def test_leaving_on_an_error_stops_busy_workers_at_once():
+    start = time.monotonic()
+    executor = ProcessExecutor(1)
+    answers = executor.map(nap, [0.0, 60.0])
+    worker = next(answers)
+    executor.__exit__(KeyError, KeyError(), None)
+    assert time.monotonic() - start < 10
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
+
+
+def test_keys_must_match_jobs(pool):
+    for executor in (SerialExecutor(), pool):
+        with pytest.raises(ValueError, match="1 keys for 2 jobs"):
+            executor.map(square, [1, 2], keys=["a"])
+
+
+def test_the_number_of_workers_is_the_users_or_the_machines():
+    assert isinstance(make_executor(1), SerialExecutor)
+    assert make_executor(3).workers == 3
+    assert make_executor(0).workers == usable_cores()
+
+
+def assert_group_ends(group, within_s=5.0):
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    os.killpg(group, signal.SIGKILL)
+    pytest.fail("a worker survived its parent")
+
+
+SCRIPT = """
+import math
+from limbfit.execution import ProcessExecutor
+print("started")
+with ProcessExecutor(2) as executor:
+    print(list(executor.map(math.sqrt, [1, 4, 9])))
+"""
+
+
+def test_an_unguarded_script_runs_once(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    for command in ([str(script)], ["-c", SCRIPT]):
+        done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=60)
+        assert done.stdout.split("\n")[:2] == ["started", "[1.0, 2.0, 3.0]"], done.stderr
+
+
+def test_ctrl_c_ends_the_run_and_its_workers_quietly(tmp_path):
+    script = textwrap.dedent(
+        """
+        import os, time
+        from limbfit.execution import ProcessExecutor
+        with ProcessExecutor(2) as executor:
+            print(*executor.map(os.getenv, ["HOME", "HOME"], keys=["a", "b"]), flush=True)
+            list(executor.map(time.sleep, [60, 60], keys=["a", "b"]))
+        """
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    run.stdout.readline()
+    time.sleep(0.3)
+    os.killpg(run.pid, signal.SIGINT)
+    _, errors = run.communicate(timeout=5)
+    assert errors.count("Traceback") == 1
+    assert "KeyboardInterrupt" in errors
+    assert_group_ends(run.pid)
+
+
+def test_workers_do_not_outlive_a_killed_parent():
+    script = (
+        "import time\nfrom limbfit.execution import ProcessExecutor\n"
+        "e = ProcessExecutor(1)\nprint(*e.map(time.sleep, [0]), flush=True)\nlist(e.map(time.sleep, [60]))"
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    run.stdout.readline()
+    time.sleep(0.2)
+    run.kill()
+    run.wait()
+    assert_group_ends(run.pid)
