@@ -1,0 +1,194 @@
+"""Implicit fields of a limb: depth below the skin, distance to the bones, the skin layer and trimmed bone.
+
+Vocabulary
+----------
+limb frame  the proximal cut is the plane z = 0 and the limb lies at z <= 0; millimetres.
+depth       distance to the *smooth* skin surface, positive inside the limb.
+layer       the level set ``depth = skin_layer_mm``: skin and adipose tissue above it, muscle below.
+void        signed distance to the bones, negative inside, after the policy ``trim-bone``: bone that is
+            shallower than layer + clearance is given to the muscle.
+
+Both kinds of surface are prolonged straight beyond the proximal cut before distances are taken: otherwise
+the flat cap would count as skin and be offset too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SurfaceError
+from .surfaces import Anatomy
+from .triangles import Surface, from_pyvista
+
+Array = NDArray[np.float64]
+
+PROLONGATION_MM = 40.0
+SEAM_MM = 3.0  # below the cut, where surfaces are prolonged from
+END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
+TRIM_SAMPLES = 60_000
+
+
+@dataclass(frozen=True)
+class TrimmedBone:
+    """What ``trim-bone`` took from one bone: volume (mm3) and greatest depth (mm)."""
+
+    volume_mm3: float
+    depth_mm: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The rigid map between patient space and the limb frame."""
+
+    rotation: Array
+    origin: Array
+
+    def to_limb(self, points: Array) -> Array:
+        """Patient space (..., 3) to the limb frame."""
+        return (np.asarray(points, dtype=float) - self.origin) @ self.rotation.T
+
+    def to_patient(self, points: Array) -> Array:
+        """The limb frame (..., 3) to patient space."""
+        return points @ self.rotation + self.origin
+
+
+def limb_frame(cut_point: Array, cut_normal: Array) -> Frame:
+    """The frame whose z axis is the proximal normal and whose origin is ``cut_point``."""
+    z = np.asarray(cut_normal, dtype=float) / np.linalg.norm(cut_normal)
+    helper = np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    return Frame(np.array([x, np.cross(z, x), z]), np.asarray(cut_point, dtype=float))
+
+
+@dataclass(frozen=True)
+class LimbFields:
+    """Fields of a limb in its frame; build it with :func:`limb_fields`.
+
+    ``skin`` and ``bones`` are prolonged beyond the cut, in limb coordinates.
+    """
+
+    frame: Frame
+    skin: Surface
+    bones: Mapping[str, Surface]
+    skin_layer_mm: float
+    bone_clearance_mm: float
+
+    @property
+    def bone_depth_mm(self) -> float:
+        """The least depth of bone."""
+        return self.skin_layer_mm + self.bone_clearance_mm
+
+    def depth(self, points: Array) -> Array:
+        """Depth (n,) of points (n, 3) below the skin, positive inside."""
+        return -signed_distance(self.skin, points)
+
+    def layer(self, points: Array) -> Array:
+        """Signed distance (n,) to the layer: positive in the muscle."""
+        return self.depth(points) - self.skin_layer_mm
+
+    def bone(self, points: Array) -> Array:
+        """Signed distance (n,) to the nearest bone as segmented, negative inside."""
+        if not self.bones:
+            return np.full(len(points), np.inf)
+        return np.min([signed_distance(bone, points) for bone in self.bones.values()], axis=0)
+
+    def void(self, points: Array, depth: Array | None = None) -> Array:
+        """Signed function (n,) of the bones that stay at least clearance below the layer; negative inside."""
+        depth = self.depth(points) if depth is None else depth
+        return np.maximum(self.bone(points), self.bone_depth_mm - depth)
+
+    def trimmed(self) -> dict[str, TrimmedBone]:
+        """What trimming took from each bone."""
+        return {name: self._trimmed(bone) for name, bone in self.bones.items()}
+
+    def _trimmed(self, bone: Surface) -> TrimmedBone:
+        below = bone.points[bone.points[:, 2] <= 0.0]
+        excess = self.bone_depth_mm - self.depth(below) if len(below) else np.zeros(0)
+        shallow = below[excess > 0]
+        if not len(shallow):
+            return TrimmedBone(0.0, 0.0)
+        # A bone's shallow part spans at most its own edge length beyond its shallow vertices.
+        pad = _longest_edge(bone)
+        low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
+        high[2] = min(high[2], 0.0)
+        spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
+        samples = _box_samples(low, high, spacing)
+        inside = signed_distance(bone, samples) < 0
+        cut = self.depth(samples[inside]) < self.bone_depth_mm
+        return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
+
+
+def limb_fields(anatomy: Anatomy, skin_layer_mm: float, bone_clearance_mm: float) -> LimbFields:
+    """The fields of an anatomy for a layer thickness and a clearance of bone below the layer (both mm).
+
+    Raises
+    ------
+    SurfaceError
+        When the skin does not reach the cut plane.
+    """
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
+    bones = {name: Surface(frame.to_limb(bone.points), bone.faces) for name, bone in anatomy.bones.items()}
+    top = skin.points[:, 2].max()
+    if top < -END_TOLERANCE_MM:
+        raise SurfaceError(
+            f"the skin ends {-top:.1f} mm below the proximal cut plane",
+            remedy="move the plane or check its normal",
+        )
+    ends_at_cut = {
+        name: -END_TOLERANCE_MM < bone.points[:, 2].max() < SEAM_MM for name, bone in bones.items()
+    }
+    bones = {name: prolonged(bone) if ends_at_cut[name] else bone for name, bone in bones.items()}
+    return LimbFields(frame, prolonged(skin), bones, skin_layer_mm, bone_clearance_mm)
+
+
+def signed_distance(surface: Surface, points: Array) -> Array:
+    """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside."""
+    if not len(points):
+        return np.zeros(0)
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    query = np.ascontiguousarray(points, dtype=float)
+    return igl.signed_distance(query, surface.points, surface.faces.astype(np.int64), kind)[0]
+
+
+def prolonged(surface: Surface) -> Surface:
+    """The surface below z = -SEAM_MM with its section there drawn out along z, far beyond the cut.
+
+    Cutting below the plane makes it immaterial how exactly the surface's own cap lies on the plane and
+    whether its rim is rounded.
+    """
+    body = surface.to_pyvista().clip_closed_surface(normal=(0, 0, -1), origin=(0, 0, -SEAM_MM))
+    body = from_pyvista(body.triangulate().clean())
+    cap = (np.abs(body.points[:, 2] + SEAM_MM) < 1e-6)[body.faces].all(axis=1)
+    moved = np.unique(body.faces[cap])
+    top = np.full(len(body.points), -1)
+    top[moved] = len(body.points) + np.arange(len(moved))
+    points = np.vstack([body.points, body.points[moved] + [0.0, 0.0, PROLONGATION_MM]])
+    a, b = _rim(body.faces[cap]).T
+    walls = np.vstack([np.stack([a, b, top[b]], axis=1), np.stack([a, top[b], top[a]], axis=1)])
+    return Surface(points, np.vstack([body.faces[~cap], top[body.faces[cap]], walls]))
+
+
+def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Directed edges (k, 2) of a patch of faces that no other face of the patch shares."""
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edges[counts[inverse.ravel()] == 1]
+
+
+def _longest_edge(surface: Surface) -> float:
+    corners = surface.points[surface.faces]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+
+
+def _box_samples(low: Array, high: Array, spacing: float) -> Array:
+    """Cell centres of a regular grid over a box."""
+    counts = np.maximum(1, np.round((high - low) / spacing)).astype(int)
+    axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low, high, counts)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
