@@ -268,7 +268,7 @@ def _calibration(sites: tuple) -> dict:
         "correlation": {"names": NAMES, "matrix": matrix.tolist()},
         "verdict": verdict,
         "combinations": ["The data determine c·(1 + γ) of the muscle to 2 %."],
-        "noise_N": 0.05,
+        "residual_sd_N": {row[0]: 0.05 for row in sites if row[2]},
     }
     return {
         "stages": [

@@ -220,6 +220,27 @@ def test_a_failed_simulation_is_named(copy: Path) -> None:
     assert "no: the step fell below its limit" in text
 
 
+def test_indentations_without_records(copy: Path) -> None:
+    for part in ("traces", "calibrate", "predict"):
+        shutil.rmtree(copy / part)
+    facts = {
+        "site": "TI-2",
+        "peak_force_N": 7.126,
+        "depth_mm": 6.0,
+        "penetration_mm": 0.02,
+        "completed": True,
+    }
+    folder = copy / "simulate"
+    folder.mkdir()
+    (folder / "TI-2.json").write_text(json.dumps(facts | {"parameters_from": "start of the study"}))
+    (folder / "TI-2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n6.25,6,7.126\n")
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    section = _section(text, "simulated")
+    assert ">7.13<" in section
+    assert "Force of the simulated indentations." in section
+    assert "no parameters have been identified" in _section(text, "summary")
+
+
 def test_broken_summary_names_the_file(copy: Path) -> None:
     (copy / "predict" / "predict.json").write_text('{"sites": [')
     with pytest.raises(InputError, match=r"predict\.json: not readable.*run its stage again"):

@@ -130,11 +130,33 @@ def _draw_forces(ax: Axes, curves: Curves, against: str) -> None:
     if "force_low_N" in curves and against == "time_s":
         low, high = curves["force_low_N"], curves["force_high_N"]
         ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
-    ax.plot(x, curves["force_measured_N"], color=MEASURED, lw=2.6, alpha=0.55, label="measured")
+    if "force_measured_N" in curves:
+        ax.plot(x, curves["force_measured_N"], color=MEASURED, lw=2.6, alpha=0.55, label="measured")
     if "force_one_material_N" in curves:
         ax.plot(x, curves["force_one_material_N"], color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
     ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label="two materials")
     ax.margins(x=0.01)
+
+
+def simulated_figure(store: Store) -> Figure | None:
+    """Force of each indentation that was simulated by itself, against time and displacement."""
+    found = [(row, store.curves("simulate", row["site"])) for row in store.simulated]
+    pairs = [(row, curves) for row, curves in found if curves is not None]
+    if not pairs:
+        return None
+    drawing, axes = _panels(2, 2, 2.6)
+    with matplotlib.rc_context(STYLE):
+        for i, (row, curves) in enumerate(pairs):
+            color, ls = (SIMULATED, ONE_MATERIAL, TRUTH, INK)[i % 4], ("-", "--", ":", "-.")[i % 4]
+            axes[0].plot(curves["time_s"], curves["force_N"], color=color, ls=ls, label=row["site"])
+            axes[1].plot(curves["displacement_mm"], curves["force_N"], color=color, ls=ls)
+        for ax, label in zip(axes, ("Time (s)", "Displacement (mm)"), strict=True):
+            ax.set_xlabel(label)
+            ax.set_ylabel("Force (N)")
+        _legend(drawing, axes[0])
+    names = ", ".join(row["site"] for row, _ in pairs)
+    svg_text = svg(drawing, "simulated", f"Simulated force against time and displacement, sites {names}")
+    return Figure("simulated", svg_text, "Force of the simulated indentations.")
 
 
 def convergence_figure(store: Store) -> Figure | None:

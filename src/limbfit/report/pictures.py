@@ -120,7 +120,7 @@ def _shoot(plotter: Any, view: View) -> Array:
 
 
 def _plotter() -> Any:
-    plotter = pv.Plotter(off_screen=True, lighting="light kit")
+    plotter: Any = pv.Plotter(off_screen=True, lighting="light kit")
     plotter.set_background(PAPER)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
@@ -207,9 +207,9 @@ def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
 
 
 @_without_display_warning()
-def field_figure(store: Store, sites: Sequence[str]) -> Figure | None:
+def field_figure(store: Store, sites: Sequence[str], stage: str, name: str) -> Figure | None:
     """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
-    rows = _drawable(store, sites, "predict")
+    rows = _drawable(store, sites, stage)
     grids = [(row, file, _linear(file)) for row, file in rows]
     stored = {name for _, _, grid in grids for name in grid.array_names}
     field = next(((name, title) for name, title in FIELDS if name in stored), None)
@@ -223,8 +223,8 @@ def field_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     ]
     names = [row["site"] for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
-    caption = f"Deformed cut through each fitted site at the largest indentation; colour: {field[1]}."
-    return Figure("field", _strip(shots, names, alt) + _colour_bar(limits, field[1]), caption)
+    caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
+    return Figure(name, _strip(shots, names, alt) + _colour_bar(limits, field[1]), caption)
 
 
 def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:

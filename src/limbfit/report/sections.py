@@ -27,6 +27,7 @@ def make_page(store: Store) -> Page:
         prediction,
         parameters,
         convergence,
+        simulated,
         solver,
         method,
         timing,
@@ -39,7 +40,7 @@ def make_page(store: Store) -> Page:
         subtitle=str(study.get("description") or ""),
         key_numbers=key_numbers(store),
         summary=summary(store),
-        sections=tuple(make(store) for make in makers),
+        sections=tuple(make(store) for make in makers if make is not simulated or store.simulated),
         footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
     )
 
@@ -90,7 +91,9 @@ def _what_was_done(store: Store) -> str:
     if not names:
         return "Nothing has been computed yet for this study."
     if not store.stages:
-        return f"The study has {len(names)} indentation sites; no parameters have been identified yet."
+        sites = f"{len(names)} indentation site{'s' if len(names) > 1 else ''}"
+        simulated = ", each simulated with the parameters of the study" if store.predicted else ""
+        return f"The study has {sites}{simulated}; no parameters have been identified."
     return (
         f"The soft tissue of this limb was identified from robotic indentations at {len(fitted)} of "
         f"{len(names)} sites ({', '.join(fitted)}): first as one material, then as a skin–adipose layer and "
@@ -180,7 +183,7 @@ def fit(store: Store) -> Section:
     rows = [row for row in store.predicted if row.get("fitted")]
     blocks = _blocks(
         figures.force_figure(store, rows, "time_s", "forces-fitted", 2),
-        pictures.field_figure(store, store.fitted[:4]),
+        pictures.field_figure(store, store.fitted[:4], "predict", "field"),
         otherwise="No simulated forces of fitted sites are stored yet.",
     )
     return Section("fit", "Fitted sites", blocks)
@@ -213,13 +216,17 @@ def parameters(store: Store) -> Section:
     blocks = _blocks(*found, otherwise="No parameters have been identified yet.")
     if store.stages and not store.calibration.get("uncertainty"):
         blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
-    noise = (store.calibration.get("uncertainty") or {}).get("noise_N")
-    if noise is not None:
-        text = (
-            f"The intervals rest on a force noise of {tables.fixed(noise, 3)} N, estimated from the records."
-        )
+    noise = _noise(store)
+    if noise:
+        text = f"The intervals rest on the residuals at the fitted sites, standard deviation {noise}."
         blocks = (*blocks, Prose(text))
     return Section("parameters", "Parameters", blocks)
+
+
+def _noise(store: Store) -> str:
+    """Standard deviations of the residuals, site by site."""
+    sites = (store.calibration.get("uncertainty") or {}).get("residual_sd_N") or {}
+    return ", ".join(f"{tables.fixed(value, 3)} N ({name})" for name, value in sites.items())
 
 
 def convergence(store: Store) -> Section:
@@ -239,6 +246,18 @@ def convergence(store: Store) -> Section:
         Bullets(texts) if texts else None, figure, *details, otherwise="No identification is stored yet."
     )
     return Section("convergence", "Convergence of the identification", blocks)
+
+
+def simulated(store: Store) -> Section:
+    """Indentations that were simulated one by one."""
+    names = [str(row["site"]) for row in store.simulated][:4]
+    blocks = _blocks(
+        figures.simulated_figure(store),
+        pictures.field_figure(store, names, "simulate", "field-simulated"),
+        tables.simulated_table(store),
+        otherwise="No single indentations were simulated.",
+    )
+    return Section("simulated", "Simulated indentations", blocks)
 
 
 def solver(store: Store) -> Section:

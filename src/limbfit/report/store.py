@@ -32,6 +32,7 @@ class Store:
     mesh: Json
     calibration: Json
     predict: Json
+    simulated: tuple[Json, ...]
     truth: Json
 
     @property
@@ -96,6 +97,7 @@ def load_store(results: Path) -> Store:
         mesh=_read_json(results / "mesh" / "mesh.json").get("sites", {}),
         calibration=_read_json(results / "calibrate" / "calibration.json"),
         predict=_read_json(results / "predict" / "predict.json"),
+        simulated=tuple(_read_json(file) for file in sorted((results / "simulate").glob("*.json"))),
         truth=_read_json(results / "truth.json"),
     )
 

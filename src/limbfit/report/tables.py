@@ -73,7 +73,9 @@ def interval(store: Store, tissue: str, name: str) -> list[float] | None:
 def verdict(store: Store, tissue: str, name: str) -> str:
     """What the identification says about a parameter: ``determined`` or the contrary, in its own words."""
     uncertainty = store.calibration.get("uncertainty") or {}
-    return str((uncertainty.get("verdict") or {}).get(f"{tissue}.{name}", NOTHING))
+    key = f"{tissue}.{name}"
+    word = str((uncertainty.get("verdict") or {}).get(key, NOTHING))
+    return f"{word}; at its bound" if (uncertainty.get("at_bound") or {}).get(key) else word
 
 
 def _limits(limits: list[float] | None) -> str:
@@ -147,7 +149,8 @@ def _site_row(store: Store, row: Json) -> Row:
 def _mean_rows(store: Store) -> Iterable[Row]:
     for word, key in (("fitted", "fitted"), ("held out", "heldout")):
         chosen = [row for row in store.predicted if bool(row.get("fitted")) == (key == "fitted")]
-        one = [row.get("error_one_material_percent") for row in chosen]
+        errors = [row.get("error_one_material_percent") for row in chosen]
+        one = [error for error in errors if error is not None]
         if chosen:
             yield Row(
                 (
@@ -156,7 +159,7 @@ def _mean_rows(store: Store) -> Iterable[Row]:
                     Cell(word),
                     _n(""),
                     _n(""),
-                    _n(fixed(sum(one) / len(one)) if None not in one else NOTHING),
+                    _n(fixed(sum(one) / len(one)) if one else NOTHING),
                     _n(mean_and_deviation(store, key)),
                 )
             )
@@ -324,6 +327,25 @@ def solver_table(store: Store) -> Table:
     )
     head = ("Site", "Element", "Steps", "Largest penetration (mm)", "Completed")
     return Table("solver", "The simulation of each site with the identified parameters.", head, rows)
+
+
+def simulated_table(store: Store) -> Table:
+    """Indentations that were simulated one by one."""
+    rows = tuple(
+        Row(
+            (
+                _h(str(row["site"])),
+                _n(fixed(row.get("depth_mm"), 2)),
+                _n(fixed(row.get("peak_force_N"), 2)),
+                _n(fixed(row.get("penetration_mm"), 3)),
+                Cell(str(row.get("parameters_from", NOTHING))),
+                Cell("yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"),
+            )
+        )
+        for row in store.simulated
+    )
+    head = ("Site", "Depth (mm)", "Largest force (N)", "Largest penetration (mm)", "Parameters", "Completed")
+    return Table("simulated", "Indentations simulated one by one.", head, rows)
 
 
 def iteration_table(stage: Json) -> Table:
