@@ -23,8 +23,10 @@ from .triangles import Surface, bodies, from_pyvista
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
 
-_SIGMA_VOXELS = 1.0
-_TAUBIN_PASSES, _TAUBIN_BAND = 40, 0.03  # takes out the terraces that are wider than the Gaussian
+_SIGMA_VOXELS = 0.7
+# Passes and pass band of Taubin's filter, which takes out terraces wider than the Gaussian; skin has no
+# edges to lose, bones have.
+_TAUBIN_SKIN, _TAUBIN_BONE = (80, 0.008), (40, 0.03)
 _MARGIN_MM = 4.0
 _REMESH_PASSES = 8
 
@@ -49,14 +51,9 @@ def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -
         Where there is nothing to extract.
     """
     mask = labels.limb if which is None else labels.mask(which)
-    return surface_of_mask(mask, labels, which or "limb", edge_mm)
-
-
-def surface_of_mask(mask: Mask, grid: Grid, name: str, edge_mm: float) -> Surface:
-    """The closed surface of the largest body of a mask on ``grid``; see :func:`extract_surface`."""
-    body, crop = _body(mask, grid, name)
+    body, crop = _body(mask, labels, which or "limb")
     field, level = smooth_field(body, crop, edge_mm)
-    fine = _smooth(_contour(field, level))
+    fine = _smooth(_contour(field, level), *(_TAUBIN_SKIN if which is None else _TAUBIN_BONE))
     return keep_volume(remesh(fine, edge_mm), float(body.sum()) * crop.voxel_mm3)
 
 
@@ -131,11 +128,9 @@ def _contour(field: Volume, level: float) -> Surface:
     return surface if surface.volume > 0 else surface.flipped
 
 
-def _smooth(surface: Surface) -> Surface:
+def _smooth(surface: Surface, passes: int, band: float) -> Surface:
     """Without short waves (Taubin 1995: windowed sinc)."""
-    poly = surface.to_pyvista().smooth_taubin(
-        n_iter=_TAUBIN_PASSES, pass_band=_TAUBIN_BAND, normalize_coordinates=True
-    )
+    poly = surface.to_pyvista().smooth_taubin(n_iter=passes, pass_band=band, normalize_coordinates=True)
     return from_pyvista(poly)
 
 

@@ -17,6 +17,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import LabelError, SurfaceError
+from .ends import ProximalEnd, layer, proximal_end
 from .extraction import extract_surface, remesh
 from .grid import Grid, LabelMap
 from .triangles import (
@@ -99,9 +100,9 @@ def build_anatomy(
     SurfaceError
         For a cut that misses the limb.
     """
-    end = _proximal_end(labels)
-    point, normal = end.plane(labels) if proximal_cut is None else _plane(*proximal_cut)
-    extended = end.extended(labels, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
+    end = proximal_end(labels.limb, labels)
+    point, normal = _default_cut(labels, end) if proximal_cut is None else _plane(*proximal_cut)
+    extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
     _check_sides(labels, end, point, normal)
     skin = _capped(extract_surface(extended, None, edge_mm), point, normal, edge_mm, "the limb")
     reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
@@ -112,67 +113,23 @@ def build_anatomy(
     return Anatomy(skin, bones, point, normal)
 
 
-@dataclass(frozen=True)
-class _End:
-    """One end of the limb in the image: grid axis (0, 1, 2 for i, j, k), side (-1 or 1), last full layer."""
-
-    axis: int
-    side: int
-    layer: int
-
-    def plane(self, labels: LabelMap) -> tuple[Array, Array]:
-        """The default cut: a little inside the outer face of the last layer."""
-        index = (np.array(labels.size) - 1) / 2
-        index[self.axis] = self.layer + self.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[self.axis])
-        return labels.index_to_point(index), self.side * labels.direction[:, self.axis]
-
-    def extended(self, labels: LabelMap, length_mm: float) -> LabelMap:
-        """The map with the layer at the end repeated outward, as if the limb went on."""
-        count = int(np.ceil(length_mm / labels.spacing[self.axis]))
-        kept = _take(labels.array, self.axis, self.side, self.layer)
-        pad = [(0, 0)] * 3
-        pad[2 - self.axis] = (count, 0) if self.side < 0 else (0, count)
-        start = np.zeros(3)
-        start[self.axis] = self.layer - count if self.side < 0 else 0
-        return replace(labels, array=np.pad(kept, pad, mode="edge"), origin=labels.index_to_point(start))
+def _default_cut(labels: LabelMap, end: ProximalEnd) -> tuple[Array, Array]:
+    """A little inside the outer face of the last layer."""
+    index = (np.array(labels.size) - 1) / 2
+    index[end.axis] = end.layer + end.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[end.axis])
+    return labels.index_to_point(index), end.direction(labels)
 
 
-def _take(array: NDArray[np.uint8], axis: int, side: int, layer: int) -> NDArray[np.uint8]:
-    """The array up to ``layer`` on that side."""
-    keep = slice(layer, None) if side < 0 else slice(None, layer + 1)
-    return array[tuple(keep if n == 2 - axis else slice(None) for n in range(3))]
-
-
-def _proximal_end(labels: LabelMap) -> _End:
-    """Where the limb was cut: at the border of the image that it fills most, else at its thicker end.
-
-    The limb's axis is the grid axis along which it is longest. Of two ends at the border, the superior one
-    is proximal.
-    """
-    limb = labels.limb
-    if not limb.any():
-        raise LabelError("the label map is empty", remedy="give one with the limb labelled")
-    extents = [_extent(limb, axis) for axis in range(3)]
-    lengths = [(high - low + 1) * labels.spacing[axis] for axis, (low, high) in enumerate(extents)]
-    axis = int(np.argmax(lengths))
-    low, high = extents[axis]
-    ends = [_End(axis, -1, low), _End(axis, 1, high)]
-    border = [end for end in ends if end.layer in (0, labels.size[axis] - 1)]
-    if len(border) == 1:
-        return border[0]
-    if len(border) == 2:
-        return max(border, key=lambda end: end.side * labels.direction[2, axis])
-    return max(ends, key=lambda end: int(_layer(limb, axis, end.layer + 3 * -end.side).sum()))
-
-
-def _extent(limb: NDArray[np.bool_], axis: int) -> tuple[int, int]:
-    others = tuple(n for n in range(3) if n != 2 - axis)
-    filled = np.flatnonzero(limb.any(axis=others))
-    return int(filled[0]), int(filled[-1])
-
-
-def _layer(limb: NDArray[np.bool_], axis: int, index: int) -> NDArray[np.bool_]:
-    return np.take(limb, index, axis=2 - axis)
+def _extended(labels: LabelMap, end: ProximalEnd, length_mm: float) -> LabelMap:
+    """The map with the layer at the end repeated outward, as if the limb went on."""
+    count = int(np.ceil(length_mm / labels.spacing[end.axis]))
+    keep = slice(end.layer, None) if end.side < 0 else slice(None, end.layer + 1)
+    kept = labels.array[tuple(keep if n == 2 - end.axis else slice(None) for n in range(3))]
+    pad = [(0, 0)] * 3
+    pad[2 - end.axis] = (count, 0) if end.side < 0 else (0, count)
+    start = np.zeros(3)
+    start[end.axis] = end.layer - count if end.side < 0 else 0
+    return replace(labels, array=np.pad(kept, pad, mode="edge"), origin=labels.index_to_point(start))
 
 
 def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
@@ -183,14 +140,14 @@ def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
     return np.asarray(point, dtype=float), vector / length
 
 
-def _check_sides(labels: LabelMap, end: _End, point: Array, normal: Array) -> None:
+def _check_sides(labels: LabelMap, end: ProximalEnd, point: Array, normal: Array) -> None:
     """Refuse a limb that a side of the image cuts off distal of the cut."""
     limb = labels.limb & (_heights(labels, point, normal) < 0)
     for axis in range(3):
         if axis == end.axis:
             continue
-        for layer in (0, labels.size[axis] - 1):
-            if _layer(limb, axis, layer).sum() > 20:
+        for index in (0, labels.size[axis] - 1):
+            if layer(limb, axis, index).sum() > 20:
                 raise LabelError(
                     "the limb runs out of the side of the image",
                     remedy="take an image that holds the whole limb, or move the proximal cut",

@@ -1,0 +1,213 @@
+"""Bones in T1- or UTE-like contrast: bright marrow enclosed by dark cortex, both inside the limb.
+
+The *escape level* of a voxel is the brightest that the darkest point of a way out of the limb's slice can
+be. Marrow cannot get out without crossing cortex, so its escape level is dark; subcutaneous fat, fat between
+muscles and vessels get out through tissue. (Grey-scale hole filling by reconstruction, Soille 2003, of the
+negative image.) Grey levels are relative to muscle throughout.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+from numpy.typing import NDArray
+from scipy.ndimage import (
+    binary_dilation,
+    binary_erosion,
+    binary_opening,
+    binary_propagation,
+    distance_transform_edt,
+)
+from scipy.ndimage import label as connected
+
+from .body import ball, fill_slices
+
+Mask = NDArray[np.bool_]
+Field = NDArray[np.float32]
+Spacing = NDArray[np.float64]
+
+_BRIGHT = 1.15  # marrow is brighter
+_ESCAPE = 0.78  # and cannot get out without crossing something darker
+_DARK = 0.65  # cortex: half-way between muscle (1) and cortical bone (0.2 to 0.3 with partial volume)
+_SKIN_MM = 2.0  # no bone this near to the outline, where partial volume with air is dark too
+_CORTEX_MM = 9.0  # thickest cortex: the anterior crest of the tibia
+_TAIL_MM = 2.0  # dark fascia and vessels thinner than twice this are taken off the bone
+_SEED_PART = 0.15  # of the smallest bone's volume, for its marrow to count
+_STEP_IN_MM, _STEP_OUT_MM = 2.0, 6.0  # how far a bone's outline may move from slice to slice
+_GROWTH = (0.6, 1.8)
+
+
+@dataclass(frozen=True)
+class Bone:
+    """One bone: its voxels, and along the limb its extent and mean place in slices."""
+
+    mask: Mask
+    volume_mm3: float
+
+
+def find_bones(levels: Field, limb: Mask, spacing: Spacing, smallest_mm3: float) -> list[Mask]:
+    """Masks of the bones, largest first.
+
+    Parameters
+    ----------
+    levels : ``[k, j, i]`` grey level over that of muscle, k along the limb.
+    limb : everything inside the skin.
+    spacing : mm along i, j, k.
+    smallest_mm3 : bones smaller than this are left out.
+    """
+    deep = _depth(limb, spacing) > _SKIN_MM
+    marrow = deep & (levels > _BRIGHT) & (escape_level(levels, limb) < _ESCAPE)
+    parts = _parts(marrow, _SEED_PART * smallest_mm3 / float(np.prod(spacing)))
+    if parts.max() == 0:
+        return []
+    for value in range(1, parts.max() + 1):
+        _follow(parts, value, levels, deep, spacing)
+    owned = _with_cortex(parts, levels, deep, spacing)
+    bones = [owned == value for value in range(1, parts.max() + 1)]
+    large = [bone for bone in bones if bone.sum() * np.prod(spacing) >= smallest_mm3]
+    return sorted(large, key=lambda bone: -int(bone.sum()))
+
+
+def escape_level(levels: Field, limb: Mask) -> Field:
+    """Per slice, the largest level that some way from the voxel to the outside never falls below."""
+    outside = np.float32(levels.max() + 1)
+    found = np.empty_like(levels)
+    for k, (plane, inside) in enumerate(zip(levels, limb)):
+        relief = np.pad(-np.where(inside, plane, outside), 1, constant_values=-outside)
+        filled = sitk.GrayscaleFillhole(sitk.GetImageFromArray(relief))
+        found[k] = -sitk.GetArrayFromImage(filled)[1:-1, 1:-1]
+    return found
+
+
+def _depth(limb: Mask, spacing: Spacing) -> Field:
+    """Distance to the outline, mm; the image's ends do not count as outline."""
+    padded = np.pad(limb, ((1, 1), (1, 1), (1, 1)))
+    padded[0], padded[-1] = padded[1], padded[-2]
+    return distance_transform_edt(padded, sampling=spacing[::-1])[1:-1, 1:-1, 1:-1]
+
+
+def _parts(marrow: Mask, smallest: float) -> NDArray[np.int32]:
+    """Connected cavities of at least ``smallest`` voxels, numbered from 1."""
+    found, count = connected(marrow, np.ones((3, 3, 3)))
+    sizes = np.bincount(found.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    number = np.zeros(count + 1, dtype=np.int32)
+    keep = np.flatnonzero(sizes >= max(smallest, 4))
+    number[keep] = np.arange(1, len(keep) + 1)
+    return number[found]
+
+
+def _follow(parts: NDArray[np.int32], value: int, levels: Field, deep: Mask, spacing: Spacing) -> None:
+    """Go on slice by slice where the cortex is too thin to enclose the marrow, as near a joint.
+
+    Changes ``parts`` in place.
+    """
+    filled = np.flatnonzero((parts == value).any(axis=(1, 2)))
+    for step, k in ((-1, int(filled[0])), (1, int(filled[-1]))):
+        while 0 <= k + step < len(parts):
+            previous = fill_slices((parts[k] == value)[None])[0]
+            k += step
+            free = deep[k] & ((parts[k] == 0) | (parts[k] == value))
+            found = _next_section(previous, levels[k], free, spacing)
+            if found is None:
+                break
+            parts[k][found] = value
+
+
+def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) -> Mask | None:
+    """The marrow in the next slice, split from fat around it along the darkest line (watershed)."""
+    flat = np.array([spacing[0], spacing[1], 1e6])
+    inside = binary_erosion(previous, ball(_STEP_IN_MM, flat)[0]) & free
+    allowed = binary_dilation(previous, ball(_STEP_OUT_MM, flat)[0]) & free
+    if not inside.any():
+        return None
+    markers = np.where(allowed, 0, 2).astype(np.uint8)
+    markers[inside] = 1
+    basins = sitk.MorphologicalWatershedFromMarkers(
+        sitk.GetImageFromArray(-plane), sitk.GetImageFromArray(markers), False, True
+    )
+    section = (sitk.GetArrayFromImage(basins) == 1) & (plane > _BRIGHT)
+    section &= binary_propagation(inside & section, mask=section)
+    ratio = section.sum() / previous.sum()
+    return section if _GROWTH[0] <= ratio <= _GROWTH[1] else None
+
+
+def _with_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Spacing) -> NDArray[np.int32]:
+    """Each cavity with the dark cortex around it, without the fascia and vessels that hang on."""
+    marrow = parts > 0
+    distance, nearest = distance_transform_edt(~marrow, sampling=spacing[::-1], return_indices=True)
+    dark = deep & (levels < _DARK) & (distance < _CORTEX_MM)
+    bone = binary_propagation(marrow, mask=fill_slices(marrow | dark))
+    bone = _without_tails(bone, spacing) | marrow
+    bone = binary_propagation(marrow, mask=fill_slices(bone))
+    return np.where(bone, parts[tuple(nearest)], 0)
+
+
+def _without_tails(bone: Mask, spacing: Spacing) -> Mask:
+    reach = int(_TAIL_MM / spacing[2]) + 1
+    padded = np.pad(bone, ((reach, reach), (0, 0), (0, 0)), mode="edge")
+    return binary_opening(padded, ball(_TAIL_MM, spacing))[reach:-reach]
+
+
+def name_bones(bones: list[Mask], spacing: Spacing) -> list[str]:
+    """Names by size and place; slices run from distal to proximal, ``bones`` from large to small.
+
+    The femur is the upper of two large bones that lie one above the other; the tibia the largest below it;
+    the fibula the slender one beside the tibia; the patella the compact one at the femur's height. What fits
+    none of these is ``bone-1`` and so on.
+    """
+    shapes = [_Extent.of(bone, spacing) for bone in bones]
+    names: dict[int, str] = {}
+    if not bones:
+        return []
+    large = [n for n, shape in enumerate(shapes) if shape.volume > 0.25 * shapes[0].volume]
+    stacked = len(large) >= 2 and shapes[large[0]].overlap(shapes[large[1]]) < 0.3
+    if stacked:
+        lower, upper = sorted(large[:2], key=lambda n: shapes[n].middle)
+        names |= {lower: "tibia", upper: "femur"}
+    else:
+        lower, upper = 0, None
+        names[0] = "tibia"
+    rest = [n for n in range(len(bones)) if n not in names]
+    for n in rest:
+        shape = shapes[n]
+        if "fibula" not in names.values() and shape.slender and shape.overlap(shapes[lower]) > 0.5:
+            names[n] = "fibula"
+        elif "patella" not in names.values() and upper is not None and shape.overlap(shapes[upper]) > 0.5:
+            names[n] = "patella"
+    unknown = iter(range(1, len(bones) + 1))
+    return [names[n] if n in names else f"bone-{next(unknown)}" for n in range(len(bones))]
+
+
+@dataclass(frozen=True)
+class _Extent:
+    """A bone along the limb, mm."""
+
+    low: float
+    high: float
+    middle: float
+    volume: float
+
+    @classmethod
+    def of(cls, bone: Mask, spacing: Spacing) -> _Extent:
+        areas = bone.sum(axis=(1, 2))
+        filled = np.flatnonzero(areas)
+        return cls(
+            low=float(filled[0] * spacing[2]),
+            high=float((filled[-1] + 1) * spacing[2]),
+            middle=float((areas @ np.arange(len(areas))) / areas.sum() * spacing[2]),
+            volume=float(areas.sum() * np.prod(spacing)),
+        )
+
+    @property
+    def slender(self) -> bool:
+        """More than two and a half times as long as wide."""
+        length = self.high - self.low
+        return length > 2.5 * float(np.sqrt(self.volume / length))
+
+    def overlap(self, other: _Extent) -> float:
+        """Part of the shorter one's length that both share."""
+        shared = min(self.high, other.high) - max(self.low, other.low)
+        return shared / min(self.high - self.low, other.high - other.low)

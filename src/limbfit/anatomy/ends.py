@@ -1,0 +1,69 @@
+"""Where the limb enters the image: its axis on the grid and its proximal end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import LabelError
+from .grid import Grid
+
+Mask = NDArray[np.bool_]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ProximalEnd:
+    """The proximal end of a limb on its grid.
+
+    ``axis`` is 0, 1, 2 for i, j, k; ``side`` -1 or 1, the sense of that axis that is proximal; ``layer`` the
+    last index that holds limb.
+    """
+
+    axis: int
+    side: int
+    layer: int
+
+    def direction(self, grid: Grid) -> Array:
+        """(3,) unit vector, proximal, LPS."""
+        return self.side * grid.direction[:, self.axis]
+
+    def along(self, array: NDArray) -> NDArray:
+        """A view of ``[k, j, i]`` whose first axis runs along the limb from distal to proximal."""
+        view = np.moveaxis(array, 2 - self.axis, 0)
+        return view[::-1] if self.side < 0 else view
+
+
+def proximal_end(limb: Mask, grid: Grid) -> ProximalEnd:
+    """Where the limb was cut: at the border of the image that it reaches, else at its thicker end.
+
+    The limb's axis is the grid axis along which it is longest. Of two ends at the border, as of an intact
+    leg, the superior one is proximal.
+    """
+    if not limb.any():
+        raise LabelError("the label map is empty", remedy="give one with the limb labelled")
+    extents = [_extent(limb, axis) for axis in range(3)]
+    lengths = [(high - low + 1) * grid.spacing[axis] for axis, (low, high) in enumerate(extents)]
+    axis = int(np.argmax(lengths))
+    low, high = extents[axis]
+    ends = [ProximalEnd(axis, -1, low), ProximalEnd(axis, 1, high)]
+    border = [end for end in ends if end.layer in (0, grid.size[axis] - 1)]
+    if len(border) == 1:
+        return border[0]
+    if len(border) == 2:
+        return max(border, key=lambda end: end.direction(grid)[2])
+    depth = min(3, high - low)
+    return max(ends, key=lambda end: int(layer(limb, axis, end.layer - depth * end.side).sum()))
+
+
+def layer(mask: Mask, axis: int, index: int) -> Mask:
+    """One layer of ``[k, j, i]`` across grid axis 0, 1, 2 (i, j, k)."""
+    return np.take(mask, index, axis=2 - axis)
+
+
+def _extent(mask: Mask, axis: int) -> tuple[int, int]:
+    others = tuple(n for n in range(3) if n != 2 - axis)
+    filled = np.flatnonzero(mask.any(axis=others))
+    return int(filled[0]), int(filled[-1])
