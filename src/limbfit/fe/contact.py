@@ -29,8 +29,10 @@ class ContactSurface:
     points: Array
 
     @classmethod
-    def build(cls, element: Element, points: Array, faces: NDArray[np.int64]) -> ContactSurface:
-        N, areas = face_quadrature(element, points, faces)
+    def build(
+        cls, element: Element, points: Array, faces: NDArray[np.int64], rule: str
+    ) -> ContactSurface:
+        N, areas = face_quadrature(element, points, faces, rule)
         return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
 
     def gaps(self, indenter: Indenter, u: Array | None = None) -> Array:

@@ -6,7 +6,7 @@ nodes in VTK order.  Adding an element is adding a row to `ELEMENTS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,8 @@ class Element:
 
     ``shape(x (q, 3))`` gives values (q, k) and derivatives (q, k, 3); ``points``/``weights`` are the
     quadrature; ``mean_dilatation`` takes one volume ratio and pressure per element (three-field,
-    Simo, Taylor and Pister 1985); ``face_shape``/``face_points``/``face_weights`` belong to its faces.
+    Simo, Taylor and Pister 1985); ``face_shape`` and ``face_rules`` (by name: points and weights) belong to
+    its faces.
     """
 
     name: str
@@ -34,8 +35,7 @@ class Element:
     weights: Array
     mean_dilatation: bool
     face_shape: Shape
-    face_points: Array
-    face_weights: Array
+    face_rules: Mapping[str, tuple[Array, Array]]
 
 
 def _simplex_gradients(d: int) -> Array:
@@ -122,18 +122,28 @@ _TET_1 = (np.full((1, 3), 0.25), np.array([1.0 / 6.0]))
 _TET_4 = _orbit(((5.0 + 3.0 * np.sqrt(5.0)) / 20.0, 0.25), d=3)
 # Degree 3, eight points: the rule of FEBio's default tet10.
 _TET_8 = _orbit((0.0158359099, 0.138527967), (0.6791431780, 0.111472033), d=3)
-_TRI = _triangle_7()
-_QUAD = _gauss(2, 3)
+# Contact at nodes constrains as many points as there are nodes to give way.  Gauss points of a quadratic
+# face outnumber them threefold: stiff contact then opens at every other point and Newton's method chatters.
+# The nodal rule of a quadratic triangle has its corners at zero weight (it is exact to degree 2).
+_TRI3 = {
+    "nodes": (np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.full(3, 1.0 / 6.0)),
+    "gauss": _triangle_7(),
+}
+_TRI6 = {
+    "nodes": (np.array([[0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]), np.full(3, 1.0 / 6.0)),
+    "gauss": _triangle_7(),
+}
+_QUAD4 = {"nodes": (QUAD_CORNERS, np.ones(4)), "gauss": _gauss(2, 2)}
 _HEX = _gauss(3, 2)
 
 ELEMENTS: dict[str, Element] = {
     e.name: e
     for e in (
-        Element("tet4", "tet4", linear_simplex, *_TET_1, False, linear_simplex, *_TRI),
-        Element("tet10", "tet10", quadratic_simplex, *_TET_4, False, quadratic_simplex, *_TRI),
-        Element("tet10g8", "tet10", quadratic_simplex, *_TET_8, False, quadratic_simplex, *_TRI),
-        Element("tet10p0", "tet10", quadratic_simplex, *_TET_4, True, quadratic_simplex, *_TRI),
-        Element("hex8", "hex8", linear_hexahedron, *_HEX, True, linear_quadrilateral, *_QUAD),
+        Element("tet4", "tet4", linear_simplex, *_TET_1, False, linear_simplex, _TRI3),
+        Element("tet10", "tet10", quadratic_simplex, *_TET_4, False, quadratic_simplex, _TRI6),
+        Element("tet10g8", "tet10", quadratic_simplex, *_TET_8, False, quadratic_simplex, _TRI6),
+        Element("tet10p0", "tet10", quadratic_simplex, *_TET_4, True, quadratic_simplex, _TRI6),
+        Element("hex8", "hex8", linear_hexahedron, *_HEX, True, linear_quadrilateral, _QUAD4),
     )
 }
 
@@ -153,9 +163,12 @@ def reference_gradients(element: Element, points: Array, cells: NDArray[np.int64
     return np.ascontiguousarray(gradients), weights
 
 
-def face_quadrature(element: Element, points: Array, faces: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Shape values (q, k) and reference areas (f, q), mm^2, at the quadrature points of faces."""
-    N, dN = element.face_shape(element.face_points)
+def face_quadrature(
+    element: Element, points: Array, faces: NDArray[np.int64], rule: str
+) -> tuple[Array, Array]:
+    """Shape values (q, k) and reference areas (f, q), mm^2, at the points of a face rule."""
+    at, weights = element.face_rules[rule]
+    N, dN = element.face_shape(at)
     tangents = np.einsum("fki,qkj->fqij", points[faces], dN, optimize=True)
     normal = np.cross(tangents[..., 0], tangents[..., 1])
-    return N, np.linalg.norm(normal, axis=-1) * element.face_weights
+    return N, np.linalg.norm(normal, axis=-1) * weights

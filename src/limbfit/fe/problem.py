@@ -77,6 +77,7 @@ class Problem:
     history : the indenter's advance.
     supports : single components held or moved.
     element : name in the element table; by default the mesh's cell type.
+    contact_rule : where contact is enforced: ``nodes`` of the faces or their ``gauss`` points.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     """
 
@@ -89,6 +90,7 @@ class Problem:
     supports: tuple[Support, ...] = ()
     element: str = ""
     start: str = "touching"
+    contact_rule: str = "nodes"
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, OgdenQLV]) -> Problem:
@@ -147,6 +149,8 @@ def _check_choices(problem: Problem) -> None:
         raise ProblemError(f"region {missing[0]!r} has no material")
     if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
         raise ProblemError("the mesh has region indices without a name")
+    if problem.contact_rule not in ("nodes", "gauss"):
+        raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy="use 'nodes' or 'gauss'")
     if problem.start not in ("touching", "as-given"):
         raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
 

@@ -89,8 +89,6 @@ class Simulation:
         self.floor = 0.0
         width = problem.indenter.width if problem.indenter is not None else 1.0
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
-        if self.warm:
-            self.stiffness = max(self.stiffness, max(state.penalty for state in self.warm.values()))
         self.deepest = control.penetration * float(np.abs(problem.history.displacement).max())
         rest = np.zeros_like(self.system.points)
         self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness)]
@@ -120,7 +118,10 @@ class Simulation:
         """The step to time ``t``, or why there is none; nothing is changed unless it is accepted."""
         before = self.states[-1]
         displacement, dt = float(self.problem.history.at(t)), t - before.time
+        warm = self.warm.get(round(t, 9))
         stiffness, u = self.stiffness, self._predict(t, displacement)
+        if warm is not None:  # the same penalty as then, or the force would jump between iterates
+            stiffness = max(stiffness, warm.penalty)
         for _ in range(6):
             increment = self.memory.increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus

@@ -120,7 +120,7 @@ class System:
         self.indenter = problem.indenter
         if problem.indenter is not None:
             faces = np.asarray(problem.contact_faces, dtype=np.int32)
-            self.surface = ContactSurface.build(self.element, self.points, faces)
+            self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
             self.face_positions = _positions(faces, self.numbers, self.indptr, self.indices)
             if problem.start == "touching":
                 self.indenter = problem.indenter.moved(self._touching(problem.indenter))
@@ -174,7 +174,8 @@ class System:
             and mine.contact_faces is problem.contact_faces
             and mine.indenter is problem.indenter
             and mine.supports == problem.supports
-            and (mine.element, mine.start) == (problem.element, problem.start)
+            and (mine.element, mine.start, mine.contact_rule)
+            == (problem.element, problem.start, problem.contact_rule)
         )
 
     def impose(self, u: Array, displacement: float) -> Array:
