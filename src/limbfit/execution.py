@@ -229,13 +229,13 @@ class _Worker:
         far.close()
 
     def send(self, function: Callable, job: Any) -> None:
-        with suppress(ConnectionError):  # it died while idle: reading its line tells so
+        with suppress(OSError):  # it died while idle: reading its line tells so
             self.connection.send((function, job))
 
     def receive(self) -> _Outcome | None:
         try:
             return self.connection.recv()
-        except (EOFError, ConnectionError):
+        except (EOFError, OSError):  # nothing more, or half a message
             return None
 
     def end(self, at_once: bool) -> None:

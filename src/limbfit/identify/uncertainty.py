@@ -4,9 +4,9 @@ Linearised at the answer, in logarithms of the parameters. The fit weighs sites 
 their noise, and what is left over is mostly the model's own misfit, which drifts along the trace instead of
 scattering. So the covariance is the sandwich of weighted least squares (White 1980; Newey and West 1987 for
 correlated residuals): ``H^-1 M H^-1`` with ``H = J' W J`` and ``M = J' W S W J``, where S holds each site's
-residual variance and an exponential autocorrelation estimated from its residuals. The bounds enter as the spread
-of a uniform distribution between them: where the data say nothing, that is all that is known, and the interval
-says so.
+residual variance and an exponential autocorrelation estimated from its residuals. The bounds enter as the
+spread of a uniform distribution between them: where the data say nothing, that is all that is known, and the
+interval says so.
 """
 
 from __future__ import annotations
@@ -118,8 +118,7 @@ def estimate_uncertainty(
     responses : forces and derivatives there (``Calibration.responses``).
     """
     left = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
-    share = len(parameters) / sum(residual.size for residual in left)
-    noise = tuple(_site_noise(site.name, residual, share) for site, residual in zip(measured, left))
+    noise = _noise(left, [site.name for site in measured], len(parameters))
     scaled = [response.jacobian * parameters for response in responses]
     prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
     covariance = _sandwich(scaled, measured, noise, prior_sd)
@@ -145,18 +144,23 @@ def estimate_uncertainty(
     )
 
 
-def _site_noise(name: str, residual: Array, share: float) -> SiteNoise:
-    """Standard deviation (corrected for the fitted parameters) and first-order autocorrelation.
+def _noise(residuals: Sequence[Array], names: Sequence[str], parameters: int) -> tuple[SiteNoise, ...]:
+    """Standard deviation and first-order autocorrelation per site, both corrected for what the fit took away."""
+    lags = [_autocorrelation(residual, parameters / len(residuals)) for residual in residuals]
+    effective = [r.size * (1 - lag) / (1 + lag) for r, lag in zip(residuals, lags)]
+    kept = max(1 - parameters / sum(effective), 0.1)
+    sd = [float(np.sqrt(residual @ residual / (residual.size * kept))) for residual in residuals]
+    return tuple(SiteNoise(*entry) for entry in zip(names, sd, lags, effective))
 
-    A sum of squares below rounding is a perfect fit, which says nothing about correlation.
+
+def _autocorrelation(residual: Array, fitted: float) -> float:
+    """Correlation of neighbours; its bias grows with the ``fitted`` parameters per site (Marriott and Pope 1954).
+
+    A perfect fit says nothing about it.
     """
-    n = residual.size
-    squares = float(residual @ residual)
+    n, squares = residual.size, float(residual @ residual)
     lag = float(residual[1:] @ residual[:-1]) / squares if squares > 0 else 0.0
-    lag = float(np.clip(lag, 0.0, 1 - 2 / n))
-    effective = n * (1 - lag) / (1 + lag)
-    sd = np.sqrt(squares / (n * max(1 - share, 0.1)))
-    return SiteNoise(name, float(sd), lag, float(effective))
+    return float(np.clip(lag + (1 + 3 * lag) * fitted / n, 0.0, 1 - 2 / n))
 
 
 def _sandwich(

@@ -1,0 +1,96 @@
+"""A closed-form viscoelastic model whose truth is known, to be identified.
+
+At each site an incompressible bar of skin beside one of muscle, compressed together between plates
+(uniaxial stress, second-order Ogden, quasi-linear viscoelasticity of the nominal stress). Bars differ in length and
+section from site to site, as tissue does. Derivatives come by complex step, exact to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limbfit.identify import Measured, SiteResponse, Unknowns
+
+NAMES = tuple(
+    f"{tissue}.{name}" for tissue in ("skin", "muscle") for name in ("c_kPa", "m", "gamma", "tau_s")
+)
+TRUTH = np.array([9.0, 6.0, 2.0, 0.5, 4.0, 4.0, 3.0, 0.3])
+# The paper's start and bounds (section 2.3, table 1).
+PAPER = Unknowns(
+    NAMES,
+    np.tile([4.7, 3.0, 1.2, 2.0], 2),
+    np.tile([0.047, 2.0, 0.01, 0.01], 2),
+    np.tile([47.0, 20.0, 10.0, 10.0], 2),
+)
+
+
+@dataclass(frozen=True)
+class Bars:
+    """A site: sections in mm^2, lengths in mm of skin and muscle, depth in mm at 0.96 mm/s."""
+
+    sections: tuple[float, float]
+    lengths: tuple[float, float]
+    depth: float
+    points: int = 60
+
+    def force(self, p: np.ndarray) -> np.ndarray:
+        """Force (points,) N at evenly spread times of loading and unloading."""
+        n = self.points
+        time = np.linspace(0, 2 * self.depth / 0.96, n)
+        travel = 0.96 * np.minimum(time, time[-1] - time)
+        total = np.zeros(n, dtype=p.dtype)
+        for section, length, (c, m, gamma, tau) in zip(self.sections, self.lengths, p.reshape(2, 4)):
+            stretch = 1 - travel / length
+            powers = (
+                stretch ** (m - 1) - stretch ** (-m - 1) - stretch ** (-m / 2 - 1) + stretch ** (m / 2 - 1)
+            )
+            elastic = -section * c * 1e-3 / m * powers
+            dt = time[1] - time[0]
+            decay, history = np.exp(-dt / tau), np.zeros(n, dtype=p.dtype)
+            rise = (1 - decay) / (dt / tau)
+            for k in range(1, n):
+                history[k] = decay * history[k - 1] + rise * (elastic[k] - elastic[k - 1])
+            total += elastic + gamma * history
+        return total
+
+    def respond(self, p: np.ndarray) -> SiteResponse:
+        step = 1e-30
+        columns = [self.force(p + 1j * step * row).imag / step for row in np.eye(len(p))]
+        return SiteResponse(self.force(p), np.stack(columns, axis=1))
+
+
+SITES = (
+    Bars((320.0, 60.0), (14.0, 20.0), 4.0),
+    Bars((250.0, 150.0), (11.0, 18.0), 3.5),
+    Bars((120.0, 380.0), (20.0, 24.0), 6.0),
+    Bars((60.0, 420.0), (25.0, 22.0), 7.0),
+)
+
+
+def simulate(parameters):
+    return [site.respond(parameters) for site in SITES]
+
+
+def records(noise: float = 0.0, seed: int = 0, truth: np.ndarray = TRUTH, sites=SITES) -> list[Measured]:
+    rng = np.random.default_rng(seed)
+    forces = [site.force(truth) for site in sites]
+    return [Measured(f"s{k}", f + noise * rng.standard_normal(f.size)) for k, f in enumerate(forces)]
+
+
+class Counted:
+    """A simulation that counts its calls, fails at random, or in a part of the parameter space."""
+
+    def __init__(self, failing: float = 0.0, seed: int = 0, forbidden=lambda p: False):
+        self.calls, self.failing, self.forbidden = 0, failing, forbidden
+        self.rng = np.random.default_rng(seed)
+
+    def __call__(self, parameters):
+        self.calls += 1
+        responses = simulate(parameters)
+        for k, response in enumerate(responses):
+            if self.rng.random() < self.failing or self.forbidden(parameters):
+                half = np.where(np.arange(response.force_N.size) < 30, response.force_N, np.nan)
+                responses[k] = SiteResponse(half, response.jacobian, False, "did not converge")
+        return responses

@@ -1,0 +1,221 @@
+"""The identification against a closed-form viscoelastic model whose truth is known (see bars.py)."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from bars import PAPER, SITES, TRUTH, Counted, records, simulate
+
+from limbfit.errors import CalibrationError, ProblemError
+from limbfit.identify import (
+    FIXED,
+    SEPARATE,
+    SHARED,
+    CalibrationSettings,
+    Measured,
+    SiteResponse,
+    State,
+    Unknowns,
+    calibrate,
+    search_space,
+)
+
+
+def test_complex_step_derivatives_agree_with_differences():
+    response = SITES[0].respond(TRUTH)
+    for k, row in enumerate(np.eye(8)):
+        h = 1e-5 * TRUTH[k]
+        central = (SITES[0].force(TRUTH + h * row) - SITES[0].force(TRUTH - h * row)) / (2 * h)
+        assert response.jacobian[:, k] == pytest.approx(central, rel=1e-5, abs=1e-9)
+
+
+def test_truth_is_found_from_the_papers_start_in_few_evaluations():
+    run = Counted()
+    found = calibrate(run, records(), PAPER)
+    assert found.converged, found.reason
+    assert found.parameters == pytest.approx(TRUTH, rel=2e-3)
+    assert found.evaluations == run.calls
+    assert found.stages[0].evaluations <= 10
+    assert found.stages[1].evaluations <= 10
+    assert found.stages[0].parameters[:4] == found.stages[0].parameters[4:]
+    assert [h.cost for h in found.history if h.stage == 1] == sorted(
+        (h.cost for h in found.history if h.stage == 1), reverse=True
+    )
+
+
+def test_the_one_material_stage_alone_keeps_tissues_equal():
+    found = calibrate(simulate, records(), PAPER, stages=(SHARED,))
+    assert np.array_equal(found.parameters[:4], found.parameters[4:])
+    assert found.cost > 1e-3
+
+
+def test_the_second_stage_starts_where_the_first_ended_without_a_new_simulation():
+    found = calibrate(simulate, records(), PAPER)
+    last = [h for h in found.history if h.stage == 0][-1]
+    first = next(h for h in found.history if h.stage == 1)
+    assert (first.parameters, first.evaluations) == (last.parameters, last.evaluations)
+
+
+def test_fixed_parameters_stay_and_the_others_are_found():
+    start = PAPER.start.copy()
+    start[[1, 5]] = TRUTH[[1, 5]]
+    known = Unknowns(PAPER.names, start, PAPER.lower, PAPER.upper)
+    grouping = (0, FIXED, 1, 2, 3, FIXED, 4, 5)
+    found = calibrate(simulate, records(), known, stages=(grouping,))
+    assert np.array_equal(found.parameters[[1, 5]], TRUTH[[1, 5]])
+    assert found.parameters == pytest.approx(TRUTH, rel=2e-3)
+
+
+def test_random_starts_within_the_bounds_end_at_the_same_optimum():
+    rng = np.random.default_rng(3)
+    data = records(0.03, seed=1)
+    reference = calibrate(simulate, data, PAPER)
+    for _ in range(8):
+        share = rng.uniform(0.15, 0.85, 4)
+        start = np.tile(np.exp(np.log(PAPER.lower[:4]) * (1 - share) + np.log(PAPER.upper[:4]) * share), 2)
+        found = calibrate(simulate, data, Unknowns(PAPER.names, start, PAPER.lower, PAPER.upper))
+        assert found.cost == pytest.approx(reference.cost, rel=5e-3), start
+        assert found.parameters == pytest.approx(reference.parameters, rel=0.05), start
+
+
+def test_an_optimum_beyond_a_bound_is_found_on_it():
+    upper = PAPER.upper.copy()
+    upper[[0, 4]] = 6.0
+    found = calibrate(simulate, records(), Unknowns(PAPER.names, PAPER.start, PAPER.lower, upper))
+    assert found.converged, found.reason
+    assert found.parameters[0] == pytest.approx(6.0)
+    assert np.all(found.parameters <= upper * (1 + 1e-12))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_simulation_in_ten_may_fail(seed):
+    data = records(0.03)
+    reference = calibrate(simulate, data, PAPER)
+    run = Counted(failing=0.1, seed=seed)
+    found = calibrate(run, data, PAPER)
+    assert found.converged, found.reason
+    assert found.parameters == pytest.approx(reference.parameters, rel=5e-3)
+    assert run.calls <= 60
+
+
+def test_a_region_that_cannot_be_simulated_is_walked_around():
+    run = Counted(forbidden=lambda p: p[0] * (1 + p[2]) > 31.0)
+    found = calibrate(run, records(), PAPER)
+    assert found.converged, found.reason
+    assert found.parameters == pytest.approx(TRUTH, rel=2e-3)
+
+
+def test_an_answer_that_cannot_be_simulated_ends_with_the_reason():
+    found = calibrate(Counted(forbidden=lambda p: p[0] > 8.0), records(), PAPER)
+    assert not found.converged
+    assert "stuck: the simulations fail" in found.reason
+    assert "did not converge" in found.reason
+    assert found.parameters[0] <= 8.0
+
+
+def test_a_start_that_fails_moves_towards_the_middle_of_the_bounds():
+    run = Counted(forbidden=lambda p: abs(p[0] - 4.7) < 0.01)
+    assert calibrate(run, records(), PAPER).parameters == pytest.approx(TRUTH, rel=2e-3)
+    with pytest.raises(CalibrationError, match=r"no simulation completes.*s0: did not converge"):
+        calibrate(Counted(forbidden=lambda p: True), records(), PAPER)
+
+
+def test_a_force_that_is_not_finite_is_a_failure():
+    def broken(parameters):
+        responses = simulate(parameters)
+        return [SiteResponse(responses[0].force_N * np.nan, responses[0].jacobian), *responses[1:]]
+
+    with pytest.raises(CalibrationError, match="s0: the simulated force is not finite"):
+        calibrate(broken, records(), PAPER)
+
+
+def test_wrong_shapes_are_the_callers_fault():
+    with pytest.raises(CalibrationError, match="3 responses for 4 sites"):
+        calibrate(lambda p: simulate(p)[:3], records(), PAPER)
+    with pytest.raises(CalibrationError, match="s1: the simulated force has the wrong shape"):
+        calibrate(
+            lambda p: [
+                r if k != 1 else SiteResponse(r.force_N[1:], r.jacobian[1:])
+                for k, r in enumerate(simulate(p))
+            ],
+            records(),
+            PAPER,
+        )
+
+
+@pytest.mark.parametrize("failing", [0.0, 0.1])
+def test_a_run_taken_up_again_from_any_state_gives_the_same_answer(failing):
+    states: list[str] = []
+    data = records(0.03)
+    whole = calibrate(
+        Counted(failing), data, PAPER, on_iterate=lambda s: states.append(json.dumps(s.to_dict()))
+    )
+    assert len(states) > 8
+    for text in states:
+        state = State.from_dict(json.loads(text))
+        again = calibrate(simulate, data, PAPER, state=state)
+        if failing:
+            assert again.parameters == pytest.approx(whole.parameters, rel=5e-3)
+        else:
+            assert again.to_dict() == whole.to_dict()
+
+
+def test_the_result_is_json():
+    found = calibrate(simulate, records(), PAPER, stages=(SHARED,))
+    content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert set(content["parameters"]) == set(PAPER.names)
+    assert content["stages"][0]["evaluations"] == content["evaluations"]
+    assert set(content["errors_percent"]) == {"s0", "s1", "s2", "s3"}
+
+
+def test_the_papers_objective_leads_to_the_truth_too():
+    settings = CalibrationSettings(objective="paper", max_iterations=60)
+    found = calibrate(simulate, records(), PAPER, settings)
+    assert max(found.history[-1].errors_percent) < 0.5
+
+
+def test_the_papers_stopping_rule_stops_earlier():
+    loose = calibrate(simulate, records(0.03), PAPER, CalibrationSettings(stopping="paper"))
+    tight = calibrate(simulate, records(0.03), PAPER, CalibrationSettings(relative_tolerance=1e-6))
+    assert loose.converged
+    assert "0.01" in loose.stages[0].reason
+    assert loose.evaluations < tight.evaluations
+    assert loose.cost >= tight.cost
+
+
+def test_the_limit_of_iterations_is_not_called_convergence():
+    found = calibrate(simulate, records(), PAPER, CalibrationSettings(max_iterations=2))
+    assert not found.converged
+    assert [stage.iterations for stage in found.stages] == [2, 2]
+    assert "limit" in found.reason
+
+
+def test_sites_count_alike_whatever_their_force_and_sampling():
+    data = records()
+    big = [Measured(d.name, d.force_N * 10) for d in data]
+    start = calibrate(simulate, data, PAPER, CalibrationSettings(max_iterations=1), stages=(SHARED,)).history[
+        0
+    ]
+    scaled = [SiteResponse(10 * r.force_N, 10 * r.jacobian) for r in simulate(PAPER.start)]
+    tenfold = calibrate(lambda p: scaled, big, PAPER, CalibrationSettings(max_iterations=1), stages=(SHARED,))
+    assert tenfold.history[0].cost == pytest.approx(start.cost)
+
+
+def test_search_space_round_trip_and_derivatives():
+    for grouping in (SHARED, SEPARATE, (0, 1, 2, FIXED, 3, 1, 2, FIXED)):
+        space = search_space(PAPER, grouping)
+        z = (space.lower + space.upper) / 2
+        assert space.reduce(space.logarithms(z)) == pytest.approx(z)
+        jacobian = space.pull_back(np.eye(8), space.expand(z))
+        for k, row in enumerate(np.eye(len(z))):
+            difference = (space.expand(z + 1e-6 * row) - space.expand(z - 1e-6 * row)) / 2e-6
+            assert jacobian[:, k] == pytest.approx(difference, rel=1e-6)
+
+
+def test_impossible_bounds_are_bad_input():
+    with pytest.raises(ProblemError, match=r"skin.gamma.*0 < lower"):
+        Unknowns(PAPER.names, PAPER.start, PAPER.lower * [1, 1, 0, 1, 1, 1, 1, 1], PAPER.upper)
+    with pytest.raises(ProblemError, match="no parameter is left"):
+        search_space(PAPER, (FIXED,) * 8)
