@@ -1,0 +1,188 @@
+"""load_study: what it accepts, and that each refusal is one line with file, key and remedy."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from limbfit.errors import StudyError
+from limbfit.study import load_study
+
+GOOD = """
+[study]
+name = "one limb"
+
+[surfaces]
+skin = "skin.stl"
+bones = { tibia = "tibia.stl" }
+
+[mesh]
+edge_near_mm = 3.0
+
+[[sites]]
+name = "1"
+fitted = true
+trace = "1.csv"
+position = [0.0, -50.0, 10.0]
+
+[[sites]]
+name = "2"
+depth_mm = 6.0
+position = [0.0, 50.0, 10.0]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("skin.stl", "tibia.stl", "1.csv"):
+        (tmp_path / name).touch()
+    (tmp_path / "mri").mkdir()
+    return tmp_path
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "study.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(StudyError) as caught:
+        load_study(path)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_a_good_study(folder: Path) -> None:
+    file = write(folder, GOOD)
+    study = load_study(file)
+    assert study == load_study(folder)
+    assert [site.name for site in study.sites] == ["1", "2"]
+    assert [site.name for site in study.fitted] == ["1"]
+    assert study.results == folder / "results"
+    assert study.mesh.edge_near_mm == 3.0
+    assert study.mesh.edge_far_mm == 12.0
+    assert study.path(study.sites[0].trace or Path()) == folder / "1.csv"
+    assert study.site("2").depth_mm == 6.0
+
+
+def test_a_study_does_not_change(folder: Path) -> None:
+    study = load_study(write(folder, GOOD))
+    with pytest.raises(Exception, match="frozen"):
+        study.mesh.edge_near_mm = 1.0
+
+
+def test_an_unknown_site_is_answered_with_the_known_ones(folder: Path) -> None:
+    study = load_study(write(folder, GOOD))
+    with pytest.raises(StudyError, match=r"study\.toml: sites: no site is named '7'; the study has 1, 2"):
+        study.site("7")
+
+
+def test_no_study(folder: Path) -> None:
+    text = refusal(folder)
+    assert text.startswith(str(folder / "study.toml"))
+    assert "no such study; give a study.toml or the folder that holds one" in text
+
+
+@pytest.mark.parametrize("content", [b"[study\nname = 1", b"[study]\nname = \xff\xfe"])
+def test_not_toml(folder: Path, content: bytes) -> None:
+    (folder / "study.toml").write_bytes(content)
+    assert re.search(r"study\.toml: not valid TOML: .+", refusal(folder))
+
+
+# what to replace in the good study, by what, and what the refusal says: place, fault
+FAULTS = {
+    "unknown key": (
+        "edge_near_mm = 3.0",
+        "edge_naer_mm = 3.0",
+        r"mesh\.edge_naer_mm: unknown key; see docs/study",
+    ),
+    "unknown table": ("[mesh]", "[meshes]", r"meshes: unknown key; see docs/study"),
+    "negative": ("edge_near_mm = 3.0", "edge_near_mm = -3.0", r"mesh\.edge_near_mm: .*greater than 0"),
+    "zero": ("edge_near_mm = 3.0", "edge_near_mm = 0", r"mesh\.edge_near_mm: .*greater than 0"),
+    "infinite": ("edge_near_mm = 3.0", "edge_near_mm = inf", r"mesh\.edge_near_mm: .*finite"),
+    "not a number": ("edge_near_mm = 3.0", "edge_near_mm = nan", r"mesh\.edge_near_mm: "),
+    "text for number": ("edge_near_mm = 3.0", 'edge_near_mm = "fine"', r"mesh\.edge_near_mm: .*number"),
+    "wrong choice": ("edge_near_mm = 3.0", 'element = "hex20"', r"mesh\.element: .*'tet4' or 'tet10'"),
+    "short vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0]", r"sites\.0\.position"),
+    "infinite vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0, inf]", r"sites\.0\.position\.2: .*finite"),
+    "no name": ('name = "one limb"', "", r"study\.name: .*required"),
+    "bad site name": ('name = "2"', 'name = "../2"', r"sites\.1\.name: .*pattern"),
+    "same site twice": ('name = "2"', 'name = "1"', r"sites: site names must differ; given twice: 1"),
+    "two doors": ("[mesh]", '[image]\npath = "mri"\n[mesh]', r"either \[image\] or \[surfaces\]"),
+    "no place": ("position = [0.0, 50.0, 10.0]", "", r"sites\.1: give either position .* or near"),
+    "near without markers": (
+        "position = [0.0, 50.0",
+        "near = [0.0, 50.0",
+        r"site 2: 'near' needs image\.markers",
+    ),
+    "record and plan": (
+        'trace = "1.csv"',
+        'trace = "1.csv"\ndepth_mm = 5',
+        r"sites\.0: give either trace .* or depth",
+    ),
+    "fitted without record": (
+        "depth_mm = 6.0",
+        "depth_mm = 6.0\nfitted = true",
+        r"sites\.1: a fitted site needs a trace",
+    ),
+    "missing record": ('trace = "1.csv"', 'trace = "9.csv"', r"sites\.1\.trace: 9\.csv does not exist"),
+    "missing surface": (
+        'skin = "skin.stl"',
+        'skin = "hide.stl"',
+        r"surfaces\.skin: hide\.stl does not exist",
+    ),
+    "missing bone": (
+        'tibia = "tibia.stl"',
+        'tibia = "t.stl"',
+        r"surfaces\.bones\.tibia: t\.stl does not exist",
+    ),
+    "wide rounding": (
+        "[mesh]",
+        "[indenter]\nedge_radius_mm = 10\n[mesh]",
+        r"indenter: edge_radius_mm must be smaller",
+    ),
+    "start out of bounds": (
+        "[mesh]",
+        "[material]\nstart = { c_kPa = 50, m = 3, gamma = 1, tau_s = 1 }\n[mesh]",
+        r"material: start\.c_kPa lies outside its bounds",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_refusals_name_file_key_and_fault(folder: Path, fault: str) -> None:
+    old, new, expected = FAULTS[fault]
+    assert GOOD.count(old) == 1
+    text = refusal(write(folder, GOOD.replace(old, new)))
+    assert text.startswith(f"{folder / 'study.toml'}: ")
+    assert re.search(expected, text), text
+
+
+def test_several_faults_are_counted(folder: Path) -> None:
+    text = GOOD.replace("edge_near_mm = 3.0", "edge_near_mm = 0\nedge_far_mm = 0\ngrowth = 0")
+    assert "(and 2 more)" in refusal(write(folder, text))
+
+
+def test_no_door(folder: Path) -> None:
+    text = re.sub(r"\[surfaces\].*?\[mesh\]", "[mesh]", GOOD, flags=re.DOTALL)
+    assert "either [image] or [surfaces]" in refusal(write(folder, text))
+
+
+def test_no_site(folder: Path) -> None:
+    text = GOOD[: GOOD.index("[[sites]]")]
+    assert re.search(r"sites: .*required", refusal(write(folder, text)))
+    text = "sites = []\n" + text
+    assert "sites: the study has no site" in refusal(write(folder, text))
+
+
+def test_missing_markers_and_labels(folder: Path) -> None:
+    text = re.sub(
+        r"\[surfaces\].*?\[mesh\]", '[image]\npath = "mri"\nmarkers = "m"\n[mesh]', GOOD, flags=re.DOTALL
+    )
+    assert "image.markers: m does not exist" in refusal(write(folder, text))
+    text = text.replace('markers = "m"', "") + '[segmentation]\nlabels = "l.seg.nrrd"\n'
+    assert "segmentation.labels: l.seg.nrrd does not exist" in refusal(write(folder, text))
