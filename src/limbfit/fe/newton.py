@@ -50,7 +50,8 @@ def equilibrate(
     for iteration in range(control.max_iterations):
         norm = residual_norm(system, here)
         scale = reaction_scale(system, here, floor)
-        if norm <= control.tolerance * scale:
+        rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
+        if norm <= control.tolerance * scale or rounding:
             return Equilibrium(u, here, iteration)
         forcing = min(0.1, max(0.1 * norm / scale, 0.3 * control.tolerance * scale / norm))
         stale = control.stale_products if norm < 0.5 * last or iteration == 0 else 0
