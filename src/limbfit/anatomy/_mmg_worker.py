@@ -42,4 +42,4 @@ if __name__ == "__main__":
     source, target = sys.argv[1:3]
     with np.load(source) as stored:
         outcome = remesh(dict(stored))
-    np.savez(target, **outcome)
+    np.savez(target, allow_pickle=False, **outcome)

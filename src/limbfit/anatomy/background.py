@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Field = Callable[[Array], Array]
+Field = Callable[[Array], tuple[Array, Array]]
 
-PLANE, SKIN, LAYER, BONE = 1, 2, 4, 8
+PLANE, LAYER, BONE, FAR = 1, 2, 4, 8
 TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 # Kuhn's subdivision of a cube into six tetrahedra; corner bits are (x, y, z), all share the diagonal 0-7.
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
@@ -67,14 +67,14 @@ def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool
     Parameters
     ----------
     grid : the grid.
-    field : signed function of points.
+    field : signed function of points (k, 3) that gives values (k,) and gradients (k, 3).
     bit : mask bit that the points on the level set receive.
 
     Returns
     -------
     The cut grid and, per tetrahedron, whether it lies where the field is positive.
     """
-    values = field(grid.points)
+    values = field(grid.points)[0]
     edges = _crossed_edges(grid.tets, values)
     t = _roots(grid.points, edges, values, field)
     grid, snapped = _snapped(grid, edges, t, bit)
@@ -107,7 +107,7 @@ def _roots(points: Array, edges: Ints, values: Array, field: Field) -> Array:
     last = np.zeros(len(edges))
     for _ in range(ROOT_STEPS):
         t = low + (high - low) * f_low / (f_low - f_high)
-        f = field(a + t[:, None] * (b - a))
+        f, _ = field(a + t[:, None] * (b - a))
         side = np.where(f * f_low > 0, 1, -1)
         repeated = np.where(side == last, 0.5, 1.0)
         low, high = np.where(side > 0, t, low), np.where(side > 0, high, t)

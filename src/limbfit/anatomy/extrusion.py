@@ -12,19 +12,10 @@ from .background import volumes
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Field = Callable[[Array], Array]
+Field = Callable[[Array], tuple[Array, Array]]
 
-DIFFERENCE_MM = 0.05
 NEWTON_STEPS = 4
 BISECTIONS = 4
-
-
-def gradient(field: Field, points: Array) -> Array:
-    """Gradient (n, 3) of a field by central differences."""
-    steps = DIFFERENCE_MM * np.eye(3)
-    ahead = field((points[:, None] + steps).reshape(-1, 3)).reshape(-1, 3)
-    behind = field((points[:, None] - steps).reshape(-1, 3)).reshape(-1, 3)
-    return (ahead - behind) / (2 * DIFFERENCE_MM)
 
 
 def projected(field: Field, points: Array, z_freedom: Array) -> Array:
@@ -33,12 +24,11 @@ def projected(field: Field, points: Array, z_freedom: Array) -> Array:
     ``z_freedom`` (n,) is 1 for free points and 0 for those that must keep their z (on the cut plane).
     """
     points = points.copy()
-    for _ in range(NEWTON_STEPS if len(points) else 0):
-        slope = gradient(field, points)
-        way = slope.copy()
-        way[:, 2] *= z_freedom
+    for _ in range(NEWTON_STEPS):
+        value, slope = field(points)
+        way = slope * np.column_stack([np.ones((len(points), 2)), z_freedom])
         rate = np.maximum(np.einsum("ij,ij->i", slope, way), 0.05)  # a kink must not send a point away
-        points -= (field(points) / rate)[:, None] * way
+        points -= (value / rate)[:, None] * way
     return points
 
 

@@ -26,10 +26,12 @@ from .surfaces import Anatomy
 from .triangles import Surface, from_pyvista
 
 Array = NDArray[np.float64]
+Level = tuple[Array, Array]  # a signed function at points and its gradient there
 
 PROLONGATION_MM = 40.0
 SEAM_MM = 3.0  # below the cut, where surfaces are prolonged from
 END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
+NORMAL_WITHIN_MM = 1e-3  # of a surface, where its normal stands for the gradient of the distance
 TRIM_SAMPLES = 60_000
 
 
@@ -84,24 +86,36 @@ class LimbFields:
         """The least depth of bone."""
         return self.skin_layer_mm + self.bone_clearance_mm
 
-    def depth(self, points: Array) -> Array:
-        """Depth (n,) of points (n, 3) below the skin, positive inside."""
-        return -signed_distance(self.skin, points)
+    def depth(self, points: Array) -> Level:
+        """Depth (n,) of points (n, 3) below the skin, positive inside, and its gradient (n, 3)."""
+        distance, slope = signed_distance(self.skin, points)
+        return -distance, -slope
 
-    def layer(self, points: Array) -> Array:
-        """Signed distance (n,) to the layer: positive in the muscle."""
-        return self.depth(points) - self.skin_layer_mm
+    def layer(self, points: Array) -> Level:
+        """Signed distance (n,) to the layer, positive in the muscle, and its gradient (n, 3)."""
+        depth, slope = self.depth(points)
+        return depth - self.skin_layer_mm, slope
 
-    def bone(self, points: Array) -> Array:
-        """Signed distance (n,) to the nearest bone as segmented, negative inside."""
-        if not self.bones:
-            return np.full(len(points), np.inf)
-        return np.min([signed_distance(bone, points) for bone in self.bones.values()], axis=0)
+    def void(self, points: Array) -> Level:
+        """Signed function (n,) of the bones that stay at least clearance below the layer, negative inside.
 
-    def void(self, points: Array, depth: Array | None = None) -> Array:
-        """Signed function (n,) of the bones that stay at least clearance below the layer; negative inside."""
-        depth = self.depth(points) if depth is None else depth
-        return np.maximum(self.bone(points), self.bone_depth_mm - depth)
+        Where bone was trimmed it is the depth that is missing; the gradient (n, 3) belongs to the part that
+        counts.
+        """
+        depth, slope = self.depth(points)
+        value, gradient = self.bone_depth_mm - depth, -slope
+        bone, bone_slope = self._bone(points)
+        own = bone > value
+        return np.where(own, bone, value), np.where(own[:, None], bone_slope, gradient)
+
+    def _bone(self, points: Array) -> Level:
+        """Signed distance (n,) to the nearest bone as segmented, and its gradient."""
+        value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
+        for bone in self.bones.values():
+            distance, slope = signed_distance(bone, points)
+            nearer = distance < value
+            value, gradient = np.where(nearer, distance, value), np.where(nearer[:, None], slope, gradient)
+        return value, gradient
 
     def trimmed(self) -> dict[str, TrimmedBone]:
         """What trimming took from each bone."""
@@ -109,7 +123,7 @@ class LimbFields:
 
     def _trimmed(self, bone: Surface) -> TrimmedBone:
         below = bone.points[bone.points[:, 2] <= 0.0]
-        excess = self.bone_depth_mm - self.depth(below) if len(below) else np.zeros(0)
+        excess = self.bone_depth_mm - self.depth(below)[0] if len(below) else np.zeros(0)
         shallow = below[excess > 0]
         if not len(shallow):
             return TrimmedBone(0.0, 0.0)
@@ -119,8 +133,8 @@ class LimbFields:
         high[2] = min(high[2], 0.0)
         spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
         samples = _box_samples(low, high, spacing)
-        inside = signed_distance(bone, samples) < 0
-        cut = self.depth(samples[inside]) < self.bone_depth_mm
+        inside = signed_distance(bone, samples)[0] < 0
+        cut = self.depth(samples[inside])[0] < self.bone_depth_mm
         return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
 
 
@@ -148,13 +162,19 @@ def limb_fields(anatomy: Anatomy, skin_layer_mm: float, bone_clearance_mm: float
     return LimbFields(frame, prolonged(skin), bones, skin_layer_mm, bone_clearance_mm)
 
 
-def signed_distance(surface: Surface, points: Array) -> Array:
-    """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside."""
+def signed_distance(surface: Surface, points: Array) -> Level:
+    """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside, and gradient."""
     if not len(points):
-        return np.zeros(0)
+        return np.zeros(0), np.zeros((0, 3))
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
     query = np.ascontiguousarray(points, dtype=float)
-    return igl.signed_distance(query, surface.points, surface.faces.astype(np.int64), kind)[0]
+    distance, face, nearest, _ = igl.signed_distance(query, surface.points, surface.faces, kind)
+    close = np.abs(distance) < NORMAL_WITHIN_MM
+    gradient = (query - nearest) / np.where(close, 1.0, distance)[:, None]
+    a, b, c = np.moveaxis(surface.triangles[face[close]], 1, 0)
+    normal = np.cross(b - a, c - a)
+    gradient[close] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return distance, gradient
 
 
 def prolonged(surface: Surface) -> Surface:
@@ -163,8 +183,8 @@ def prolonged(surface: Surface) -> Surface:
     Cutting below the plane makes it immaterial how exactly the surface's own cap lies on the plane and
     whether its rim is rounded.
     """
-    body = surface.to_pyvista().clip_closed_surface(normal=(0, 0, -1), origin=(0, 0, -SEAM_MM))
-    body = from_pyvista(body.triangulate().clean())
+    clipped = surface.to_pyvista().clip_closed_surface(normal=(0, 0, -1), origin=(0, 0, -SEAM_MM))
+    body = from_pyvista(clipped.triangulate().clean())
     cap = (np.abs(body.points[:, 2] + SEAM_MM) < 1e-6)[body.faces].all(axis=1)
     moved = np.unique(body.faces[cap])
     top = np.full(len(body.points), -1)

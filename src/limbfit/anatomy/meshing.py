@@ -20,22 +20,27 @@ from typing import Literal
 import igl
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ..errors import MeshingError
 from ..mesh import Mesh, boundary_faces, check, quality, to_tet10
 from . import background
-from .background import BONE, LAYER, PLANE, TetGrid
-from .curving import curved
+from .background import BONE, FAR, LAYER, PLANE, TetGrid
+from .curving import curved, with_diagonals
 from .engines import ENGINES, VolumeMesh, VolumeTask
 from .extrusion import guarded, prism_tets, projected
-from .layers import LimbFields, TrimmedBone, limb_fields
+from .layers import Level, LimbFields, TrimmedBone, limb_fields
 from .surfaces import Anatomy, Surface
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 REGIONS = ("skin", "muscle")
+SURFACES = (PLANE, LAYER, BONE, FAR)
 GOOD_DIHEDRAL_DEG = 8.0
+HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
+LAYER_RATIO = 5.5  # greatest edge over thickness of the skin layer: about 9 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
 RIM_LAYERS = 3.0  # depth below the cut plane, in layers, over which the extrusion turns sideways
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
@@ -47,6 +52,8 @@ class MeshSettings:
 
     The edge length is ``edge_near_mm`` within ``near_radius_mm`` of the site and grows from there by
     ``growth`` mm per mm up to ``edge_far_mm``. ``curved`` puts mid-edge nodes on the smooth surfaces.
+    With ``local_radius_mm`` only the limb within that distance of the site is meshed, and the nodes where it
+    was cut off are fixed (node set ``fixed_truncation``); that stiffens the answer.
     """
 
     element: Literal["tet4", "tet10"] = "tet10"
@@ -58,6 +65,7 @@ class MeshSettings:
     bone_clearance_mm: float = 1.5
     time_limit_s: float = 600.0
     curved: bool = True
+    local_radius_mm: float | None = None
     engine: Literal["mmg"] = "mmg"
 
     @property
@@ -68,7 +76,7 @@ class MeshSettings:
     @property
     def hausdorff_mm(self) -> float:
         """How far the faceted surfaces may stray from the smooth ones."""
-        return float(np.clip(0.03 * self.edge_far_mm, 0.1, 0.6))
+        return float(np.clip(self.edge_far_mm**2 / HAUSDORFF_RADIUS_MM, 0.1, 2.5))
 
 
 @dataclass(frozen=True)
@@ -77,8 +85,6 @@ class BaseMesh:
 
     fields: LimbFields
     grid: TetGrid
-    triangles: Ints
-    surfaces: Ints
     trimmed: Mapping[str, TrimmedBone]
     enclosed_mm3: float
 
@@ -128,11 +134,8 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings) -> BaseMesh:
         grid = grid.kept(positive)
     if not len(grid.tets):
         raise MeshingError("no muscle is left under the skin layer; choose a smaller skin_layer_mm")
-    triangles = boundary_faces(_muscle_mesh(grid.points, grid.tets))
-    common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
-    surfaces = np.select([common & bit > 0 for bit in (PLANE, LAYER, BONE)], (PLANE, LAYER, BONE), BONE)
     trimmed = fields.trimmed()
-    return BaseMesh(fields, grid, triangles, surfaces, trimmed, enclosed_volume(anatomy, fields, trimmed))
+    return BaseMesh(fields, grid, trimmed, enclosed_volume(anatomy, fields, trimmed))
 
 
 def mesh_site(
@@ -155,7 +158,8 @@ def mesh_site(
     Returns
     -------
     mesh : regions ``skin`` and ``muscle``; node sets ``fixed_bone`` (on bones) and ``fixed_proximal`` (on the
-        cut plane); face set ``skin`` (outward, without the cut plane).
+        cut plane) and, with ``local_radius_mm``, ``fixed_truncation``; face set ``skin`` (outward, without
+        the cut plane).
     report : quality and what was trimmed.
 
     Raises
@@ -165,17 +169,16 @@ def mesh_site(
     """
     start = time.perf_counter()
     base = base or base_mesh(anatomy, settings)
-    frame = base.fields.frame
-    size = site_size(base.fields, base.grid.points, frame.to_limb(position), frame.rotation @ axis, settings)
-    task = VolumeTask(
-        base.grid.points, base.grid.tets, base.triangles, base.surfaces, size, settings.hausdorff_mm
-    )
-    muscle = _on_surfaces(ENGINES[settings.engine](task, settings.time_limit_s), base.fields)
-    mesh = _with_skin_layer(muscle, base.fields)
+    fields, frame = base.fields, base.fields.frame
+    site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
+    grid = base.grid if settings.local_radius_mm is None else _near(base.grid, site, settings.local_radius_mm)
+    task = _task(grid, site_size(fields, grid.points, site, inward, settings), settings)
+    muscle = _on_surfaces(ENGINES[settings.engine](task, settings.time_limit_s), fields)
+    mesh, under = _with_skin_layer(muscle, fields)
     if settings.element == "tet10":
         mesh = to_tet10(mesh)
         if settings.curved:
-            mesh = curved(mesh, _curved_target(mesh, base.fields))
+            mesh = curved(mesh, with_diagonals(mesh, _curved_target(mesh, fields), under))
     check(mesh)
     report = _report(mesh, base, settings, time.perf_counter() - start)
     return mesh.with_points(frame.to_patient(mesh.points)), report
@@ -189,10 +192,35 @@ def site_size(fields: LimbFields, points: Array, site: Array, axis: Array, setti
     distance = np.hypot(lateral, DEPTH_RATIO * axial)
     beyond = np.maximum(distance - settings.near_radius_mm, 0.0)
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
-    depth = fields.depth(points)
-    sheet = np.abs(fields.void(points, depth)) + np.maximum(depth - settings.skin_layer_mm, 0.0)
+    depth, _ = fields.depth(points)
+    muscle_depth = np.maximum(depth - settings.skin_layer_mm, 0.0)
+    size = np.minimum(size, LAYER_RATIO * settings.skin_layer_mm + muscle_depth)
+    sheet = np.abs(fields.void(points)[0]) + muscle_depth
     thinnest = np.minimum(settings.edge_near_mm, settings.bone_clearance_mm)
     return np.minimum(size, np.maximum(SHEET_RATIO * sheet, thinnest))
+
+
+def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
+    triangles = boundary_faces(_muscle_mesh(grid.points, grid.tets))
+    common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
+    surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
+    return VolumeTask(grid.points, grid.tets, triangles, surfaces, size, settings.hausdorff_mm)
+
+
+def _near(grid: TetGrid, site: Array, radius: float) -> TetGrid:
+    """The connected part of a grid within a distance of a site."""
+
+    def ball(points: Array) -> tuple[Array, Array]:
+        offset = points - site
+        distance = np.linalg.norm(offset, axis=1)
+        return radius - distance, -offset / np.maximum(distance, 1e-12)[:, None]
+
+    grid, inside = background.cut(grid, ball, FAR)
+    grid = grid.kept(inside)
+    rows = grid.tets[:, [0, 1, 2]].ravel(), grid.tets[:, [1, 2, 3]].ravel()
+    links = coo_array((np.ones(len(rows[0])), rows), shape=(len(grid.points),) * 2)
+    label = connected_components(links, directed=False)[1][grid.tets[:, 0]]
+    return grid.kept(label == np.bincount(label).argmax())
 
 
 def _on_surfaces(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
@@ -225,32 +253,40 @@ def _same_faces(faces: Ints, chosen: Ints, count: int) -> NDArray[np.bool_]:
     return np.isin(packed[0], packed[1])
 
 
-def _with_skin_layer(muscle: VolumeMesh, fields: LimbFields) -> Mesh:
-    """The tet4 mesh of muscle and the extruded skin layer, with its sets, in the limb frame."""
+def _with_skin_layer(muscle: VolumeMesh, fields: LimbFields) -> tuple[Mesh, Ints]:
+    """The tet4 mesh of muscle and extruded skin layer with its sets, and the node under each node."""
+    count = len(muscle.points)
     faces = boundary_faces(_muscle_mesh(muscle.points, muscle.tets))
-    interface = faces[_same_faces(faces, muscle.triangles[muscle.triangle_refs == LAYER], len(muscle.points))]
+    interface = faces[_same_faces(faces, muscle.triangles[muscle.triangle_refs == LAYER], count)]
     nodes = np.unique(interface)
     # Near the cut plane nodes go out sideways, or those below it could overtake those on it.
     z_freedom = np.minimum(-muscle.points[nodes, 2] / (RIM_LAYERS * fields.skin_layer_mm), 1.0)
     outer = projected(fields.depth, muscle.points[nodes], z_freedom)
-    top = np.full(len(muscle.points), -1)
-    top[nodes] = len(muscle.points) + np.arange(len(nodes))
-    points = np.vstack([muscle.points, outer])
+    top = np.full(count, -1)
+    top[nodes] = count + np.arange(len(nodes))
     skin = prism_tets(interface, top)
-    cells = np.vstack([skin, muscle.tets])
-    regions = np.repeat([0, 1], [len(skin), len(muscle.tets)]).astype(np.int64)
-    mesh = Mesh(points, cells, "tet4", regions, REGIONS)
-    faces = boundary_faces(mesh)
-    on_plane = (points[faces, 2] == 0.0).all(axis=1)
-    on_skin = (faces >= len(muscle.points)).all(axis=1) & ~on_plane
-    return replace(
-        mesh,
-        node_sets={
-            "fixed_bone": np.unique(faces[~on_plane & ~on_skin]),
-            "fixed_proximal": np.unique(faces[on_plane]),
-        },
-        face_sets={"skin": faces[on_skin]},
+    mesh = Mesh(
+        points=np.vstack([muscle.points, outer]),
+        cells=np.vstack([skin, muscle.tets]),
+        cell_type="tet4",
+        regions=np.repeat([0, 1], [len(skin), len(muscle.tets)]).astype(np.int64),
+        region_names=REGIONS,
     )
+    return _with_sets(mesh, muscle), np.concatenate([np.arange(count), nodes])
+
+
+def _with_sets(mesh: Mesh, muscle: VolumeMesh) -> Mesh:
+    """Node and face sets by the surface that each boundary face lies on; skin nodes follow the muscle's."""
+    faces = boundary_faces(mesh)
+    on_plane = (mesh.points[faces, 2] == 0.0).all(axis=1)
+    on_skin = (faces >= len(muscle.points)).all(axis=1) & ~on_plane
+    on_bone = _same_faces(faces, muscle.triangles[muscle.triangle_refs == BONE], len(mesh.points)) & ~on_plane
+    rest = ~(on_plane | on_skin | on_bone)
+    sets = {"fixed_bone": on_bone, "fixed_proximal": on_plane}
+    if rest.any():
+        sets["fixed_truncation"] = rest
+    node_sets = {name: np.unique(faces[chosen]) for name, chosen in sets.items()}
+    return replace(mesh, node_sets=node_sets, face_sets={"skin": faces[on_skin]})
 
 
 def _curved_target(mesh: Mesh, fields: LimbFields) -> Array:
@@ -262,7 +298,7 @@ def _curved_target(mesh: Mesh, fields: LimbFields) -> Array:
     return target
 
 
-def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callable[[Array], Array]]]:
+def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callable[[Array], Level]]]:
     corners = mesh.cells[:, :4].max() + 1
     faces = boundary_faces(mesh)
     on_plane = (mesh.points[faces[:, :3], 2] == 0.0).all(axis=1)

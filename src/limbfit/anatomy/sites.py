@@ -71,7 +71,7 @@ def indenter_axis(skin: Surface, position: ArrayLike, width: float, edge: ArrayL
 def square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
     """The two unit edge directions (2, 3) of a square indenter, both normal to its axis.
 
-    Without ``edge``, the first is the cross product of axis and z, or of axis and x where the axis is along z.
+    Without ``edge``, the first is the cross product of axis and z, or of axis and x where axis is z.
     """
     along_z = abs(axis[2]) > 0.999
     first = (
