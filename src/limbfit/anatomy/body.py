@@ -27,8 +27,8 @@ _TISSUE = 0.45  # of the median of the tissue: between the noise of air and musc
 _CLOSE_MM = 3.5
 _OPEN_MM = 1.5
 _RIM_MM = 2.5  # the outline is at half of the brightest tissue this near
-_BIAS_GRID_MM = 4.0
-_BIAS_ITERATIONS = [30, 30, 20]
+_BIAS_GRID_MM = 5.0
+_BIAS_ITERATIONS = [25, 20, 15]
 _SMALLEST_LIMB_MM3 = 5.0e4
 
 

@@ -39,14 +39,6 @@ _STEP_IN_MM, _STEP_OUT_MM = 2.0, 6.0  # how far a bone's outline may move from s
 _GROWTH = (0.6, 1.8)
 
 
-@dataclass(frozen=True)
-class Bone:
-    """One bone: its voxels, and along the limb its extent and mean place in slices."""
-
-    mask: Mask
-    volume_mm3: float
-
-
 def find_bones(levels: Field, limb: Mask, spacing: Spacing, smallest_mm3: float) -> list[Mask]:
     """Masks of the bones, largest first.
 
@@ -129,7 +121,7 @@ def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) ->
         sitk.GetImageFromArray(-plane), sitk.GetImageFromArray(markers), False, True
     )
     section = (sitk.GetArrayFromImage(basins) == 1) & (plane > _BRIGHT)
-    section &= binary_propagation(inside & section, mask=section)
+    section = binary_opening(section, ball(_STEP_IN_MM, flat)[0])
     ratio = section.sum() / previous.sum()
     return section if _GROWTH[0] <= ratio <= _GROWTH[1] else None
 

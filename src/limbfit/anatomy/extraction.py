@@ -50,11 +50,17 @@ def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -
     LabelError
         Where there is nothing to extract.
     """
+    fine = fine_surface(labels, which, edge_mm)
+    return keep_volume(remesh(fine, edge_mm), fine.volume)
+
+
+def fine_surface(labels: LabelMap, which: str | None, edge_mm: float) -> Surface:
+    """The same surface with the many uneven triangles of marching cubes, for cutting and remeshing."""
     mask = labels.limb if which is None else labels.mask(which)
     body, crop = _body(mask, labels, which or "limb")
     field, level = smooth_field(body, crop, edge_mm)
     fine = _smooth(_contour(field, level), *(_TAUBIN_SKIN if which is None else _TAUBIN_BONE))
-    return keep_volume(remesh(fine, edge_mm), float(body.sum()) * crop.voxel_mm3)
+    return keep_volume(fine, float(body.sum()) * crop.voxel_mm3)
 
 
 def _body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
@@ -134,10 +140,20 @@ def _smooth(surface: Surface, passes: int, band: float) -> Surface:
     return from_pyvista(poly)
 
 
-def remesh(surface: Surface, edge_mm: float) -> Surface:
-    """Even triangles of ``edge_mm`` on the same shape (Botsch and Kobbelt 2004)."""
+def remesh(
+    surface: Surface, edge_mm: float, creases: NDArray[np.int64] | None = None, passes: int = _REMESH_PASSES
+) -> Surface:
+    """Even triangles of ``edge_mm`` on the same shape (Botsch and Kobbelt 2004).
+
+    ``creases`` (n, 2) are edges to keep sharp.
+    """
     points, faces = gpytoolbox.remesh_botsch(
-        surface.points, surface.faces.astype(np.int32), i=_REMESH_PASSES, h=edge_mm, project=True
+        surface.points,
+        surface.faces.astype(np.int32),
+        i=passes,
+        h=edge_mm,
+        project=True,
+        feature_edges=None if creases is None else creases.astype(np.int32),
     )
     return Surface(points, faces)
 

@@ -92,6 +92,13 @@ class Grid:
         """(..., 3) LPS mm to continuous indices (i, j, k)."""
         return (np.asarray(point, dtype=float) - self.origin) @ (self.direction / self.spacing)
 
+    def heights(self, point: ArrayLike, normal: ArrayLike) -> Array:
+        """``[k, j, i]`` distance of each voxel beyond a plane (LPS mm, unit normal), mm."""
+        i, j, k = (np.arange(n, dtype=float) for n in self.size)
+        steps = (self.direction * self.spacing).T @ np.asarray(normal)
+        start = float((self.origin - np.asarray(point)) @ np.asarray(normal))
+        return start + k[:, None, None] * steps[2] + j[:, None] * steps[1] + i * steps[0]
+
     def same_grid(self, other: Grid) -> bool:
         """Whether both sample the same points: every corner voxel within 0.01 mm."""
         if self.array.shape != other.array.shape:

@@ -18,13 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import LabelError, SurfaceError
 from .ends import ProximalEnd, layer, proximal_end
-from .extraction import extract_surface, remesh
-from .grid import Grid, LabelMap
+from .extraction import extract_surface, fine_surface, remesh
+from .grid import LabelMap
 from .triangles import (
     Surface,
     bodies,
     check_closed,
     from_pyvista,
+    half_edges,
     read_surface,
     self_intersections,
     write_surface,
@@ -50,6 +51,10 @@ Array = NDArray[np.float64]
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
+_JOIN_MM = 1e-3
+# Passes of remeshing before and after the cap is cut: the rim gets better triangles from even ones, and its
+# shortest edges need more passes than a smooth surface.
+_PASSES_BEFORE, _PASSES_AFTER = 3, 15
 _STUMP_MM3 = 200.0  # what is left of a bone distal of the cut, below which it is dropped
 
 
@@ -104,7 +109,7 @@ def build_anatomy(
     point, normal = _default_cut(labels, end) if proximal_cut is None else _plane(*proximal_cut)
     extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
     _check_sides(labels, end, point, normal)
-    skin = _capped(extract_surface(extended, None, edge_mm), point, normal, edge_mm, "the limb")
+    skin = _capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)
     reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
     bones = {}
     for name in labels.bone_names:
@@ -142,7 +147,7 @@ def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
 
 def _check_sides(labels: LabelMap, end: ProximalEnd, point: Array, normal: Array) -> None:
     """Refuse a limb that a side of the image cuts off distal of the cut."""
-    limb = labels.limb & (_heights(labels, point, normal) < 0)
+    limb = labels.limb & (labels.heights(point, normal) < 0)
     for axis in range(3):
         if axis == end.axis:
             continue
@@ -154,38 +159,39 @@ def _check_sides(labels: LabelMap, end: ProximalEnd, point: Array, normal: Array
                 )
 
 
-def _heights(grid: Grid, point: Array, normal: Array) -> Array:
-    """(k, j, i) distance of each voxel beyond a plane."""
-    i, j, k = (np.arange(n, dtype=float) for n in grid.size)
-    steps = (grid.direction * grid.spacing).T @ normal
-    start = float((grid.origin - point) @ normal)
-    return start + k[:, None, None] * steps[2] + j[:, None] * steps[1] + i * steps[0]
-
-
 def _within(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
     """Only what lies distal of a plane."""
-    return labels.with_array(np.where(_heights(labels, point, normal) <= 0, labels.array, 0))
+    return labels.with_array(np.where(labels.heights(point, normal) <= 0, labels.array, 0))
 
 
 def _distal_volume(labels: LabelMap, name: str, point: Array, normal: Array) -> float:
-    inside = labels.mask(name) & (_heights(labels, point, normal) < 0)
+    inside = labels.mask(name) & (labels.heights(point, normal) < 0)
     return float(inside.sum()) * labels.voxel_mm3
 
 
-def _capped(surface: Surface, point: Array, normal: Array, edge_mm: float, name: str) -> Surface:
-    """The part distal of the plane, closed by a flat cap of even triangles."""
+def _capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
+    """The part distal of the plane, closed by a flat cap with a sharp rim, in even triangles."""
     heights = (surface.points - point) @ normal
     if heights.min() >= 0 or heights.max() <= 0:
-        raise SurfaceError(f"the proximal cut misses {name}", remedy="move its point into the limb (LPS mm)")
-    cut = surface.to_pyvista().clip_closed_surface(normal=-normal, origin=point, tolerance=1e-6)
-    whole = bodies(_cleaned(from_pyvista(pv.PolyData(cut).triangulate())))[0]
-    even = remesh(whole, edge_mm)
-    return even
+        raise SurfaceError("the proximal cut misses the limb", remedy="move its point into the limb (LPS mm)")
+    even = remesh(surface, edge_mm, passes=_PASSES_BEFORE)
+    cut = even.to_pyvista().clip_closed_surface(normal=-normal, origin=point, tolerance=1e-6)
+    joined = pv.PolyData(cut).triangulate().clean(tolerance=_JOIN_MM, absolute=True).triangulate()
+    whole = bodies(from_pyvista(joined))[0]
+    return remesh(whole, edge_mm, _rim(whole, point, normal), _PASSES_AFTER)
 
 
-def _cleaned(surface: Surface) -> Surface:
-    poly = surface.to_pyvista().clean(tolerance=1e-4, absolute=True)
-    return from_pyvista(poly.triangulate())
+def _rim(surface: Surface, point: Array, normal: Array) -> NDArray[np.int64]:
+    """(n, 2) edges between the flat cap and the rest."""
+    on_plane = np.abs((surface.points - point) @ normal) < _JOIN_MM
+    in_cap = np.tile(on_plane[surface.faces].all(axis=1), 3)
+    edges = np.sort(half_edges(surface.faces), axis=1)
+    both, counts = np.unique(
+        np.concatenate([np.unique(edges[in_cap], axis=0), np.unique(edges[~in_cap], axis=0)]),
+        axis=0,
+        return_counts=True,
+    )
+    return both[counts == 2]
 
 
 def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> None:

@@ -1,0 +1,135 @@
+"""Virtual amputation: an intact leg as a transtibial residuum.
+
+Bones end at the plane. Soft tissue covers them as a surgeon's flap does: the limb's cross-section at the
+plane is carried on distally and rounded off, so that the limb ends ``pad_mm`` beyond the bones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.ndimage import label as connected
+
+from ..errors import LabelError
+from .grid import SOFT_TISSUE, LabelMap
+
+Array = NDArray[np.float64]
+
+_STEP_MM = 0.5  # of the cross-section
+_SMOOTH_MM = 1.0  # of its outline
+_ROUNDING = 2.0  # the end is flat only further from the outline than this many pads
+
+
+def amputate(
+    labels: LabelMap, plane_point: ArrayLike, plane_normal: ArrayLike, pad_mm: float = 15.0
+) -> LabelMap:
+    """The leg cut at a plane, with a rounded pad of soft tissue over the cut bones.
+
+    Parameters
+    ----------
+    labels : an intact leg.
+    plane_point, plane_normal : LPS mm; the normal points proximally, to what is kept.
+    pad_mm : soft tissue distal of the bones, on the limb's middle; towards the outline it thins as a
+        quarter ellipse.
+
+    Returns
+    -------
+    LabelMap
+        On the same grid; bones and soft tissue distal of the pad are gone.
+
+    Raises
+    ------
+    LabelError
+        For a plane that misses the limb or its bones, or an image too short for the pad.
+    """
+    point, normal = _unit_plane(plane_point, plane_normal)
+    if pad_mm <= 0:
+        raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
+    height = labels.heights(point, normal)
+    section = _section(labels, point, normal)
+    array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
+    near = np.nonzero((height < 0) & (height > -pad_mm))
+    depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
+    end = pad_mm * _quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
+    kept = -height[near] < end
+    array[tuple(axis[kept] for axis in near)] = labels.value(SOFT_TISSUE)
+    _check(labels, array, section, height, pad_mm)
+    return labels.with_array(array)
+
+
+def _unit_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+    vector = np.asarray(normal, dtype=float)
+    length = float(np.linalg.norm(vector))
+    if not length > 0:
+        raise LabelError("the normal of the amputation plane is zero", remedy="give a proximal direction")
+    return np.asarray(point, dtype=float), vector / length
+
+
+def _quarter_ellipse(t: Array) -> Array:
+    """0 at the outline (t = 0) with an upright tangent, 1 from t = 1 inward."""
+    return np.sqrt(1 - (1 - np.clip(t, 0, 1)) ** 2)
+
+
+@dataclass(frozen=True)
+class _Section:
+    """The limb's cross-section: depth below its outline (mm, 0 outside) on a raster of the plane."""
+
+    corner: Array
+    axes: Array
+    depth: Array
+    whole: bool
+
+    @property
+    def largest_depth(self) -> float:
+        return float(self.depth.max())
+
+    def depth_at(self, points: Array) -> Array:
+        """Depth of points (n, 3) projected onto the plane."""
+        place = (points - self.corner) @ self.axes / _STEP_MM
+        return map_coordinates(self.depth, place.T, order=1, mode="constant", cval=0.0)
+
+
+def _section(labels: LabelMap, point: Array, normal: Array) -> _Section:
+    """Where the plane cuts the limb; of several pieces the largest."""
+    axes = np.linalg.svd(normal[None])[2][1:].T
+    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * (np.array(labels.size) - 1)
+    flat = (labels.index_to_point(corners) - point) @ axes
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    u, v = (np.arange(a, b + _STEP_MM, _STEP_MM) for a, b in zip(low, high))
+    points = point + u[:, None, None] * axes[:, 0] + v[None, :, None] * axes[:, 1]
+    index = labels.point_to_index(points)[..., ::-1]
+    cover = map_coordinates(
+        labels.limb.astype(np.float32), np.moveaxis(index, -1, 0), order=1, mode="constant", cval=0.0
+    )
+    inside = gaussian_filter(cover, _SMOOTH_MM / _STEP_MM) > 0.5
+    parts, count = connected(inside)
+    if count == 0:
+        raise LabelError("the amputation plane misses the limb", remedy="move its point into the limb")
+    inside = parts == int(np.argmax(np.bincount(parts.ravel())[1:])) + 1
+    image = np.all((index > -0.5) & (index < np.array(labels.array.shape) - 0.5), axis=-1)
+    rim = inside & (distance_transform_edt(image) <= 1.0)
+    return _Section(point + axes @ low, axes, distance_transform_edt(inside) * _STEP_MM, not rim.any())
+
+
+def _check(labels: LabelMap, array: NDArray[np.uint8], section: _Section, height: Array, pad: float) -> None:
+    if not section.whole:
+        raise LabelError(
+            "the image ends within the limb's cross-section at the amputation plane",
+            remedy="move the plane proximally",
+        )
+    soft = labels.value(SOFT_TISSUE)
+    if not np.any((array > 0) & (array != soft)):
+        raise LabelError(
+            "no bone is left proximal of the amputation plane",
+            remedy="move the plane distally, or turn its normal to point proximally",
+        )
+    border = np.ones(array.shape, dtype=bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    if np.any(border & (array > 0) & (height < 0)):
+        raise LabelError(
+            f"the image ends less than {pad:g} mm distal of the amputation plane",
+            remedy="move the plane proximally, or make amputation_pad_mm smaller",
+        )
