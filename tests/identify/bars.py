@@ -1,8 +1,8 @@
 """A closed-form viscoelastic model whose truth is known, to be identified.
 
 At each site an incompressible bar of skin beside one of muscle, compressed together between plates
-(uniaxial stress, second-order Ogden, quasi-linear viscoelasticity of the nominal stress). Bars differ in length and
-section from site to site, as tissue does. Derivatives come by complex step, exact to rounding.
+(uniaxial stress, second-order Ogden, quasi-linear viscoelasticity of the nominal stress). Bars differ in
+length and section from site to site, as tissue does. Derivatives come by complex step, exact to rounding.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ def fitted(data, run=simulate):
 
 
 def linear_fit(data):
-    """Uncertainty at the truth, without the nonlinear part: responses there, shifted by one Gauss-Newton step."""
+    """Uncertainty at the truth, without the nonlinear part: one Gauss-Newton step from there."""
     responses = simulate(TRUTH)
     J = np.concatenate([r.jacobian * TRUTH * d.scale for r, d in zip(responses, data)])
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 # Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
 _RESTARTS = (0.0, 0.0, 0.1, 0.25, 0.5)
 _PAPER_CHANGE = 0.01
+_PATIENCE = 4  # steps
 _TRIES = 3  # of a simulation that completed before
 
 
@@ -33,7 +34,8 @@ class CalibrationSettings:
     """How parameters are found.
 
     ``stopping="paper"`` ends where no parameter or no objective entry changed by more than 0.01, absolute
-    (section 2.3); ``relative_tolerance`` is a relative change of parameters (see ``trust_region.minimise``).
+    (section 2.3); ``relative_tolerance`` is a relative change of parameters (see ``trust_region.minimise``),
+    and the fall of the squared error per step below which a stage ends after four such steps.
     ``max_iterations`` counts accepted steps, per stage.
     """
 
@@ -45,13 +47,17 @@ class CalibrationSettings:
 
 @dataclass(frozen=True)
 class Iterate:
-    """An accepted point: full parameters, cost, force error in percent per site, evaluations so far."""
+    """An accepted point: full parameters, cost, force error in percent per site.
+
+    ``evaluations`` and, among them, ``failures`` are counted from the beginning.
+    """
 
     stage: int
     parameters: tuple[float, ...]
     cost: float
     errors_percent: tuple[float, ...]
     evaluations: int
+    failures: int
 
 
 @dataclass(frozen=True)
@@ -199,8 +205,8 @@ class _Run:
     ) -> None:
         self.simulate, self.measured, self.unknowns = simulate, measured, unknowns
         self.settings, self.stages = settings, stages
-        self.evaluations = 0
-        self.failure = ""
+        self.evaluations = self.failures = 0
+        self.failure = ""  # why the last one failed
         self._responses: dict[bytes, tuple[SiteResponse, ...]] = {}
 
     def space(self, stage: int) -> Space:
@@ -215,6 +221,7 @@ class _Run:
             responses = tuple(self.simulate(parameters))
             self.failure = check_responses(responses, self.measured, len(parameters))
             if self.failure:
+                self.failures += 1
                 return None
             self._responses[parameters.tobytes()] = responses
         residual, jacobian = residuals(self.settings.objective, responses, self.measured)
@@ -244,7 +251,7 @@ class _Run:
             error_percent(response.force_N, site.force_N)
             for response, site in zip(self.responses(parameters), self.measured)
         )
-        return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations)
+        return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations, self.failures)
 
     def states(self, state: State | None) -> Iterator[State]:
         """The first or resumed state, then one for every accepted step, finished stage and new stage."""
@@ -268,7 +275,7 @@ class _Run:
         space = self.space(state.stage)
         for _ in range(_TRIES):
             point = self.evaluate(space, np.array(state.z))
-            self.evaluations = state.evaluations
+            self.evaluations, self.failures = state.evaluations, state.history[-1].failures
             if point is not None:
                 return point
         raise CalibrationError(f"the simulation of the stored iterate fails now: {self.failure}")
@@ -283,7 +290,7 @@ class _Run:
             tolerance=self.settings.relative_tolerance,
             radius=state.radius,
             max_iterations=max(self.settings.max_iterations - done, 1),
-            stop=self._paper_rule(space) if self.settings.stopping == "paper" else None,
+            stop=self._paper_rule(space) if self.settings.stopping == "paper" else self._valley_rule(state),
         )
 
     def _after(self, state: State, step: Step) -> State:
@@ -317,6 +324,24 @@ class _Run:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
         history = (*state.history, self.iterate(stage, point))
         return State(stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages), point
+
+    def _valley_rule(self, state: State) -> Callable[[Point, Point], str]:
+        """Ends a creep along a valley in which the data cannot tell one place from another."""
+        mine = [iterate for iterate in state.history if iterate.stage == state.stage]
+        track = [(iterate.cost, iterate.failures) for iterate in mine]
+        least = 1 - _PATIENCE * self.settings.relative_tolerance
+
+        def stop(before: Point, after: Point) -> str:
+            track.append((after.cost, self.failures))
+            (cost, failures), (now, failed) = track[-1 - _PATIENCE :][0], track[-1]
+            # Small steps after failures tell of the failures, not of the data.
+            if len(track) > _PATIENCE and now > least * cost and failed == failures:
+                return (
+                    f"{_PATIENCE} steps hardly lowered the error: the data do not tell these parameters apart"
+                )
+            return ""
+
+        return stop
 
     def _paper_rule(self, space: Space) -> Callable[[Point, Point], str]:
         def stop(before: Point, after: Point) -> str:

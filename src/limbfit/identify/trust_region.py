@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 FIRST_RADIUS = 1.0
 _LARGEST_RADIUS = 2.0
-_MAX_REJECTED = 12
+_MAX_REJECTED = 8
 # Directions that the data hardly see are not followed: relative to the residual, in units of z.
 _DAMPING = 1e-2
 _EXACT = 1e-9  # a residual this small (relative force) is a perfect fit

@@ -145,7 +145,7 @@ def estimate_uncertainty(
 
 
 def _noise(residuals: Sequence[Array], names: Sequence[str], parameters: int) -> tuple[SiteNoise, ...]:
-    """Standard deviation and first-order autocorrelation per site, both corrected for what the fit took away."""
+    """Standard deviation and first-order autocorrelation per site, corrected for what the fit took away."""
     lags = [_autocorrelation(residual, parameters / len(residuals)) for residual in residuals]
     effective = [r.size * (1 - lag) / (1 + lag) for r, lag in zip(residuals, lags)]
     kept = max(1 - parameters / sum(effective), 0.1)
@@ -154,7 +154,7 @@ def _noise(residuals: Sequence[Array], names: Sequence[str], parameters: int) ->
 
 
 def _autocorrelation(residual: Array, fitted: float) -> float:
-    """Correlation of neighbours; its bias grows with the ``fitted`` parameters per site (Marriott and Pope 1954).
+    """Correlation of neighbours; its bias grows with ``fitted`` parameters per site (Marriott and Pope 1954).
 
     A perfect fit says nothing about it.
     """

@@ -70,9 +70,7 @@ def broken_line(time: Array, displacement: Array) -> BrokenLine:
     at, coarse, n = bins(t, u, 300)
     travel = float(np.ptp(coarse))
     tolerance = max(0.003 * travel, 4 * noise_level(u) / np.sqrt(float(n.mean())))
-    knots = np.array([time[0], at[np.argmax(coarse)], time[-1]])
-    if not time[0] < knots[1] < time[-1]:
-        knots = knots[[0, 2]]
+    knots = np.array([time[0], time[-1]])
     while True:
         knots, values = _place_knots(t, u, knots)
         miss = np.abs(coarse - np.interp(at, knots, values))

@@ -1,0 +1,388 @@
+"""Records: refusals that name file, place and remedy; touch-down; curves that keep the peak.
+
+The synthetic record is a power-law solid with quasi-linear relaxation, F = a d^p filtered by
+G(t) = 1 + gamma exp(-t / tau): it starts with slack, is pushed in at constant speed and drawn back.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from limbfit.errors import TraceError
+from limbfit.traces import Trace, check_trace, find_touch_down, read_trace, regularise
+
+SHARED = Path(__file__).parents[1] / ".." / "shared"
+OPENLIMB = SHARED / "reference" / "openlimb-study"
+RELAXATION = SHARED / "data" / "relaxation"
+needs_openlimb = pytest.mark.skipif(not OPENLIMB.is_dir(), reason="shared/reference is not here")
+needs_relaxation = pytest.mark.skipif(not RELAXATION.is_dir(), reason="shared/data is not here")
+
+
+def relaxing(time, depth, p=1.3, stiffness=0.5, gamma=2.0, tau=0.4):
+    """Force in N of the power-law solid, by the exact recursion for piecewise linear elastic force."""
+    elastic = stiffness * np.maximum(depth, 0.0) ** p
+    history = np.zeros_like(elastic)
+    for k in range(1, len(time)):
+        dt = time[k] - time[k - 1]
+        decay = np.exp(-dt / tau)
+        history[k] = decay * history[k - 1] + (1 - decay) / (dt / tau) * (elastic[k] - elastic[k - 1])
+    return np.maximum(elastic + gamma * history, 0.0)
+
+
+def record(
+    slack=0.4,
+    depth=5.0,
+    speed=0.96,
+    rate=500.0,
+    p=1.3,
+    noise_N=0.03,
+    noise_mm=0.005,
+    offset=0.0,
+    wait=0.0,
+    seed=0,
+):
+    """A record, and its force without noise as a function of time."""
+    travel = slack + depth
+    fine = np.arange(0, wait + 2 * travel / speed, 1e-3)
+    moved = speed * np.clip(fine - wait, 0, None)
+    path = np.minimum(moved, 2 * travel - moved)
+    force = relaxing(fine, path - slack, p)
+    time = np.arange(0, fine[-1], 1 / rate)
+    rng = np.random.default_rng(seed)
+    displacement = np.interp(time, fine, path) + noise_mm * rng.standard_normal(time.size)
+    clean = np.interp(time, fine, force)
+    noisy = clean + offset + noise_N * rng.standard_normal(time.size)
+    return Trace(time, displacement, noisy), lambda t: np.interp(t, fine, force)
+
+
+def write_csv(path, trace, header="time_s,displacement_mm,force_N", delimiter=",", decimal="."):
+    rows = zip(trace.time_s, trace.displacement_mm, trace.force_N)
+    lines = [delimiter.join(f"{v:.5f}".replace(".", decimal) for v in row) for row in rows]
+    path.write_text("\n".join([header.replace(",", delimiter), *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+# --- reading
+
+
+@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", "."), ("\t", "."), (";", ",")])
+def test_tables_of_all_flavours_read_the_same(tmp_path, delimiter, decimal):
+    trace, _ = record(rate=50)
+    read = read_trace(write_csv(tmp_path / "a.csv", trace, delimiter=delimiter, decimal=decimal))
+    assert read.force_N == pytest.approx(trace.force_N, abs=1e-5)
+    assert read.displacement_mm == pytest.approx(trace.displacement_mm, abs=1e-5)
+
+
+def test_columns_are_found_by_name_whatever_their_order_and_company(tmp_path):
+    trace, _ = record(rate=50)
+    path = tmp_path / "a.csv"
+    rows = [
+        f"{t:.4f},x,{f:.4f},{d:.4f}" for t, d, f in zip(trace.time_s, trace.displacement_mm, trace.force_N)
+    ]
+    path.write_text("\n".join(["# recorded on a Monday", '"t","note","F","u"', *rows]), encoding="utf-8-sig")
+    read = read_trace(path, columns=("t", "u", "F"))
+    assert read.displacement_mm == pytest.approx(trace.displacement_mm, abs=1e-4)
+
+
+@pytest.mark.parametrize("struct", [False, True])
+def test_mat_files_hold_vectors_or_one_struct(tmp_path, struct):
+    trace, _ = record(rate=50)
+    content = {
+        "time_s": trace.time_s[:, None],
+        "displacement_mm": trace.displacement_mm[None],
+        "force_N": trace.force_N,
+    }
+    savemat(tmp_path / "a.mat", {"record": content} if struct else content)
+    read = read_trace(tmp_path / "a.mat")
+    assert np.array_equal(read.force_N, trace.force_N)
+    assert np.array_equal(read.time_s, trace.time_s)
+
+
+def broken(tmp_path, edit):
+    """A file whose lines were edited."""
+    trace, _ = record(rate=50)
+    path = write_csv(tmp_path / "a.csv", trace)
+    lines = path.read_text().splitlines()
+    edit(lines)
+    path.write_text("\n".join(lines))
+    return path
+
+
+def replace(line, text):
+    return lambda lines: lines.__setitem__(line - 1, text)
+
+
+@pytest.mark.parametrize(
+    ("edit", "says"),
+    [
+        (
+            replace(1, "time,displacement_mm,force_N"),
+            "header: no column 'time_s'.*it has 'time', 'disp.*rename",
+        ),
+        (replace(7, "0.1,oops,0.2"), "line 7, column displacement_mm: 'oops' is not a number"),
+        (replace(7, "0.1,"), "line 7, column displacement_mm: '' is not a number"),
+        (replace(7, "0.1"), "line 7, column displacement_mm: the row is too short"),
+        (replace(7, "0.1,0.1,nan"), "force_N: nan in sample 6"),
+        (replace(7, "0.1,0.1,inf"), "force_N: inf in sample 6"),
+        (replace(7, "9.1,0.1,0.1"), "time_s: time does not increase at sample 7; remove"),
+        (lambda lines: lines.__delitem__(slice(12, None)), "only 11 samples; a record needs at least 20"),
+        (lambda lines: lines.clear(), "the file is empty"),
+    ],
+)
+def test_broken_tables_are_refused_with_file_place_and_remedy(tmp_path, edit, says):
+    path = broken(tmp_path, edit)
+    with pytest.raises(TraceError, match=says) as caught:
+        read_trace(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_no_tables_are_refused(tmp_path):
+    with pytest.raises(TraceError, match="no such file"):
+        read_trace(tmp_path / "none.csv")
+    path = tmp_path / "a.csv"
+    path.write_bytes(bytes(100_000))
+    with pytest.raises(TraceError, match="not a text table"):
+        read_trace(path)
+    path.write_bytes(b"time_s,displacement_mm,force_N\n\xff\xfe1,2,3\n")
+    with pytest.raises(TraceError, match="not UTF-8"):
+        read_trace(path)
+
+
+def test_broken_mat_files_are_refused(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM" + bytes(500))
+    with pytest.raises(TraceError, match=r"version 7\.3; save it in MATLAB with '-v7'"):
+        read_trace(path)
+    for content in (b"", b"nonsense" * 100, bytes(1000)):
+        path.write_bytes(content)
+        with pytest.raises(TraceError, match="not a readable MAT file"):
+            read_trace(path)
+    trace, _ = record(rate=50)
+    columns = {"time_s": trace.time_s, "displacement_mm": trace.displacement_mm}
+    savemat(path, columns | {"force_N": np.ones((4, 4))})
+    with pytest.raises(TraceError, match="force_N: not a vector of real numbers"):
+        read_trace(path)
+    savemat(path, columns | {"force_N": "text"})
+    with pytest.raises(TraceError, match="force_N: not a vector"):
+        read_trace(path)
+    savemat(path, columns)
+    with pytest.raises(TraceError, match="no column 'force_N'"):
+        read_trace(path)
+    savemat(path, columns | {"force_N": trace.force_N[:-1]})
+    with pytest.raises(TraceError, match=r"force_N: .* values for .* times"):
+        read_trace(path)
+
+
+# --- what cannot be an indentation
+
+
+@pytest.mark.parametrize(
+    ("factors", "says"),
+    [
+        ((1, 1e-3, 1), "displacement_mm: a travel of .* looks like metres"),
+        ((1, 1e3, 1), "displacement_mm: a travel of .* looks like micrometres"),
+        ((1e3, 1, 1), "time_s: a speed of .* looks like milliseconds"),
+        ((1 / 3600, 1, 1), "time_s: a speed of .* check the units"),
+        ((1, 1, 1e-3), "force_N: a peak force of .* looks like kilonewtons"),
+        ((1, 1, 1e3), "force_N: a peak force of .* looks like millinewtons"),
+        ((1, -1, 1), "displacement_mm: the displacement falls; .* change the sign"),
+        ((1, 1, -1), "force_N: the force falls when the indenter pushes; .* change the sign"),
+        ((1, 1, 0), "force_N: no contact"),
+    ],
+)
+def test_units_that_cannot_be_right_are_refused(factors, says):
+    trace, _ = record(rate=100)
+    t, d, f = factors
+    with pytest.raises(TraceError, match=says):
+        check_trace(Trace(t * trace.time_s, d * trace.displacement_mm, f * trace.force_N))
+
+
+def test_a_record_of_noise_is_no_contact():
+    trace, _ = record(rate=100)
+    rng = np.random.default_rng(5)
+    with pytest.raises(
+        TraceError, match=r"no contact: the force rises by .* against a noise of .*leave the site"
+    ):
+        check_trace(Trace(trace.time_s, trace.displacement_mm, 0.03 * rng.standard_normal(trace.time_s.size)))
+
+
+# --- touch-down
+
+
+@pytest.mark.parametrize("p", [1.0, 1.3, 1.5, 2.0])
+@pytest.mark.parametrize("slack", [0.0, 0.4, 2.0])
+def test_touch_down_is_found_under_noise(p, slack):
+    for seed in range(3):
+        trace, _ = record(slack=slack, p=p, seed=seed)
+        touch = find_touch_down(trace)
+        assert abs(touch.displacement_mm - slack) < max(0.1, 2.5 * touch.uncertainty_mm), touch
+        assert touch.uncertainty_mm < 0.12
+        assert touch.time_s == pytest.approx(touch.displacement_mm / 0.96, abs=0.01)
+
+
+def test_touch_down_does_not_mind_an_offset_or_a_wait_before_the_ramp():
+    for seed in range(3):
+        trace, _ = record(offset=0.2, wait=1.5, seed=seed)
+        touch = find_touch_down(trace)
+        assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
+        assert touch.time_s == pytest.approx(1.5 + 0.4 / 0.96, abs=0.1)
+        assert touch.baseline_N == pytest.approx(0.2, abs=0.01)
+        assert not touch.in_contact_at_start
+
+
+def test_a_record_without_slack_says_so():
+    trace, _ = record(slack=0.0)
+    touch = find_touch_down(trace)
+    assert touch.in_contact_at_start
+    assert touch.displacement_mm < 0.1
+
+
+def test_more_noise_means_more_uncertainty_and_no_bias():
+    errors, stated = [], []
+    for seed in range(12):
+        touch = find_touch_down(record(noise_N=0.1, seed=seed)[0])
+        errors.append(touch.displacement_mm - 0.4)
+        stated.append(touch.uncertainty_mm)
+    assert abs(np.mean(errors)) < 0.06
+    assert 0.5 < np.mean(stated) / np.sqrt(np.mean(np.square(errors))) < 3
+    assert np.mean(stated) > 2 * find_touch_down(record(noise_N=0.01)[0]).uncertainty_mm
+
+
+@needs_openlimb
+@pytest.mark.parametrize("site", ["1", "2", "3", "4", "5", "6"])
+def test_touch_down_of_foreign_records(site):
+    """Between FEBio's last point without force and the first with more than 10 mN, to 0.1 mm."""
+    trace = read_trace(OPENLIMB / "traces" / f"site-{site}.csv")
+    points = np.loadtxt(OPENLIMB / "febio" / f"site-{site}.csv", delimiter=",", skiprows=1)
+    first = int(np.argmax(points[:, 2] > 0.01))
+    before = int(np.flatnonzero(points[:first, 2] == 0)[-1])
+    touch = find_touch_down(trace)
+    assert points[before, 1] - 0.1 < touch.displacement_mm < points[first, 1] + 0.05
+    assert touch.uncertainty_mm < 0.1
+
+
+# --- regularisation
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_peak_is_kept_and_the_noise_is_gone(seed):
+    trace, truth = record(seed=seed)
+    touch = find_touch_down(trace)
+    curve = regularise(trace, touch)
+    assert curve.peak_force_N == pytest.approx(truth(5.4 / 0.96), abs=0.03)
+    assert curve.time_s[curve.peak_index] + touch.time_s == pytest.approx(5.4 / 0.96, abs=0.005)
+    error = curve.force_N - truth(curve.time_s + touch.time_s)
+    assert np.sqrt(np.mean(error**2)) < 0.015
+    assert curve.noise_N == pytest.approx(0.03, rel=0.1)
+    assert curve.noise_mm == pytest.approx(0.005, rel=0.1)
+
+
+def test_displacement_is_a_line_in_and_a_line_out():
+    trace, _ = record()
+    touch = find_touch_down(trace)
+    curve = regularise(trace, touch)
+    assert len(curve.knots_s) == 3
+    assert curve.speed_load_mm_s == pytest.approx(0.96, rel=1e-3)
+    assert curve.speed_unload_mm_s == pytest.approx(0.96, rel=1e-3)
+    assert curve.depth_mm + touch.displacement_mm == pytest.approx(5.4, abs=2e-3)
+    assert curve.knots_mm[[0, -1]] == pytest.approx([0, 0], abs=1e-9)
+    assert curve.force_N[0] == pytest.approx(0, abs=1e-3)
+    assert curve.force_N.min() >= 0
+
+
+def test_a_single_smoothing_over_the_corner_would_lose_the_peak():
+    """What treating loading and unloading apart is for."""
+    trace, truth = record()
+    touch = find_touch_down(trace)
+    peak = truth(5.4 / 0.96)
+    window = np.ones(250) / 250
+    over = np.convolve(trace.force_N, window, "same").max()
+    assert peak - over > 5 * abs(peak - regularise(trace, touch).peak_force_N)
+
+
+def test_given_smoothing_is_used():
+    trace, _ = record()
+    touch = find_touch_down(trace)
+    roughness = [
+        np.abs(np.diff(regularise(trace, touch, smoothing=lam).force_N, 2)).sum() for lam in (0.0, 1.0, 1e4)
+    ]
+    assert roughness[0] > 2 * roughness[1] > 2 * roughness[2]
+
+
+def test_coarse_and_clean_records_are_not_blurred():
+    trace, truth = record(rate=10, noise_N=0.0, noise_mm=0.0)
+    touch = find_touch_down(trace)
+    assert touch.displacement_mm == pytest.approx(0.4, abs=0.05)
+    curve = regularise(trace, touch)
+    assert curve.peak_force_N == pytest.approx(truth(5.4 / 0.96), rel=0.01)
+    assert np.abs(curve.force_N - truth(curve.time_s + touch.time_s)).max() < 0.08 * curve.peak_force_N
+
+
+def test_resampling_keeps_corners_peak_and_ends():
+    curve = regularise((trace := record()[0]), find_touch_down(trace))
+    few = curve.resample(60)
+    assert abs(len(few.time_s) - 60) <= 2
+    assert np.all(np.isin(curve.knots_s, few.time_s))
+    assert few.peak_force_N == pytest.approx(curve.peak_force_N)
+    assert few.time_s[-1] == curve.time_s[-1]
+    assert np.all(np.diff(few.time_s) > 0)
+
+
+def test_a_record_that_ends_at_its_peak_is_loading_only():
+    trace, _ = record()
+    half = trace.time_s < 5.4 / 0.96
+    trace = Trace(trace.time_s[half], trace.displacement_mm[half], trace.force_N[half])
+    curve = regularise(trace, find_touch_down(trace))
+    assert np.isnan(curve.speed_unload_mm_s)
+    assert curve.peak_index == len(curve.time_s) - 1
+    assert len(curve.knots_s) == 2
+
+
+def test_a_long_record_is_quick_and_alike():
+    trace, _ = record(rate=20_000)
+    short, _ = record(rate=500)
+    assert len(trace.time_s) > 200_000
+    curves = [regularise(t, find_touch_down(t)) for t in (trace, short)]
+    assert curves[0].peak_force_N == pytest.approx(curves[1].peak_force_N, rel=0.01)
+
+
+@needs_openlimb
+@pytest.mark.parametrize("site", ["1", "2", "3", "4", "5", "6"])
+def test_foreign_records_keep_their_peak(site):
+    trace = read_trace(OPENLIMB / "traces" / f"site-{site}.csv")
+    facts = json.loads((OPENLIMB / "sites.json").read_text())["sites"][site]
+    curve = regularise(trace, find_touch_down(trace))
+    assert curve.peak_force_N == pytest.approx(facts["peak_force_N"], abs=0.03)
+    assert curve.noise_N == pytest.approx(0.03, rel=0.1)
+    assert curve.speed_load_mm_s == pytest.approx(facts["speed_mm_s"], rel=2e-3)
+
+
+@needs_relaxation
+@pytest.mark.parametrize(
+    "name", ["230403-FF1A", "230403-FF1b", "230403-RDG1A", "230411-RDG1A", "230411-RDG1B", "230411-RDG1C"]
+)
+def test_real_ramp_and_hold_records(name):
+    trace = read_trace(RELAXATION / f"{name}.csv")
+    touch = find_touch_down(trace)
+    curve = regularise(trace, touch)
+    assert curve.peak_force_N == pytest.approx(trace.force_N.max() - touch.baseline_N, rel=0.02)
+    assert np.isnan(curve.speed_unload_mm_s)
+    ramp = np.max(np.diff(trace.displacement_mm) / np.diff(trace.time_s))
+    assert 0.85 * ramp < curve.speed_load_mm_s < ramp
+    end = trace.force_N[-5:].mean() - touch.baseline_N
+    assert curve.force_N[-1] == pytest.approx(end, rel=0.02)
+    held = np.interp(np.arange(curve.corners_s[1], curve.time_s[-1], 0.5), curve.time_s, curve.force_N)
+    assert np.all(np.diff(held) < 0)
+
+
+@needs_relaxation
+def test_the_late_touch_down_of_the_poor_run_is_found():
+    touch = find_touch_down(read_trace(RELAXATION / "230403-FF1A.csv"))
+    assert touch.displacement_mm == pytest.approx(3.4, abs=0.2)
+    assert not touch.in_contact_at_start
