@@ -81,7 +81,7 @@ def _body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
 
 def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]:
     """Smoothed signed distance (mm, positive inside) on cubic voxels, and the level that keeps the volume."""
-    distance = _signed_distance(body, grid)
+    distance = signed_distance_to(body, grid)
     smooth = Volume(
         gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), grid.spacing, grid.origin, grid.direction
     )
@@ -92,8 +92,8 @@ def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]
     return cubic, float(np.partition(values, place)[place])
 
 
-def _signed_distance(body: Mask, grid: Grid) -> Field:
-    """Distance to the other side's nearest voxel, clamped where only the sign matters."""
+def signed_distance_to(body: Mask, grid: Grid) -> Field:
+    """Distance of each voxel to the nearest one on the other side, mm, positive inside, clamped."""
     reach = 3 * grid.spacing.max()
 
     def outside(mask: Mask) -> Field:
