@@ -201,8 +201,9 @@ def _meshes(folder: Path, sites: tuple) -> None:
             "element": "tet10",
             "min_dihedral_deg": 9.8,
             "layer_mean_mm": 3.0,
-            "layer_sd_mm": 0.02,
-            "trimmed_bone_mm3": {"tibia": 412.0},
+            "layer_std_mm": 0.02,
+            "trimmed_bone": {"tibia": {"volume_mm3": 412.0, "depth_mm": 1.1}},
+            "warnings": ["the layer is thin at the tibial crest"] if i == 1 else [],
             "seconds": 15.2,
         }
         if row[2]:

@@ -137,6 +137,13 @@ def test_site_table_marks_the_fitted(report: str) -> None:
     assert "0.9 ± 0.3" in table.group()
 
 
+def test_mesh_facts(report: str) -> None:
+    text = _section(report, "meshes")
+    assert "3.00 ± 0.02" in text
+    assert '<td class="number">412</td>' in text
+    assert "<li>Site TI-2: the layer is thin at the tibial crest</li>" in text
+
+
 def test_correlations_are_coloured_by_sign(report: str) -> None:
     text = _section(report, "parameters")
     assert re.search(r'class="number cold" style="--shade:68%">−0\.90<', text)

@@ -196,12 +196,12 @@ def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
         plotter.close()
     names = [row["site"] for row, _ in rows]
     alt = "Meshes cut through the sites " + ", ".join(names) + ": skin layer, muscle and bone voids"
-    legend = _legend((("skin–adipose layer", SKIN), ("muscle–soft tissue", MUSCLE)))
+    legend = _legend((("skin–adipose layer", SKIN), ("muscle–soft tissue", MUSCLE), ("wall of a bone", BONE)))
     caption = (
         "The mesh of each fitted site, cut along the limb through the site (above), and near the indenter "
         "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
     )
-    titles = [f"{name}" for name in names]
+    titles = [f"site {name}" for name in names]
     markup = _strip(whole, titles, alt) + _strip(near, [f"{t}, near" for t in titles], alt) + legend
     return Figure("mesh-cut", markup, caption)
 
@@ -224,7 +224,9 @@ def field_figure(store: Store, sites: Sequence[str], stage: str, name: str) -> F
     names = [row["site"] for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
     caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
-    return Figure(name, _strip(shots, names, alt) + _colour_bar(limits, field[1]), caption)
+    return Figure(
+        name, _strip(shots, [f"site {name}" for name in names], alt) + _colour_bar(limits, field[1]), caption
+    )
 
 
 def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
@@ -282,10 +284,22 @@ def _add_regions(plotter: Any, grid: Grid) -> None:
         part = grid.extract_cells(np.flatnonzero(regions == index))
         if part.n_cells:
             surface = part.extract_surface(algorithm="dataset_surface")
-            color = SKIN if name == "skin" else MUSCLE
-            plotter.add_mesh(
-                surface, color=color, show_edges=True, edge_color="#5a4040", line_width=1, **MATT
-            )
+            bone = _on_bone(surface)
+            for chosen, color in ((~bone, SKIN if name == "skin" else MUSCLE), (bone, BONE)):
+                _add_faces(plotter, surface.extract_cells(np.flatnonzero(chosen)), color)
+
+
+def _on_bone(surface: Grid) -> NDArray[np.bool_]:
+    """Which triangles of a region's surface are the wall of a bone void."""
+    if "in fixed_bone" not in surface.point_data:
+        return np.zeros(surface.n_cells, dtype=bool)
+    triangles = np.asarray(surface.faces).reshape(-1, 4)[:, 1:]
+    return np.asarray(surface.point_data["in fixed_bone"])[triangles].all(axis=1)
+
+
+def _add_faces(plotter: Any, faces: Grid, color: str) -> None:
+    if faces.n_cells:
+        plotter.add_mesh(faces, color=color, show_edges=True, edge_color="#4a2f2f", line_width=1.5, **MATT)
 
 
 def _limits(cuts: Sequence[Grid], views: Sequence[View], field: str) -> tuple[float, float]:

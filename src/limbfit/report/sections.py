@@ -159,9 +159,13 @@ def model(store: Store) -> Section:
 
 def meshes(store: Store) -> Section:
     """Cut meshes and their quality."""
+    warnings = tuple(
+        f"Site {site}: {text}" for site, facts in store.mesh.items() for text in facts.get("warnings") or ()
+    )
     blocks = _blocks(
         pictures.mesh_figure(store, store.fitted[:4]),
         tables.mesh_table(store) if store.mesh else None,
+        Bullets(warnings) if warnings else None,
         otherwise="No meshes are stored yet.",
     )
     return Section("meshes", "Meshes", blocks)

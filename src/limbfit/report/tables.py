@@ -290,9 +290,8 @@ def mesh_table(store: Store) -> Table:
 
 
 def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
-    trimmed = facts.get("trimmed_bone_mm3") or {}
-    total = sum(trimmed.values()) if isinstance(trimmed, Mapping) else trimmed
-    layer = f"{fixed(facts.get('layer_mean_mm'), 2)} ± {fixed(facts.get('layer_sd_mm'), 2)}"
+    trimmed = [bone.get("volume_mm3", 0.0) for bone in (facts.get("trimmed_bone") or {}).values()]
+    layer = f"{fixed(facts.get('layer_mean_mm'), 2)} ± {fixed(facts.get('layer_std_mm'), 2)}"
     cells = (
         _h(site),
         Cell(str(facts.get("element", NOTHING))),
@@ -300,7 +299,7 @@ def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
         _n(_count(facts.get("cells"))),
         _n(fixed(facts.get("min_dihedral_deg"))),
         _n(layer),
-        _n(fixed(total, 0)),
+        _n(fixed(sum(trimmed), 0)),
         _n(duration(facts.get("seconds"))),
     )
     return Row(cells, marked)
