@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class NewtonControl:
     """Tolerance of the residual relative to the reactions, and limits."""
 
-    tolerance: float = 1e-6
+    tolerance: float = 1e-5
     max_iterations: int = 30
     max_backtracks: int = 12
     stale_products: int = 12

@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MemoryDerivative:
-    """Derivatives of a `Memory`: ``elastic (m, q, p, 6)``, ``prony (l, m, q, p, 6)``."""
+    """Derivatives of a `Memory`: ``elastic (m, q, 6, p)``, ``prony (l, m, q, 6, p)``."""
 
     elastic: Array
     prony: Array
 
     @classmethod
     def rest(cls, system: System, laws: Laws) -> MemoryDerivative:
-        shape = (*system.weights.shape, laws.count, 6)
+        shape = (*system.weights.shape, 6, laws.count)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
 
     def residual(
@@ -65,7 +65,7 @@ class MemoryDerivative:
                 d_tau, cells = laws.d_prony[r, p, l, 1], of == r
                 change = d_decay[r, l] * before.prony[l][cells]
                 change += d_ramp[r, l] * (after.elastic - before.elastic)[cells]
-                prony[l][cells, :, laws.parameter_index[r, p]] += d_tau * change
+                prony[l][cells, :, :, laws.parameter_index[r, p]] += d_tau * change
         return MemoryDerivative(elastic, prony)
 
 
@@ -96,7 +96,7 @@ def explicit_forces(cells, grads, weights, mean, regions, tables, d_tables, scal
     F, A, N = matrix[0], matrix[1], matrix[2]
     c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
     d_beta, value = vector[5], vector[6]
-    S, part, fe = np.empty((P, 6)), np.empty(6), np.empty((k, 3, P))
+    S, part, fe, FS = np.empty((6, P)), np.empty(6), np.empty((k, 3, P)), np.empty((3, P))
     for el in range(m):
         for a in range(k):
             for i in range(3):
@@ -114,12 +114,12 @@ def explicit_forces(cells, grads, weights, mean, regions, tables, d_tables, scal
             principal(F, A, c2, N)
             logarithmic_stretches(c2, e)
             ogden(terms[region], c2, e, beta, slope, quotient)
-            for p in range(P):
-                for t in range(6):
-                    total = on_elastic[region] * dSe[el, q, p, t]
-                    for l in range(H.shape[0]):
-                        total += on_prony[region, l] * dH[l, el, q, p, t]
-                    S[p, t] = total
+            for t in range(6):
+                for p in range(P):
+                    S[t, p] = on_elastic[region] * dSe[el, q, t, p]
+                for l in range(H.shape[0]):
+                    for p in range(P):
+                        S[t, p] += on_prony[region, l] * dH[l, el, q, t, p]
             for j in range(index.shape[1]):
                 p = index[region, j]
                 if p < 0:
@@ -136,15 +136,17 @@ def explicit_forces(cells, grads, weights, mean, regions, tables, d_tables, scal
                     total = part[t] - d_scale[region, j] * Se[el, q, t]
                     for l in range(H.shape[0]):
                         total += d_on_prony[region, j, l] * H[l, el, q, t]
-                    S[p, t] += total
-            for p in range(P):
-                for i in range(3):
-                    x = F[i, 0] * S[p, 0] + F[i, 1] * S[p, 3] + F[i, 2] * S[p, 5]
-                    y = F[i, 0] * S[p, 3] + F[i, 1] * S[p, 1] + F[i, 2] * S[p, 4]
-                    z = F[i, 0] * S[p, 5] + F[i, 1] * S[p, 4] + F[i, 2] * S[p, 2]
-                    for a in range(k):
-                        g = grads[el, q]
-                        fe[a, i, p] += weights[el, q] * (x * g[0, a] + y * g[1, a] + z * g[2, a])
+                    S[t, p] += total
+            for i in range(3):
+                x, y, z = weights[el, q] * F[i, 0], weights[el, q] * F[i, 1], weights[el, q] * F[i, 2]
+                for p in range(P):
+                    FS[0, p] = x * S[0, p] + y * S[3, p] + z * S[5, p]
+                    FS[1, p] = x * S[3, p] + y * S[1, p] + z * S[4, p]
+                    FS[2, p] = x * S[5, p] + y * S[4, p] + z * S[2, p]
+                for a in range(k):
+                    x, y, z = grads[el, q, 0, a], grads[el, q, 1, a], grads[el, q, 2, a]
+                    for p in range(P):
+                        fe[a, i, p] += x * FS[0, p] + y * FS[1, p] + z * FS[2, p]
         for a in range(k):
             for i in range(3):
                 for p in range(P):
@@ -153,15 +155,15 @@ def explicit_forces(cells, grads, weights, mean, regions, tables, d_tables, scal
 
 @njit(cache=True)
 def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, du, out):  # type: ignore[no-untyped-def]
-    """Total derivative (m, q, p, 6) of Se: explicit in the parameters, and through ``du (n, 3, p)``."""
+    """Total derivative (m, q, 6, p) of Se: explicit in the parameters, and through ``du (n, 3, p)``."""
     m, k = cells.shape
     P = du.shape[2]
     ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
     F, A, N = matrix[0], matrix[1], matrix[2]
     c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
     d_beta = vector[5]
-    dF, FN, dC, dS = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    shear, local = np.empty(3), np.empty((P, 3))
+    half, dFN, dC, dS = np.empty((3, 3, P)), np.empty((3, 3, P)), np.empty((3, 3, P)), np.empty((3, 3, P))
+    FN, GN, shear, local = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, P))
     for el in range(m):
         for a in range(k):
             for i in range(3):
@@ -178,40 +180,48 @@ def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, d
                 if index[region, j] >= 0:
                     ogden_derivative(terms[region], d_terms[region, j], e, d_beta)
                     for i in range(3):
-                        local[index[region, j], i] = d_beta[i] / c2[i]
+                        local[i, index[region, j]] = d_beta[i] / c2[i]
             for i in range(3):
                 j, h = (i + 1) % 3, (i + 2) % 3
                 shear[i] = 0.5 * ((c2[j] + c2[h]) * quotient[i] - beta[j] - beta[h]) / (c2[j] * c2[h])
                 for p in range(3):
                     FN[p, i] = F[p, 0] * N[0, i] + F[p, 1] * N[1, i] + F[p, 2] * N[2, i]
-            for p in range(P):
-                dF[:] = 0.0
-                for a in range(k):
-                    for i in range(3):
-                        for j in range(3):
-                            dF[i, j] += du[cells[el, a], i, p] * grads[el, q, j, a]
-                for i in range(3):  # A = (FN)^T dF N, hence dC = A + A^T in the principal frame
-                    for j in range(3):
-                        A[i, j] = 0.0
-                        for r in range(3):
-                            dFN = dF[r, 0] * N[0, j] + dF[r, 1] * N[1, j] + dF[r, 2] * N[2, j]
-                            A[i, j] += FN[r, i] * dFN
-                for i in range(3):
-                    for j in range(3):
-                        dC[i, j] = A[i, j] + A[j, i]
-                for i in range(3):
-                    j, h = (i + 1) % 3, (i + 2) % 3
-                    rate = 0.0
+            dFN[:] = 0.0  # dF in columns along the principal directions
+            for a in range(k):
+                for j in range(3):
+                    GN[j] = 0.0
                     for r in range(3):
-                        moduli = total - (slope[i] + slope[r]) / 3.0 + (slope[i] - 2.0 * beta[i] if i == r else 0.0)
-                        rate += moduli * dC[r, r] / (2.0 * c2[r])
-                    dS[i, i] = local[p, i] + rate / c2[i]
-                    dS[j, h] = shear[i] * dC[j, h]
-                    dS[h, j] = dS[j, h]
-                for t in range(6):
-                    x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
-                    value = 0.0
-                    for i in range(3):
-                        for j in range(3):
-                            value += N[x, i] * dS[i, j] * N[y, j]
-                    out[el, q, p, t] = value
+                        GN[j] += grads[el, q, r, a] * N[r, j]
+                for i in range(3):
+                    for j in range(3):
+                        g = GN[j]
+                        for p in range(P):
+                            dFN[i, j, p] += g * du[cells[el, a], i, p]
+            for i in range(3):  # half of dC in the principal frame
+                for j in range(3):
+                    for p in range(P):
+                        half[i, j, p] = FN[0, i] * dFN[0, j, p] + FN[1, i] * dFN[1, j, p] + FN[2, i] * dFN[2, j, p]
+            for i in range(3):
+                for j in range(3):
+                    for p in range(P):
+                        dC[i, j, p] = half[i, j, p] + half[j, i, p]
+            for i in range(3):
+                j, h = (i + 1) % 3, (i + 2) % 3
+                for p in range(P):
+                    dS[i, i, p] = local[i, p]
+                    dS[j, h, p] = shear[i] * dC[j, h, p]
+                    dS[h, j, p] = dS[j, h, p]
+                for r in range(3):
+                    moduli = total - (slope[i] + slope[r]) / 3.0 + (slope[i] - 2.0 * beta[i] if i == r else 0.0)
+                    moduli /= 2.0 * c2[r] * c2[i]
+                    for p in range(P):
+                        dS[i, i, p] += moduli * dC[r, r, p]
+            for t in range(6):
+                x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
+                for p in range(P):
+                    out[el, q, t, p] = 0.0
+                for i in range(3):
+                    for j in range(3):
+                        g = N[x, i] * N[y, j]
+                        for p in range(P):
+                            out[el, q, t, p] += g * dS[i, j, p]

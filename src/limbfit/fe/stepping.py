@@ -43,7 +43,7 @@ class StepControl:
     load_steps: int = 10
     unload_steps: int = 8
     times: tuple[float, ...] | None = None
-    tolerance: float = 1e-6
+    tolerance: float = 1e-5
     max_iterations: int = 30
     max_cuts: int = 8
     penetration: float = 0.01
