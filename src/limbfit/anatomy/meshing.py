@@ -31,6 +31,7 @@ from .curving import curved, with_diagonals
 from .engines import ENGINES, VolumeMesh, VolumeTask
 from .extrusion import guarded, prism_tets, projected
 from .layers import Level, LimbFields, TrimmedBone, limb_fields
+from .smoothing import improved
 from .surfaces import Anatomy, Surface
 
 Array = NDArray[np.float64]
@@ -39,8 +40,9 @@ Ints = NDArray[np.int64]
 REGIONS = ("skin", "muscle")
 SURFACES = (PLANE, LAYER, BONE, FAR)
 GOOD_DIHEDRAL_DEG = 8.0
+SMOOTHED_BELOW_DEG = 10.0
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
-LAYER_RATIO = 5.5  # greatest edge over thickness of the skin layer: about 9 degrees in an even prism
+LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
 RIM_LAYERS = 3.0  # depth below the cut plane, in layers, over which the extrusion turns sideways
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
@@ -234,6 +236,23 @@ def _on_surfaces(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
         target[nodes] = projected(level, target[nodes], free[nodes])
     points = guarded(muscle.points, target, muscle.tets, GOOD_DIHEDRAL_DEG)
     points[in_plane, 2] = 0.0
+    return _smoothed(replace(muscle, points=points), fields)
+
+
+def _smoothed(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
+    """Poor elements improved: inner nodes move freely, those of one surface on it, those of two not."""
+    on = {surface: _nodes_on(muscle, surface) for surface in SURFACES}
+    levels = {LAYER: fields.layer, BONE: fields.void}
+
+    def allowed(node: int, places: Array) -> Array:
+        surfaces = [surface for surface, nodes in on.items() if nodes[node]]
+        if not surfaces:
+            return places
+        if len(surfaces) == 1 and surfaces[0] in levels:
+            return projected(levels[surfaces[0]], places, np.ones(len(places)))
+        return places[:0]
+
+    points = improved(muscle.points, muscle.tets, SMOOTHED_BELOW_DEG, allowed)
     return replace(muscle, points=points)
 
 
