@@ -117,7 +117,7 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
 
 def _site_title(store: Store, row: Json, columns: int) -> str:
     region = str(row.get("region") or "")
-    head = f"{row['site']}, {region}" if region and columns < 3 else str(row["site"])
+    head = f"site {row['site']}" + (f", {region}" if region and columns < 3 else "")
     return f"{_short(head, LONGEST_TITLE // (columns - 1 or 1))}: {fixed(row.get('error_percent'))} %"
 
 
