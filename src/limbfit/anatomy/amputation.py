@@ -15,7 +15,7 @@ from scipy.ndimage import label as connected
 
 from ..errors import LabelError
 from .extraction import signed_distance_to
-from .grid import SOFT_TISSUE, LabelMap
+from .grid import LabelMap
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def amputate(
     depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
     end = pad_mm * _quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
     kept = -height[near] < end
-    array[tuple(axis[kept] for axis in near)] = labels.value(SOFT_TISSUE)
+    array[tuple(axis[kept] for axis in near)] = labels.soft_value
     _check(labels, array, section, height, pad_mm)
     return labels.with_array(array)
 
@@ -84,7 +84,7 @@ def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
         value: _interpolated(signed_distance_to(mask, labels), place, 2 - axis) > 0
         for value, mask in masks.items()
     }
-    array = np.where(inside.pop(0), labels.value(SOFT_TISSUE), 0).astype(np.uint8)
+    array = np.where(inside.pop(0), labels.soft_value, 0).astype(np.uint8)
     for value, mask in inside.items():
         array[mask] = value
     return LabelMap(array, spacing, labels.index_to_point(start), labels.direction, labels.names)
@@ -160,7 +160,7 @@ def _check(labels: LabelMap, array: NDArray[np.uint8], section: _Section, height
             "the image ends within the limb's cross-section at the amputation plane",
             remedy="move the plane proximally",
         )
-    soft = labels.value(SOFT_TISSUE)
+    soft = labels.soft_value
     if not np.any((array > 0) & (array != soft)):
         raise LabelError(
             "no bone is left proximal of the amputation plane",

@@ -173,6 +173,14 @@ class LabelMap(Grid):
             f"no label is named {name!r}", remedy="the map has " + ", ".join(sorted(self.names.values()))
         )
 
+    @property
+    def soft_value(self) -> int:
+        """The label value of soft tissue; of several kinds the lowest."""
+        soft = [value for value, name in sorted(self.names.items()) if name in SOFT_NAMES]
+        if not soft:
+            raise LabelError("the label map names no soft tissue", remedy=f"name one label {SOFT_TISSUE!r}")
+        return soft[0]
+
     def mask(self, name: str) -> NDArray[np.bool_]:
         """Voxels of one name."""
         return self.array == self.value(name)

@@ -89,8 +89,9 @@ def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
     """Any scalar label image; names from ``<file>.json`` (``{"2": "tibia"}``) or the default ones."""
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise LabelError("a label image has one value per voxel", file=path)
+    names = _sidecar_names(path)
     try:
-        return LabelMap.from_sitk(image, _sidecar_names(path))
+        return LabelMap.from_sitk(image, names)
     except LabelError as error:
         raise LabelError(error.what, file=path) from None
 

@@ -1,0 +1,137 @@
+"""Images keep their place in the patient through every format, oblique and flipped axes included."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from limbs import DIRECTIONS, volume
+
+from limbfit.anatomy.imaging import LabelMap, Volume, read_volume, write_volume
+from limbfit.errors import ImageError, LabelError
+
+TOLERANCE_MM = 0.01
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS.keys())
+def test_affine_agrees_with_simpleitk(direction):
+    image = volume(direction)
+    foreign = image.to_sitk()
+    for index in [(0, 0, 0), (4, 5, 6), (1, 0, 3)]:
+        assert np.allclose(image.index_to_point(index), foreign.TransformIndexToPhysicalPoint(index))
+        assert np.allclose(image.affine @ [*index, 1], [*image.index_to_point(index), 1])
+        assert image.array[index[::-1]] == foreign[index]
+    assert Volume.from_sitk(foreign).same_grid(image)
+
+
+def test_point_to_index_is_the_inverse():
+    image = volume(DIRECTIONS["flipped rows"])
+    index = np.random.default_rng(0).uniform(-3, 9, size=(20, 3))
+    assert np.allclose(image.point_to_index(image.index_to_point(index)), index)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".nrrd", ".mha", ".mhd"])
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS.keys())
+def test_round_trip_through_files(tmp_path, suffix, direction):
+    image = volume(direction)
+    write_volume(tmp_path / f"image{suffix}", image)
+    back = read_volume(tmp_path / f"image{suffix}")
+    corner = np.array(image.size) - 1
+    assert np.array_equal(back.array, image.array)
+    assert np.abs(back.index_to_point(corner) - image.index_to_point(corner)).max() < TOLERANCE_MM
+    assert back.same_grid(image)
+
+
+def test_nifti_is_turned_from_ras_to_lps(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    affine = np.diag([2.0, 3.0, 4.0, 1.0])
+    affine[:3, 3] = [10, 20, 30]
+    array = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+    nibabel.save(nibabel.Nifti1Image(array, affine), tmp_path / "ras.nii")
+    image = read_volume(tmp_path / "ras.nii")
+    ras = affine @ [2, 1, 3, 1]
+    assert np.allclose(image.index_to_point([2, 1, 3]), ras[:3] * [-1, -1, 1])
+    assert image.array[3, 1, 2] == array[2, 1, 3]
+
+
+def test_nifti_without_a_stated_orientation_is_refused(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    bare = nibabel.Nifti1Image(np.ones((3, 4, 5), np.float32), np.eye(4))
+    bare.set_qform(None, code=0)
+    bare.set_sform(None, code=0)
+    nibabel.save(bare, tmp_path / "bare.nii")
+    with pytest.raises(ImageError, match="does not say how it lies"):
+        read_volume(tmp_path / "bare.nii")
+
+
+def test_nrrd_without_a_space_is_refused(tmp_path):
+    import nrrd
+
+    nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((3, 4, 5), np.float32))
+    with pytest.raises(ImageError, match="does not say how it lies"):
+        read_volume(tmp_path / "bare.nrrd")
+
+
+def test_sheared_axes_are_refused(tmp_path):
+    import nrrd
+
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0.3, 1]]),
+        "space origin": [0, 0, 0],
+    }
+    nrrd.write(str(tmp_path / "tilted.nrrd"), np.ones((3, 4, 5), np.float32), header)
+    with pytest.raises(ImageError, match="orthonormal"):
+        read_volume(tmp_path / "tilted.nrrd")
+
+
+def test_voxels_that_are_not_numbers_are_refused(tmp_path):
+    image = volume(np.eye(3))
+    array = image.array.copy()
+    array[2, 3, 1] = np.nan
+    write_volume(tmp_path / "nan.nrrd", image.with_array(array))
+    with pytest.raises(ImageError, match="1 voxels are not numbers"):
+        read_volume(tmp_path / "nan.nrrd")
+
+
+@pytest.mark.parametrize("name", ["none.nii.gz", "cut.nii.gz", "cut.nii", "cut.nrrd", "cut.mha", "words.txt"])
+def test_missing_and_damaged_files_are_refused(tmp_path, name):
+    if name.startswith("cut"):
+        write_volume(tmp_path / name, volume(np.eye(3)))
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+    elif name == "words.txt":
+        (tmp_path / name).write_text(json.dumps({}))
+    with pytest.raises(ImageError, match=name):
+        read_volume(tmp_path / name)
+
+
+def test_colour_and_flat_images_are_refused(tmp_path):
+    colour = sitk.GetImageFromArray(np.zeros((3, 4, 5, 3), np.uint8), isVector=True)
+    sitk.WriteImage(colour, str(tmp_path / "colour.mha"))
+    with pytest.raises(ImageError, match="one grey value"):
+        read_volume(tmp_path / "colour.mha")
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((4, 5), np.float32)), str(tmp_path / "flat.mha"))
+    with pytest.raises(ImageError, match="three dimensions"):
+        read_volume(tmp_path / "flat.mha")
+
+
+def test_grids_differ_by_shape_and_by_place():
+    image = volume(DIRECTIONS["oblique"])
+    place = (image.spacing, image.origin, image.direction)
+    assert not image.same_grid(Volume(image.array[:-1], *place))
+    moved = Volume(image.array, image.spacing, image.origin + np.array([0, 0.02, 0]), image.direction)
+    assert not image.same_grid(moved)
+
+
+@pytest.mark.parametrize("bad", [[1, 1], [1, 1, 0], [1, 1, np.nan]])
+def test_spacing_must_be_three_lengths(bad):
+    with pytest.raises(ImageError, match="spacing"):
+        Volume(np.zeros((2, 2, 2)), bad, [0, 0, 0], np.eye(3))
+
+
+def test_labels_must_be_small_whole_numbers():
+    with pytest.raises(LabelError, match="whole numbers"):
+        LabelMap(np.full((2, 2, 2), 0.5), [1, 1, 1], [0, 0, 0], np.eye(3))
