@@ -161,7 +161,11 @@ def _check_cells(problem: Problem) -> None:
     if len(unique) != len(mesh.cells):
         raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
     _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
-    bad = np.flatnonzero(~(weights > 0).all(axis=1))
+    upright = (weights > 0).all(axis=1)
+    if mesh.cell_type == "tet10":  # a quadratic map may be upright at its points and its corners not
+        corners = mesh.points[mesh.corners]
+        upright &= np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
+    bad = np.flatnonzero(~upright)
     if len(bad):
         raise ProblemError(f"{len(bad)} cells are inverted or flat, the first is cell {bad[0]}")
     used = np.zeros(len(mesh.points), dtype=bool)

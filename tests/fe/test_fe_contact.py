@@ -1,0 +1,142 @@
+"""Indenters and contact: derivatives, touch-down, penetration, robustness, partial results."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import MUSCLE, SKIN, block, punch
+
+from limbfit.errors import ProblemError
+from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
+from limbfit.fe.indenter import signed_distance
+from limbfit.fe.linear import symmetric_product
+from limbfit.fe.system import Increment, Laws
+
+SHAPES = [("square", 0.0), ("square", 2.0), ("sphere", 0.0), ("cylinder", 0.0), ("cylinder", 2.0)]
+
+
+@pytest.mark.parametrize(("shape", "radius"), SHAPES)
+def test_distance_derivatives(shape, radius):
+    code, half, rounding = Indenter(shape, 20.0, radius).kernel
+    rng, h = np.random.default_rng(0), 1e-6
+    g, H, other, scratch = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for x in rng.uniform([-13, -13, -6], [13, 13, 2], (400, 3)):
+        value = signed_distance(code, half, rounding, x, g, H)
+        if value < -0.9 * rounding:
+            continue
+        assert np.linalg.norm(g) == pytest.approx(1.0, abs=1e-12)
+        for i in range(3):
+            step = h * np.eye(3)[i]
+            ends = [signed_distance(code, half, rounding, x + s * step, other, scratch) for s in (-1, 1)]
+            slopes = []
+            for s in (-1, 1):
+                signed_distance(code, half, rounding, x + s * step, other, scratch)
+                slopes.append(other.copy())
+            assert (ends[1] - ends[0]) / (2 * h) == pytest.approx(g[i], abs=1e-5)
+            if rounding > 1.0 or shape == "sphere":
+                np.testing.assert_allclose((slopes[1] - slopes[0]) / (2 * h), H[i], atol=2e-5)
+
+
+@pytest.mark.parametrize("rule", ["nodes", "gauss"])
+@pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
+@pytest.mark.parametrize(("shape", "radius"), SHAPES)
+def test_contact_force_and_stiffness_are_derivatives_of_its_energy(cell_type, rule, shape, radius):
+    tool = Indenter(shape, 20.0, max(radius, 1.0), centre=(0.3, -0.4, 0.0), axis=(0.1, 0.05, -1.0))
+    problem = punch(cell_type, 4, 1, indenter=tool, contact_rule=rule, start="as-given")
+    system, laws = System(problem), Laws.build([SKIN, MUSCLE])
+    rest = np.zeros((*system.weights.shape, 6))
+
+    def at(u, d):
+        return system.evaluate(u, laws, Increment(0.0, d, np.zeros(2), rest, 0.5))
+
+    rng, h = np.random.default_rng(1), 1e-6
+    u = 0.01 * rng.normal(size=system.points.shape) * ~system.supported
+    d = rng.normal(size=u.shape) * ~system.supported
+    here = at(u, 0.6)
+    assert here.contact_area > 0
+    ahead, back = at(u + h * d, 0.6), at(u - h * d, 0.6)
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
+    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
+    deeper, shallower = at(u, 0.6 + h), at(u, 0.6 - h)
+    assert (deeper.energy - shallower.energy) / (2 * h) == pytest.approx(here.force, rel=1e-5)
+    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
+    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
+
+
+def test_starts_just_touching():
+    problem = punch("tet10", 2, 1)
+    system = System(replace(problem, indenter=replace(problem.indenter, centre=(0.0, 0.0, 17.0))))
+    np.testing.assert_allclose(system.indenter.centre, [0, 0, 0], atol=1e-6)
+
+
+def test_indenter_beside_the_faces_is_refused():
+    with pytest.raises(ProblemError, match="never meets"):
+        System(punch("tet10", 2, 1, indenter=Indenter(centre=(200.0, 0.0, 1.0))))
+
+
+@pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
+def test_punch_stays_out_and_comes_back_to_rest(cell_type):
+    result = solve(punch(cell_type, 4, 1))
+    assert result.completed, result.reason
+    assert result.penetration.max() <= 0.01 * 6.0
+    assert (result.force >= 0).all()
+    assert result.times[np.argmax(result.force)] == pytest.approx(6.0 / 0.96)
+    assert result.force[-1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("c", "m", "gamma", "tau"),
+    [(4.7e-5, 20.0, 10.0, 0.01), (0.047, 2.0, 0.01, 10.0), (0.047, 20.0, 10.0, 10.0), (4.7e-5, 2.0, 10.0, 10.0)],
+)
+def test_corners_of_the_parameter_bounds(c, m, gamma, tau):
+    skin = OgdenQLV(c, m, gamma, tau)
+    result = solve(punch("tet10", 2, 1, materials={"skin": skin, "muscle": MUSCLE}))
+    assert result.completed, result.reason
+
+
+@pytest.mark.parametrize("shape", ["square", "sphere", "cylinder"])
+def test_thin_tissue_over_bone(shape):
+    """4 mm of tissue pushed in by 2.4 mm by a sharp, tilted tool."""
+    lines = np.linspace(-20.0, 20.0, 9)
+    mesh = block("tet10", lines, lines, np.array([-4.0, -2.0, 0.0]), layer=2.0)
+    tool = Indenter(shape, 20.0, 0.0, centre=(0, 0, 1), axis=(0.05, 0.1, -1.0))
+    history = History(np.array([0.0, 2.5, 5.0]), np.array([0.0, 2.4, 0.0]))
+    fixed, faces = mesh.node_sets["bottom"], mesh.face_sets["top"]
+    result = solve(Problem(mesh, {"skin": SKIN, "muscle": MUSCLE}, fixed, faces, tool, history))
+    assert result.completed, result.reason
+    assert result.penetration.max() <= 0.024
+
+
+def test_what_cannot_be_solved_is_a_partial_result_with_its_reason():
+    """Slow at first, then 2 m/s: two Newton iterations and one cut do not get there."""
+    history = History(np.array([0.0, 10.0, 10.01]), np.array([0.0, 1.0, 21.0]))
+    times = (*np.linspace(0.1, 10.0, 40), 10.01)
+    result = solve(punch("tet10", 2, 1, history=history), StepControl(times=times, max_iterations=5, max_cuts=1))
+    assert not result.completed
+    assert "stopped at" in result.reason
+    assert 2 < len(result.times) == len(result.force)
+    assert result.force[-1] > result.force[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("break_it", "what"),
+    [
+        (lambda p: {"history": (np.array([0.0, 2.0, 1.0]), np.array([0.0, 1.0, 0.0]))}, "backwards in time"),
+        (lambda p: {"mesh": replace(p.mesh, cells=p.mesh.cells[:, [1, 0, *range(2, 10)]])}, "inverted"),
+        (lambda p: {"mesh": replace(p.mesh, cells=np.vstack([p.mesh.cells, p.mesh.cells[:1]]), regions=np.append(p.mesh.regions, 0))}, "duplicate"),
+        (lambda p: {"materials": {"skin": SKIN}}, "no material"),
+        (lambda p: {"contact_faces": np.zeros((0, 6), dtype=int)}, "contact faces"),
+        (lambda p: {"fixed": np.zeros(0, dtype=int)}, "held"),
+        (lambda p: {"element": "hex8"}, "no element"),
+    ],
+)  # fmt: skip
+def test_impossible_problems_are_refused(break_it, what):
+    problem = punch("tet10", 2, 1)
+    with pytest.raises(ProblemError, match=what):
+        changes = break_it(problem)
+        if "history" in changes:
+            changes["history"] = History(*changes["history"])
+        solve(replace(problem, **changes))

@@ -1,0 +1,105 @@
+"""Parity with FEBio 4.11 on its own meshes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from feb_reader import Feb, read_feb, read_log
+
+from limbfit.fe import History, Indenter, Problem, StepControl, Support, System, iterate, solve
+from limbfit.fe.observables import element_fields
+from limbfit.fe.system import Laws
+from limbfit.mesh import Mesh
+
+REFERENCE = Path(__file__).parents[2] / ".." / "shared" / "reference"
+pytestmark = pytest.mark.skipif(not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository")
+
+
+def body(feb: Feb) -> tuple[Mesh, np.ndarray]:
+    """The deformable parts as a mesh with regions skin and muscle, and the new number of each node."""
+    parts = [e for name, e in feb.elements.items() if name.startswith("part")]
+    cells = np.vstack([cells for _, cells, _ in parts])
+    regions = np.concatenate([np.full(len(cells), i) for i, (_, cells, _) in enumerate(parts)])
+    used = np.unique(cells)
+    number = np.full(len(feb.points), -1)
+    number[used] = np.arange(len(used))
+    names = ("skin", "muscle")[: len(parts)]
+    return Mesh(feb.points[used], number[cells], parts[0][0], regions, names), number
+
+
+def materials(feb: Feb) -> dict:
+    return dict(zip(("skin", "muscle"), (feb.materials[name] for name in sorted(feb.materials))))
+
+
+@pytest.mark.parametrize("tissue", ["skin", "muscle", "bosboom", "lim", "lim_par"])
+def test_cube(tissue):
+    feb = read_feb(REFERENCE / "cube" / f"cube_{tissue}.feb")
+    times, rows = read_log(REFERENCE / "cube" / f"cube_{tissue}.txt")
+    mesh, _ = body(feb)
+    sides = tuple(Support(feb.node_sets[name], i) for i, name in enumerate(("x0", "y0", "z0")))
+    top = Support(feb.node_sets["top"], 2, -1.0)
+    history = History(*feb.load.T)
+    none = np.zeros(0, dtype=int)
+    problem = Problem(mesh, materials(feb), none, np.zeros((0, 4), int), None, history, supports=(*sides, top))
+    system, laws = System(problem), Laws.build([problem.materials["skin"]])
+    control = StepControl(times=tuple(times[1:]), tolerance=1e-9)
+    found = [element_fields(system, laws, step.state) for step in iterate(problem, control)]
+    stress, J = np.array([f.cauchy[0, 2] for f in found]), np.array([f.J[0] for f in found])
+    assert np.abs(stress - rows[1:, 2]).max() < 1e-6 * np.abs(rows[:, 2]).max()
+    np.testing.assert_allclose(J, rows[1:, 3], rtol=1e-6)
+
+
+def residuum(kind: str, **changes) -> tuple[Problem, np.ndarray, np.ndarray]:
+    """The posterior site, FEBio's times and its forces along the axis."""
+    feb = read_feb(REFERENCE / "residuum" / f"posterior_{kind}.feb")
+    times, rows = read_log(REFERENCE / "residuum" / f"posterior_{kind}.txt")
+    mesh, number = body(feb)
+    path = rows[:, 3:] - rows[0, 3:]
+    axis = path[np.linalg.norm(path, axis=1).argmax()]
+    axis /= np.linalg.norm(axis)
+    punch = feb.points[np.unique(feb.elements["punch"][1])]
+    tip = rows[0, 3:] + axis * ((punch - rows[0, 3:]) @ axis).max()
+    indenter = Indenter("square", 20.0, 2.0, tip, axis)
+    fixed, faces = number[feb.node_sets["fixed"]], number[feb.surfaces["skin"]]
+    problem = Problem(
+        mesh, materials(feb), fixed, faces, indenter, History(*feb.load.T), start="as-given", **changes
+    )
+    return problem, times, np.abs(rows[:, :3] @ axis)
+
+
+def block(kind: str, **changes) -> tuple[Problem, np.ndarray, np.ndarray]:
+    feb = read_feb(REFERENCE / "block" / f"block_{kind}.feb")
+    times, rows = read_log(REFERENCE / "block" / f"block_{kind}.txt")
+    mesh, number = body(feb)
+    sides = tuple(Support(number[feb.node_sets[name]], i) for i, name in enumerate(("x0", "y0")))
+    start = feb.points[np.unique(feb.elements["box"][1])][:, 2].min()
+    indenter = Indenter("square", 20.0, 2.0, (0.0, 0.0, start), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+    fixed, faces = number[feb.node_sets["bottom"]], number[feb.surfaces["skin"]]
+    problem = Problem(
+        mesh, materials(feb), fixed, faces, indenter, History(*feb.load.T), supports=sides, start="as-given", **changes
+    )
+    return problem, times, np.abs(rows[:, 0])
+
+
+def difference(problem: Problem, times: np.ndarray, force: np.ndarray, **control) -> float:
+    """Largest difference from FEBio over the whole curve, in percent of its peak."""
+    result = solve(problem, StepControl(times=tuple(times[1:]), **control))
+    assert result.completed, result.reason
+    return 100 * np.abs(result.force - force).max() / force.max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "element"), [("tet4", "tet4"), ("tet10", "tet10g8")])
+def test_residuum(kind, element):
+    # FEBio's penalty, three times its automatic one, is about 10 shear moduli per mm; Gauss points as there.
+    problem, times, force = residuum(kind, element=element, contact_rule="gauss")
+    assert difference(problem, times, force, penalty=10.0, penetration=1.0) < 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "element"), [("hex8", "hex8"), ("tet4", "tet4"), ("tet10", "tet10g8")])
+def test_block(kind, element):
+    problem, times, force = block(kind, element=element, contact_rule="gauss")
+    assert difference(problem, times, force, penalty=10.0, penetration=1.0) < 1.5
