@@ -30,7 +30,12 @@ def block(
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
     points = grid.reshape(-1, 3).astype(float)
     index = np.arange(len(points)).reshape(grid.shape[:3])
-    corner = [index[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    corner = [
+        index[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None]
+        for i in (0, 1)
+        for j in (0, 1)
+        for k in (0, 1)
+    ]
     boxes = np.stack([c.ravel() for c in corner], axis=1)  # numbered 4 i + 2 j + k
     low, high = points.min(axis=0), points.max(axis=0)
     inner = ((points > low) & (points < high)).all(axis=1)
@@ -58,10 +63,14 @@ def boundary(cells: NDArray, cell_type: str) -> NDArray:
     local = HEX_FACES if cell_type == "hex8" else TET_FACES
     if cell_type == "tet10":
         edge = {tuple(sorted(pair)): 4 + i for i, pair in enumerate(TET10_EDGES.tolist())}
-        local = np.array([[*f, *(edge[tuple(sorted((f[i], f[(i + 1) % 3])))] for i in range(3))] for f in local])
+        local = np.array(
+            [[*f, *(edge[tuple(sorted((f[i], f[(i + 1) % 3])))] for i in range(3))] for f in local]
+        )
     faces = cells[:, local].reshape(-1, local.shape[1])
     corners = 4 if cell_type == "hex8" else 3
-    _, first, count = np.unique(np.sort(faces[:, :corners], axis=1), axis=0, return_index=True, return_counts=True)
+    _, first, count = np.unique(
+        np.sort(faces[:, :corners], axis=1), axis=0, return_index=True, return_counts=True
+    )
     return faces[first[count == 1]]
 
 
@@ -82,9 +91,12 @@ def punch(
     z = np.concatenate([np.linspace(-30.0, -9.0, 3), np.array([-6.0, -3.0, 0.0])])
     mesh = block(cell_type, lines, lines, z, layer=3.0)
     history = History(np.array([0.0, depth / speed, 2 * depth / speed]), np.array([0.0, depth, 0.0]))
-    values = dict(
-        mesh=mesh, materials={"skin": SKIN, "muscle": MUSCLE}, fixed=mesh.node_sets["bottom"],
-        contact_faces=mesh.face_sets["top"], indenter=Indenter(axis=(0, 0, -1), centre=(0.0, 0.0, 1.0)),
-        history=history,
-    )  # fmt: skip
+    values = {
+        "mesh": mesh,
+        "materials": {"skin": SKIN, "muscle": MUSCLE},
+        "fixed": mesh.node_sets["bottom"],
+        "contact_faces": mesh.face_sets["top"],
+        "indenter": Indenter(axis=(0, 0, -1), centre=(0.0, 0.0, 1.0)),
+        "history": history,
+    }
     return Problem(**{**values, **changes})

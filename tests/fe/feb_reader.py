@@ -55,7 +55,9 @@ def read_feb(path: Path) -> Feb:
         s.get("name"): renumber(np.array([_numbers(f.text) for f in s])) for s in mesh.findall("Surface")
     }
     materials = {
-        m.get("name"): _material(m) for m in root.find("Material") if m.get("type") == "uncoupled viscoelastic"
+        m.get("name"): _material(m)
+        for m in root.find("Material")
+        if m.get("type") == "uncoupled viscoelastic"
     }
     curve = root.find("LoadData/load_controller/points")
     load = np.array([[float(v) for v in p.text.split(",")] for p in curve])

@@ -64,7 +64,9 @@ def test_residual_turns_with_the_body(name):
     u = 0.03 * np.random.default_rng(2).normal(size=X.shape)
     plain = system.evaluate(u, laws, increment)
     turned = system.evaluate((X + u) @ Q.T - X, laws, increment)
-    np.testing.assert_allclose(turned.residual, plain.residual @ Q.T, atol=1e-11 * np.abs(plain.residual).max())
+    np.testing.assert_allclose(
+        turned.residual, plain.residual @ Q.T, atol=1e-11 * np.abs(plain.residual).max()
+    )
     assert turned.energy == pytest.approx(plain.energy, rel=1e-11)
 
 
@@ -163,7 +165,9 @@ def _errors(name: str, n: int) -> tuple[float, float]:
     return np.sqrt((w * (misfit**2).sum(-1)).sum()), np.sqrt((w * (gradient**2).sum((-1, -2))).sum())
 
 
-@pytest.mark.parametrize(("name", "l2", "h1"), [("tet4", 2, 1), ("tet10", 3, 2), ("tet10g8", 3, 2), ("hex8", 2, 1)])
+@pytest.mark.parametrize(
+    ("name", "l2", "h1"), [("tet4", 2, 1), ("tet10", 3, 2), ("tet10g8", 3, 2), ("hex8", 2, 1)]
+)
 def test_solution_converges(name, l2, h1):
     coarse, fine = (np.array(_errors(name, n)) for n in (3, 6))
     rates = np.log2(coarse / fine)

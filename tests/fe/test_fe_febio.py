@@ -14,7 +14,9 @@ from limbfit.fe.system import Laws
 from limbfit.mesh import Mesh
 
 REFERENCE = Path(__file__).parents[2] / ".." / "shared" / "reference"
-pytestmark = pytest.mark.skipif(not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository")
+pytestmark = pytest.mark.skipif(
+    not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
+)
 
 
 def body(feb: Feb) -> tuple[Mesh, np.ndarray]:
@@ -42,7 +44,9 @@ def test_cube(tissue):
     top = Support(feb.node_sets["top"], 2, -1.0)
     history = History(*feb.load.T)
     none = np.zeros(0, dtype=int)
-    problem = Problem(mesh, materials(feb), none, np.zeros((0, 4), int), None, history, supports=(*sides, top))
+    problem = Problem(
+        mesh, materials(feb), none, np.zeros((0, 4), int), None, history, supports=(*sides, top)
+    )
     system, laws = System(problem), Laws.build([problem.materials["skin"]])
     control = StepControl(times=tuple(times[1:]), tolerance=1e-9)
     found = [element_fields(system, laws, step.state) for step in iterate(problem, control)]
@@ -78,7 +82,15 @@ def block(kind: str, **changes) -> tuple[Problem, np.ndarray, np.ndarray]:
     indenter = Indenter("square", 20.0, 2.0, (0.0, 0.0, start), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
     fixed, faces = number[feb.node_sets["bottom"]], number[feb.surfaces["skin"]]
     problem = Problem(
-        mesh, materials(feb), fixed, faces, indenter, History(*feb.load.T), supports=sides, start="as-given", **changes
+        mesh,
+        materials(feb),
+        fixed,
+        faces,
+        indenter,
+        History(*feb.load.T),
+        supports=sides,
+        start="as-given",
+        **changes,
     )
     return problem, times, np.abs(rows[:, 0])
 

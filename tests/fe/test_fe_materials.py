@@ -82,7 +82,7 @@ def test_volumetric_laws(law, J):
 @pytest.mark.parametrize("dt", [1e-6, 1e-3, 0.1, 10.0])
 def test_prony_factors_and_their_derivatives(dt):
     tau, h = 0.32, 1e-5
-    decay, ramp, d_decay, d_ramp = prony_factors(dt, tau)
+    _, ramp, d_decay, d_ramp = prony_factors(dt, tau)
     grid = np.linspace(0.0, dt, 20001)
     assert ramp == pytest.approx(np.trapezoid(np.exp(-(dt - grid) / tau), grid) / dt, rel=1e-6)
     ahead, back = prony_factors(dt, tau + h), prony_factors(dt, tau - h)
@@ -101,10 +101,15 @@ def test_hold_relaxes_like_the_prony_series():
     ramp = 1e-4
     history = History(np.array([0.0, ramp, 2.0]), np.array([0.0, 1.0, 1.0]))
     none = np.zeros(0, dtype=int)
-    problem = Problem(mesh, {"skin": law, "muscle": law}, none, np.zeros((0, 4), int), None, history, supports=(*sides, top))
+    problem = Problem(
+        mesh, {"skin": law, "muscle": law}, none, np.zeros((0, 4), int), None, history, supports=(*sides, top)
+    )
     times = (ramp, *np.linspace(0.1, 2.0, 15))
     system, laws = System(problem), Laws.build([law, law])
-    stress = [element_fields(system, laws, s.state).cauchy[0, 2] for s in iterate(problem, StepControl(times=times, tolerance=1e-10))]
+    stress = [
+        element_fields(system, laws, s.state).cauchy[0, 2]
+        for s in iterate(problem, StepControl(times=times, tolerance=1e-10))
+    ]
     stretch, c, m = 0.8, law.c, law.m
     elastic = 2 * c / m * (np.sinh(m * np.log(stretch)) + np.sinh(m * np.log(stretch) / 2))
     expected = elastic * (1 + law.gamma * np.exp(-np.array(times) / law.tau))

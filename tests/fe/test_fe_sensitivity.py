@@ -13,7 +13,9 @@ from limbfit.fe import StepControl, solve
 TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-9)
 
 
-@pytest.mark.parametrize(("cell_type", "element"), [("tet10", ""), ("tet4", ""), ("hex8", ""), ("tet10", "tet10p0")])
+@pytest.mark.parametrize(
+    ("cell_type", "element"), [("tet10", ""), ("tet4", ""), ("hex8", ""), ("tet10", "tet10p0")]
+)
 def test_sensitivities_equal_central_differences(cell_type, element):
     problem = punch(cell_type, 2, 1, element=element)
     centre = solve(problem, TIGHT, sensitivities=True, store="all")

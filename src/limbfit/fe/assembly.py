@@ -101,7 +101,9 @@ def scatter_upper(Ke, positions, data):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath={"contract"})
-def assemble(cells, grads, weights, mean, regions, tables, scale, history, u, tangent, positions, residual, data):  # type: ignore[no-untyped-def]
+def assemble(  # type: ignore[no-untyped-def]
+    cells, grads, weights, mean, regions, tables, scale, history, u, tangent, positions, residual, data
+):
     """Add every element to ``residual`` and, with ``tangent``, to ``data``; return the potential, N mm.
 
     Parameters
@@ -154,7 +156,11 @@ def assemble(cells, grads, weights, mean, regions, tables, scale, history, u, ta
             inverse_transpose(F, J, G)
             for a in range(k):
                 for i in range(3):
-                    g[i, a] = G[i, 0] * grads[el, q, 0, a] + G[i, 1] * grads[el, q, 1, a] + G[i, 2] * grads[el, q, 2, a]
+                    g[i, a] = (
+                        G[i, 0] * grads[el, q, 0, a]
+                        + G[i, 1] * grads[el, q, 1, a]
+                        + G[i, 2] * grads[el, q, 2, a]
+                    )
             for i in range(3):
                 root = np.sqrt(c2[i])
                 for p in range(3):

@@ -29,9 +29,7 @@ class ContactSurface:
     points: Array
 
     @classmethod
-    def build(
-        cls, element: Element, points: Array, faces: NDArray[np.int64], rule: str
-    ) -> ContactSurface:
+    def build(cls, element: Element, points: Array, faces: NDArray[np.int64], rule: str) -> ContactSurface:
         N, areas = face_quadrature(element, points, faces, rule)
         return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
 
@@ -58,7 +56,9 @@ def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: floa
 
 
 @njit(cache=True)
-def contact(faces, N, areas, X, u, centre, frame, kernel, penalty, tangent, positions, residual, data, advance):  # type: ignore[no-untyped-def]
+def contact(  # type: ignore[no-untyped-def]
+    faces, N, areas, X, u, centre, frame, kernel, penalty, tangent, positions, residual, data, advance
+):
     """Add the contact energy's gradient to ``residual`` and its hessian to ``data``.
 
     ``advance (n, 3)`` receives the mixed derivative with respect to displacement and indenter advance

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ class Factor:
         self._diagonal = system.indptr[:-1]
         self.ready = False
         self.counts: Counter[str] = Counter()
-        self.seconds: Counter[str] = Counter(factor=time.perf_counter() - started)
+        self.seconds: defaultdict[str, float] = defaultdict(float, factor=time.perf_counter() - started)
 
     @property
     def name(self) -> str:

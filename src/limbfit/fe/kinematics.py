@@ -111,9 +111,7 @@ def push_forward(F, S, scratch, out, factor):  # type: ignore[no-untyped-def]
         scratch[i, 2] = F[i, 0] * S[5] + F[i, 1] * S[4] + F[i, 2] * S[2]
     for s in range(6):
         p, q = s % 3, (s + (1 if s > 2 else 0)) % 3
-        out[s] += factor * (
-            scratch[p, 0] * F[q, 0] + scratch[p, 1] * F[q, 1] + scratch[p, 2] * F[q, 2]
-        )
+        out[s] += factor * (scratch[p, 0] * F[q, 0] + scratch[p, 1] * F[q, 1] + scratch[p, 2] * F[q, 2])
 
 
 @njit(cache=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,7 @@ class Equilibrium:
 
 def equilibrate(
     system: System, laws: Laws, increment: Increment, u: Array, factor: Factor, control: NewtonControl,
-    floor: float, seconds: Counter[str],
+    floor: float, seconds: defaultdict[str, float],
 ) -> Equilibrium:  # fmt: skip
     """Minimise the potential of ``increment`` from ``u (n, 3)``, whose supported components are in place.
 
@@ -78,7 +78,7 @@ def reaction_scale(system: System, at: Evaluation, floor: float) -> float:
 
 
 def _evaluate(
-    system: System, laws: Laws, increment: Increment, u: Array, seconds: Counter[str]
+    system: System, laws: Laws, increment: Increment, u: Array, seconds: defaultdict[str, float]
 ) -> Evaluation:
     started = time.perf_counter()
     at = system.evaluate(u, laws, increment)
@@ -102,7 +102,7 @@ def _direction(system: System, at: Evaluation, factor: Factor, forcing: float, s
 
 def _line_search(
     system: System, laws: Laws, increment: Increment, u: Array, here: Evaluation, direction: Array,
-    control: NewtonControl, seconds: Counter[str],
+    control: NewtonControl, seconds: defaultdict[str, float],
 ) -> tuple[Array, Evaluation] | None:  # fmt: skip
     """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005)."""
     slope = float((here.residual * direction).sum())

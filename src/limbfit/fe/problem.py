@@ -39,7 +39,7 @@ class History:
 
     def at(self, t: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement at time(s) ``t``, mm."""
-        return np.interp(t, self.times, self.displacement)
+        return np.asarray(np.interp(t, self.times, self.displacement))
 
     @property
     def knots(self) -> NDArray[np.float64]:

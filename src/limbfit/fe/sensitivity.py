@@ -82,7 +82,9 @@ def _step_coefficients(laws: Laws, dt: float) -> tuple[Array, ...]:
 
 
 @njit(cache=True)
-def explicit_forces(cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u, out):  # type: ignore[no-untyped-def]
+def explicit_forces(  # type: ignore[no-untyped-def]
+    cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u, out
+):
     """Internal forces of the stress ``dS/dp`` at fixed displacement, added to ``out (n, 3, p)``.
 
     ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``; the kernel of `MemoryDerivative.residual`.
@@ -200,7 +202,9 @@ def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, d
             for i in range(3):  # half of dC in the principal frame
                 for j in range(3):
                     for p in range(P):
-                        half[i, j, p] = FN[0, i] * dFN[0, j, p] + FN[1, i] * dFN[1, j, p] + FN[2, i] * dFN[2, j, p]
+                        half[i, j, p] = (
+                            FN[0, i] * dFN[0, j, p] + FN[1, i] * dFN[1, j, p] + FN[2, i] * dFN[2, j, p]
+                        )
             for i in range(3):
                 for j in range(3):
                     for p in range(P):
@@ -212,7 +216,9 @@ def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, d
                     dS[j, h, p] = shear[i] * dC[j, h, p]
                     dS[h, j, p] = dS[j, h, p]
                 for r in range(3):
-                    moduli = total - (slope[i] + slope[r]) / 3.0 + (slope[i] - 2.0 * beta[i] if i == r else 0.0)
+                    moduli = (
+                        total - (slope[i] + slope[r]) / 3.0 + (slope[i] - 2.0 * beta[i] if i == r else 0.0)
+                    )
                     moduli /= 2.0 * c2[r] * c2[i]
                     for p in range(P):
                         dS[i, i, p] += moduli * dC[r, r, p]

@@ -6,7 +6,7 @@ A step that does not converge is cut and tried again; what was reached is a resu
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -80,7 +80,7 @@ class Simulation:
         self.problem, self.control = problem, control
         self.system = _system(problem, warm_start)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-        self.seconds: Counter[str] = Counter()
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self.factor = Factor(self.system, control.linear_solver)
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
@@ -141,7 +141,14 @@ class Simulation:
         for u in (guess, self.states[-1].u):
             u = self.system.impose(u, increment.displacement)
             found = equilibrate(
-                self.system, self.laws, increment, u, self.factor, self.control.newton, self.floor, self.seconds
+                self.system,
+                self.laws,
+                increment,
+                u,
+                self.factor,
+                self.control.newton,
+                self.floor,
+                self.seconds,
             )
             if not found.reason:
                 break
@@ -221,7 +228,7 @@ def _warm_states(problem: Problem, warm_start: Result | None) -> dict[float, Sta
 
 def iterate(
     problem: Problem,
-    steps: StepControl = StepControl(),  # noqa: B008 - frozen
+    steps: StepControl = StepControl(),
     sensitivities: bool = False,
     warm_start: Result | None = None,
 ) -> Iterator[Step]:
@@ -237,7 +244,7 @@ def iterate(
 
 def solve(
     problem: Problem,
-    steps: StepControl = StepControl(),  # noqa: B008 - frozen
+    steps: StepControl = StepControl(),
     sensitivities: bool = False,
     warm_start: Result | None = None,
     on_step: Callable[[Step], None] | None = None,
@@ -274,7 +281,12 @@ def solve(
 
 
 def _result(
-    problem: Problem, run: Simulation, rows: list[Step], kept: list[State], sensitivities: bool, seconds: float
+    problem: Problem,
+    run: Simulation,
+    rows: list[Step],
+    kept: list[State],
+    sensitivities: bool,
+    seconds: float,
 ) -> Result:
     def column(name: str, rest: float = 0.0) -> Array:
         return np.array([rest, *(getattr(row, name) for row in rows)])
@@ -301,7 +313,7 @@ def _result(
 
 
 def _statistics(run: Simulation, seconds: float) -> dict[str, Any]:
-    parts = {name: float(value) for name, value in (run.seconds + run.factor.seconds).items()}
+    parts = {name: float(value) for name, value in (run.seconds | run.factor.seconds).items()}
     return {
         "steps": run.counts["steps"],
         "cuts": run.counts["cuts"],

@@ -119,7 +119,7 @@ class System:
         self.surface: ContactSurface | None = None
         self.indenter = problem.indenter
         if problem.indenter is not None:
-            faces = np.asarray(problem.contact_faces, dtype=np.int32)
+            faces = np.asarray(problem.contact_faces, dtype=np.int64)
             self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
             self.face_positions = _positions(faces, self.numbers, self.indptr, self.indices)
             if problem.start == "touching":
@@ -206,7 +206,8 @@ class System:
     def _contact(
         self, u: Array, increment: Increment, tangent: bool, pushed: Array, data: Array, advance: Array
     ) -> tuple[float, float, float, float]:
-        assert self.surface is not None and self.indenter is not None
+        assert self.surface is not None
+        assert self.indenter is not None
         surface, frame = self.surface, self.indenter.frame
         centre = np.asarray(self.indenter.centre) + increment.displacement * frame[2]
         return contact(

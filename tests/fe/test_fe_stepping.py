@@ -1,0 +1,81 @@
+"""Time stepping, interpolation, warm starts, results."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import punch
+
+from limbfit.fe import History, StepControl, iterate, solve
+from limbfit.fe.stepping import schedule
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return punch("tet10", 2, 1)
+
+
+@pytest.fixture(scope="module")
+def result(problem):
+    return solve(problem, sensitivities=True, store="all")
+
+
+def test_schedule_hits_knots_and_peak():
+    history = History(np.array([0.0, 3.0, 4.0, 9.0]), np.array([0.0, 2.0, 5.0, 0.0]))
+    times = schedule(history, StepControl())
+    assert {3.0, 4.0, 9.0} <= set(times)
+    assert (np.diff(times) > 0).all()
+    assert times[0] > 0
+
+
+def test_default_steps_give_the_force_within_half_a_percent(problem, result):
+    fine = solve(problem, StepControl(load_steps=60, unload_steps=48))
+    t = np.linspace(0.0, problem.history.times[-1], 400)
+    error = np.abs(result.force_at(t) - fine.force_at(t))
+    assert error.mean() < 0.003 * fine.peak_force
+    assert error.max() < 0.01 * fine.peak_force
+
+
+def test_interpolation_passes_through_the_steps_and_is_never_negative(result):
+    np.testing.assert_allclose(result.force_at(result.times), result.force, atol=1e-10)
+    assert (result.force_at(np.linspace(-1.0, 20.0, 500)) >= 0).all()
+
+
+def test_interpolated_sensitivity_is_the_derivative_of_the_interpolated_force(result):
+    t, step = np.linspace(0.0, 12.0, 97), np.random.default_rng(0).normal(size=8) * 1e-7
+    moved = replace(result, force=result.force + result.force_sensitivity @ step)
+    change = moved.force_at(t) - result.force_at(t)
+    np.testing.assert_allclose(change, result.sensitivity_at(t) @ step, atol=1e-9 * result.peak_force)
+
+
+def test_warm_start_gives_the_same_forces_with_fewer_iterations(problem, result):
+    skin = problem.materials["skin"]
+    changed = problem.with_materials({**problem.materials, "skin": replace(skin, c=1.1 * skin.c)})
+    cold, warm = solve(changed), solve(changed, warm_start=result)
+    np.testing.assert_allclose(warm.force, cold.force, atol=2e-5 * cold.peak_force)
+    assert warm.statistics["newton_iterations"] < cold.statistics["newton_iterations"]
+    assert warm.system is result.system
+
+
+def test_iterate_and_solve_agree_and_states_are_kept_as_asked(problem, result):
+    steps = list(iterate(problem))
+    np.testing.assert_allclose([s.force for s in steps], result.force[1:], rtol=1e-6, atol=1e-9)
+    assert len(result.states) == len(steps)
+    peak = solve(problem, store="peak")
+    assert [s.displacement for s in peak.states] == [pytest.approx(6.0)]
+    assert not solve(problem, store="none").states
+
+
+def test_results_travel_between_processes(result):
+    copy = pickle.loads(pickle.dumps(result))
+    np.testing.assert_array_equal(copy.force, result.force)
+    assert copy.system is None
+
+
+def test_linear_solvers_give_the_same_simulation(problem, result):
+    other = solve(problem, StepControl(linear_solver="superlu"))
+    np.testing.assert_allclose(other.force, result.force, atol=1e-4 * result.peak_force)
+    assert other.statistics["linear_solver"] == "superlu"
