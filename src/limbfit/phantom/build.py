@@ -23,6 +23,7 @@ import numpy as np
 
 from ..anatomy.surfaces import save_anatomy
 from ..errors import InputError
+from ..indentation import Parameters, to_vector
 from .forces import MESHES, ForceJob, TrueForce, site_force
 from .geometry import Limb, make_limb
 from .mri import DETAIL_GRIDS, make_grid, write_series
@@ -33,7 +34,6 @@ from .surfaces import true_anatomy
 
 Mapping = Callable[[Callable[[ForceJob], TrueForce], Iterable[ForceJob]], Iterable[TrueForce]]
 Listener = Callable[[str, float, float], None]
-Parameters = dict[str, dict[str, float]]
 
 PARAMETER_BASE: Parameters = {
     "skin": {"c_kPa": 7.5, "m": 6.0, "gamma": 2.5, "tau_s": 0.5},
@@ -151,7 +151,7 @@ def _write_traces(
     traces.mkdir()
     save_anatomy(truth, true_anatomy(limb))
     parameters = true_parameters(seed)
-    flat = tuple(value for values in parameters.values() for value in values.values())
+    flat = tuple(to_vector(parameters).tolist())
     jobs = [
         ForceJob(
             site.name, truth, _triple(site.position), _triple(site.axis), _ramp(site), flat, MESHES[detail]

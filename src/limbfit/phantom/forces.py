@@ -23,8 +23,8 @@ from .record import Ramp
 ELEMENT = "tet10p0"
 STEPS = StepControl(load_steps=14, unload_steps=10)
 MESHES = {
-    "coarse": MeshSettings(element="tet10", edge_near_mm=3.2, edge_far_mm=14.0, near_radius_mm=16.0),
-    "paper": MeshSettings(element="tet10", edge_near_mm=2.5, edge_far_mm=12.0, near_radius_mm=18.0),
+    "coarse": MeshSettings(edge_near_mm=3.8, edge_far_mm=24.0, near_radius_mm=13.0, growth=0.6),
+    "paper": MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
 }
 
 

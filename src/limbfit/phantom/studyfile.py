@@ -25,9 +25,22 @@ skin_layer_mm = 3.0       # skin and adipose tissue, uniform
 shape = "square"
 width_mm = {width:.1f}
 
+{mesh}
 # One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
 # The fitted sites identify the material; all others are predicted and compared.
 """
+
+# A coarse phantom is there to be identified in minutes: the far field, which hardly strains, is meshed wide.
+_MESH = {
+    "coarse": """
+[mesh]
+edge_near_mm = 4.5
+edge_far_mm = 30.0
+near_radius_mm = 12.0
+growth = 0.7
+""",
+    "paper": "",
+}
 
 _SITE = """
 [[sites]]
@@ -41,7 +54,7 @@ near = [{x:.1f}, {y:.1f}, {z:.1f}]
 
 def study_text(sites: Sequence[TrueSite], detail: str, seed: int) -> str:
     """The content of ``study.toml`` for some sites."""
-    parts = [_HEAD.format(seed=seed, detail=detail, width=INDENTER_MM)]
+    parts = [_HEAD.format(seed=seed, detail=detail, width=INDENTER_MM, mesh=_MESH[detail])]
     for site in sites:
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
