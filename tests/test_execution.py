@@ -126,6 +126,13 @@ def test_a_worker_that_dies_while_idle_is_replaced(pool):
     assert next(pool.map(pid, [0], keys=["x"])) != victim
 
 
+def test_an_interrupt_at_the_terminal_is_left_to_the_parent(pool):
+    worker = next(pool.map(pid, [0], keys=["y"]))
+    os.kill(worker, signal.SIGINT)
+    time.sleep(0.2)
+    assert next(pool.map(pid, [0], keys=["y"])) == worker
+
+
 def test_a_job_that_kills_every_worker_is_named(pool):
     with pytest.raises(RunError, match="die of 'site-4'"):
         list(pool.map(die, [0], keys=["site-4"]))

@@ -145,21 +145,18 @@ def test_wrong_shapes_are_the_callers_fault():
         )
 
 
-@pytest.mark.parametrize("failing", [0.0, 0.1])
-def test_a_run_taken_up_again_from_any_state_gives_the_same_answer(failing):
+def test_a_run_taken_up_again_from_any_state_gives_the_same_answer():
+    """From a corner of the bounds, where the trust region has work to do."""
+    far = Unknowns(PAPER.names, np.tile([0.06, 18.0, 9.0, 0.02], 2), PAPER.lower, PAPER.upper)
     states: list[str] = []
-    data = records(0.03)
     whole = calibrate(
-        Counted(failing), data, PAPER, on_iterate=lambda s: states.append(json.dumps(s.to_dict()))
+        simulate, records(0.03), far, on_iterate=lambda state: states.append(json.dumps(state.to_dict()))
     )
-    assert len(states) > 8
+    assert whole.converged, whole.reason
+    assert len(states) > 12
     for text in states:
-        state = State.from_dict(json.loads(text))
-        again = calibrate(simulate, data, PAPER, state=state)
-        if failing:
-            assert again.parameters == pytest.approx(whole.parameters, rel=5e-3)
-        else:
-            assert again.to_dict() == whole.to_dict()
+        again = calibrate(simulate, records(0.03), far, state=State.from_dict(json.loads(text)))
+        assert again.to_dict() == whole.to_dict()
 
 
 def test_the_result_is_json():
