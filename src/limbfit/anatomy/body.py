@@ -7,7 +7,6 @@ import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 from scipy.ndimage import (
     binary_closing,
-    binary_dilation,
     binary_erosion,
     binary_fill_holes,
     binary_opening,
@@ -17,6 +16,7 @@ from scipy.ndimage import (
 from scipy.ndimage import label as connected
 
 from ..errors import ImageError
+from .ends import longest_axis
 from .grid import Volume
 
 Mask = NDArray[np.bool_]
@@ -50,6 +50,14 @@ def check_contrast(volume: Volume) -> None:
         )
 
 
+def limb_axis(volume: Volume) -> int:
+    """The grid axis (0, 1, 2 for i, j, k) along which the limb is longest."""
+    tissue = _largest(volume.array > _otsu(volume.array))
+    if tissue.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
+        raise ImageError("no limb is to be seen in the image", remedy="check the series and its contrast")
+    return longest_axis(tissue, volume)
+
+
 def limb_mask(volume: Volume, smooth: Field) -> Mask:
     """Everything inside the skin.
 
@@ -57,9 +65,7 @@ def limb_mask(volume: Volume, smooth: Field) -> Mask:
     outline is then put where the signal falls to half of the tissue beside it, so that bright fat does not
     push it outward by partial volume.
     """
-    filter_ = sitk.OtsuThresholdImageFilter()
-    filter_.Execute(sitk.GetImageFromArray(smooth))
-    tissue = float(np.median(smooth[smooth > filter_.GetThreshold()]))
+    tissue = float(np.median(smooth[smooth > _otsu(smooth)]))
     rough = _largest(smooth > _TISSUE * tissue)
     rough = _solid(rough, volume)
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
@@ -68,6 +74,13 @@ def limb_mask(volume: Volume, smooth: Field) -> Mask:
     half = 0.5 * grey_dilation(smooth, size=tuple(size))
     core = binary_erosion(rough, ball(_RIM_MM, volume.spacing), border_value=1)
     return _largest(_solid(core | (rough & (smooth > np.maximum(half, _TISSUE * tissue))), volume))
+
+
+def _otsu(array: Field) -> float:
+    """Otsu's threshold between air and tissue."""
+    found = sitk.OtsuThresholdImageFilter()
+    found.Execute(sitk.GetImageFromArray(np.ascontiguousarray(array)))
+    return float(found.GetThreshold())
 
 
 def _solid(mask: Mask, volume: Volume) -> Mask:
@@ -125,7 +138,3 @@ def muscle_level(smooth: Field, limb: Mask) -> float:
     start = 8
     best = start + int(np.argmax(counts[start:]))
     return float(edges[best] + edges[best + 1]) / 2
-
-
-def grown(mask: Mask, radius_mm: float, spacing: NDArray[np.float64]) -> Mask:
-    return binary_dilation(mask, ball(radius_mm, spacing))

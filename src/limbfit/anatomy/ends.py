@@ -36,18 +36,22 @@ class ProximalEnd:
         return view[::-1] if self.side < 0 else view
 
 
-def proximal_end(limb: Mask, grid: Grid) -> ProximalEnd:
+def longest_axis(limb: Mask, grid: Grid) -> int:
+    """The grid axis (0, 1, 2 for i, j, k) along which a mask is longest."""
+    extents = [_extent(limb, axis) for axis in range(3)]
+    return int(np.argmax([(b - a + 1) * grid.spacing[axis] for axis, (a, b) in enumerate(extents)]))
+
+
+def proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd:
     """Where the limb was cut: at the border of the image that it reaches, else at its thicker end.
 
-    The limb's axis is the grid axis along which it is longest. Of two ends at the border, as of an intact
-    leg, the superior one is proximal.
+    The limb's axis is the grid axis along which it is longest, if it is not given. Of two ends at the
+    border, as of an intact leg, the superior one is proximal.
     """
     if not limb.any():
         raise LabelError("the label map is empty", remedy="give one with the limb labelled")
-    extents = [_extent(limb, axis) for axis in range(3)]
-    lengths = [(high - low + 1) * grid.spacing[axis] for axis, (low, high) in enumerate(extents)]
-    axis = int(np.argmax(lengths))
-    low, high = extents[axis]
+    axis = longest_axis(limb, grid) if axis is None else axis
+    low, high = _extent(limb, axis)
     ends = [ProximalEnd(axis, -1, low), ProximalEnd(axis, 1, high)]
     border = [end for end in ends if end.layer in (0, grid.size[axis] - 1)]
     if len(border) == 1:

@@ -10,9 +10,9 @@ affine   the 4 x 4 matrix that takes an index to a point: ``direction @ diag(spa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
@@ -98,6 +98,16 @@ class Grid:
         steps = (self.direction * self.spacing).T @ np.asarray(normal)
         start = float((self.origin - np.asarray(point)) @ np.asarray(normal))
         return start + k[:, None, None] * steps[2] + j[:, None] * steps[1] + i * steps[0]
+
+    def turned(self, order: Sequence[int]) -> Self:
+        """The same samples with other index axes: ``order[n]`` is the present axis that becomes axis n."""
+        axes = tuple(2 - order[2 - n] for n in range(3))
+        return replace(
+            self,
+            array=np.transpose(self.array, axes),
+            spacing=self.spacing[list(order)],
+            direction=self.direction[:, list(order)],
+        )
 
     def same_grid(self, other: Grid) -> bool:
         """Whether both sample the same points: every corner voxel within 0.01 mm."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ImageError
-from .body import bias_field, check_contrast, limb_mask, muscle_level, smoothed
+from .body import bias_field, check_contrast, limb_axis, limb_mask, muscle_level, smoothed
 from .bones import find_bones, name_bones
 from .ends import ProximalEnd, proximal_end
 from .grid import BONES, DEFAULT_NAMES, LabelMap, Volume
@@ -39,12 +39,20 @@ def segment(volume: Volume, bias_correction: bool = True, min_bone_volume_mm3: f
         Where no limb or no bone is found, or the contrast is not MRI's.
     """
     check_contrast(volume)
+    axis = limb_axis(volume)
+    across = [n for n in range(3) if n != axis]
+    turned = _segment(volume.turned([*across, axis]), bias_correction, min_bone_volume_mm3)
+    return turned.turned([[*across, axis].index(n) for n in range(3)])
+
+
+def _segment(volume: Volume, bias_correction: bool, min_bone_volume_mm3: float) -> LabelMap:
+    """The same for a volume whose slices lie across the limb."""
     smooth = smoothed(volume)
     limb = limb_mask(volume, smooth)
     if bias_correction:
         smooth = smooth / bias_field(volume, limb)
     levels = (smooth / muscle_level(smooth, limb)).astype(np.float32)
-    end = proximal_end(limb, volume)
+    end = proximal_end(limb, volume, axis=2)
     bones, names = _bones(levels, limb, end, volume, min_bone_volume_mm3)
     if not bones:
         raise ImageError(
@@ -60,14 +68,13 @@ def _bones(
     """Full-size masks and names of the bones; the work is done in the limb's box, along its axis."""
     box = _box(limb)
     along_levels, along_limb = end.along(levels[box]), end.along(limb[box])
-    spacing = np.append(np.delete(volume.spacing, end.axis), volume.spacing[end.axis])
-    found = find_bones(along_levels, along_limb, spacing, smallest_mm3)
+    found = find_bones(along_levels, along_limb, volume.spacing, smallest_mm3)
     masks = []
     for bone in found:
         mask = np.zeros(limb.shape, dtype=bool)
         end.along(mask[box])[...] = bone
         masks.append(mask)
-    return masks, name_bones(found, spacing)
+    return masks, name_bones(found, volume.spacing)
 
 
 def _box(limb: Mask) -> tuple[slice, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -147,7 +148,9 @@ def read_surface(path: str | Path, coordinates: Literal["LPS", "RAS"] = "LPS") -
 
 def _read_triangles(path: Path) -> Surface:
     try:
-        poly = pv.read(str(path))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the error below says it
+            poly = pv.read(str(path))
     except Exception:  # VTK readers raise many kinds; all mean the same to the user
         raise SurfaceError("the surface cannot be read", file=path) from None
     if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:

@@ -1,0 +1,321 @@
+"""Surfaces: measures, files, what may not pass, and from labels to a closed limb."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+import pyvista as pv
+from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
+
+from limbfit.anatomy.imaging import LabelMap, read_volume
+from limbfit.anatomy.surfaces import (
+    Anatomy,
+    Surface,
+    build_anatomy,
+    check_anatomy,
+    check_closed,
+    extract_surface,
+    load_anatomy,
+    read_surface,
+    save_anatomy,
+    self_intersections,
+    write_surface,
+)
+from limbfit.errors import LabelError, SurfaceError
+
+PEERS = [".stl", ".ply", ".vtp", ".obj"]
+
+
+def ball(radius: float = 50.0, centre=(10.0, -20.0, 30.0)) -> Surface:
+    """A closed sphere, outward."""
+    sphere = pv.Icosphere(radius=radius, center=centre, nsub=3)
+    surface = Surface(np.asarray(sphere.points), sphere.regular_faces)
+    return surface if surface.volume > 0 else surface.flipped
+
+
+def test_measures_of_a_box():
+    box = pv.Box((0, 100, 0, 50, 0, 20)).triangulate()
+    surface = Surface(np.asarray(box.points), box.regular_faces)
+    surface = surface if surface.volume > 0 else surface.flipped
+    assert surface.volume == pytest.approx(100 * 50 * 20)
+    assert surface.area == pytest.approx(2 * (5000 + 2000 + 1000))
+    away = surface.points + np.array([1e4, -1e4, 1e4])
+    assert Surface(away, surface.faces).volume == pytest.approx(surface.volume, rel=1e-9)
+
+
+def test_vertex_normals_point_outward():
+    surface = ball(centre=(0, 0, 0))
+    assert np.einsum("ij,ij->i", surface.vertex_normals, surface.points / 50).min() > 0.999
+
+
+@pytest.mark.parametrize("suffix", PEERS)
+@pytest.mark.parametrize("coordinates", ["LPS", "RAS"])
+def test_round_trip_through_files(tmp_path, suffix, coordinates):
+    surface = ball()
+    write_surface(tmp_path / f"ball{suffix}", surface)
+    back = read_surface(tmp_path / f"ball{suffix}", coordinates)
+    sign = [1, 1, 1] if coordinates == "LPS" else [-1, -1, 1]
+    assert len(back.points) == len(surface.points)
+    assert back.volume == pytest.approx(surface.volume, rel=1e-5)
+    nearest = np.linalg.norm(back.points[:, None] - (surface.points * sign)[None], axis=2).min(axis=1)
+    assert nearest.max() < 0.001
+    check_closed(back, "skin")
+
+
+def centroid(surface: Surface) -> np.ndarray:
+    """Centre of the enclosed volume."""
+    corner = surface.points.mean(axis=0)
+    triangles = surface.triangles - corner
+    volumes = np.linalg.det(triangles) / 6
+    return corner + (volumes @ triangles.sum(axis=1)) / 4 / volumes.sum()
+
+
+def opened(surface):
+    return dataclasses.replace(surface, faces=surface.faces[5:])
+
+
+def with_inner_wall(surface):
+    fan = [[surface.faces[0][0], surface.faces[0][1], len(surface.points)]]
+    for a, b in ((1, 2), (2, 0)):
+        fan.append([surface.faces[0][a], surface.faces[0][b], len(surface.points)])
+    points = np.vstack([surface.points, surface.points.mean(axis=0)])
+    return Surface(points, np.vstack([surface.faces, fan, [[f[1], f[0], f[2]] for f in fan]]))
+
+
+def half_flipped(surface):
+    faces = surface.faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    return dataclasses.replace(surface, faces=faces)
+
+
+def doubled(surface):
+    shifted = surface.points + np.array([200.0, 0, 0])
+    faces = np.vstack([surface.faces, surface.faces + len(surface.points)])
+    return Surface(np.vstack([surface.points, shifted]), faces)
+
+
+def dented_through(surface):
+    points = surface.points.copy()
+    points[np.argmax(points[:, 2])] -= [3.0, 5.0, 120.0]
+    return dataclasses.replace(surface, points=points)
+
+
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        (opened, "open, .* edges have a face on one side only.*close its holes"),
+        (lambda s: s.flipped, "inverted.*flip the normals"),
+        (with_inner_wall, "more than two faces"),
+        (half_flipped, "oriented against"),
+        (doubled, "2 separate bodies"),
+        (dented_through, "crosses itself"),
+        (lambda s: Surface(s.points / 1000, s.faces), "metres.*millimetres"),
+        (lambda s: Surface(s.points * 1000, s.faces), "millimetres"),
+    ],
+)
+def test_damaged_surfaces_are_refused_with_a_remedy(damage, expected):
+    check_closed(ball(), "skin")
+    with pytest.raises(SurfaceError, match=expected) as caught:
+        check_closed(damage(ball()), "skin", "skin.stl")
+    assert str(caught.value).startswith("skin.stl")
+
+
+def test_files_that_hold_no_surface_are_refused(tmp_path):
+    (tmp_path / "words.stl").write_text("not a surface")
+    (tmp_path / "words.xyz").write_text("not a surface")
+    for name in ("words.stl", "words.xyz", "none.stl"):
+        with pytest.raises(SurfaceError, match=name):
+            read_surface(tmp_path / name)
+    points = ball()
+    nan = points.points.copy()
+    nan[3] = np.nan
+    write_surface(tmp_path / "nan.vtp", Surface(nan, points.faces))
+    with pytest.raises(SurfaceError, match="not numbers"):
+        read_surface(tmp_path / "nan.vtp")
+
+
+def test_self_intersections_agree_with_testing_every_pair():
+    random = np.random.default_rng(3)
+    points = random.uniform(0, 10, size=(60, 3))
+    surface = Surface(points, np.arange(60).reshape(-1, 3))
+    fast = {tuple(sorted(pair)) for pair in self_intersections(surface)}
+    slow = set()
+    for i in range(20):
+        for j in range(i + 1, 20):
+            one = pv.PolyData.from_regular_faces(points[3 * i : 3 * i + 3], [[0, 1, 2]])
+            other = pv.PolyData.from_regular_faces(points[3 * j : 3 * j + 3], [[0, 1, 2]])
+            if one.collision(other)[1] > 0:
+                slow.add((i, j))
+    assert fast == slow
+    assert len(slow) > 5
+
+
+def sphere_labels(radius: float, spacing: list[float], seed: int) -> tuple[LabelMap, np.ndarray]:
+    shape = tuple((np.ceil(2 * radius / np.array(spacing)) + 8).astype(int)[::-1])
+    labels = grid(shape, spacing, rotation(seed))
+    centre = labels.index_to_point((np.array(labels.size) - 1) / 2 + [0.2, -0.3, 0.4])
+    i, j, k = np.meshgrid(*[np.arange(n) for n in labels.size], indexing="ij")
+    points = labels.index_to_point(np.stack([i, j, k], -1).transpose(2, 1, 0, 3))
+    return labels.with_array((np.linalg.norm(points - centre, axis=-1) < radius) * 2), centre
+
+
+@pytest.mark.parametrize("spacing", [[1.2, 1.15, 1.0], [2.3, 2.3, 2.0], [0.5, 0.5, 3.0]])
+@pytest.mark.parametrize("radius", [20.0, 40.0])
+def test_sphere_from_labels(spacing, radius):
+    labels, centre = sphere_labels(radius, spacing, seed=8)
+    surface = extract_surface(labels, "tibia", 3.0)
+    check_closed(surface, "tibia")
+    error = np.linalg.norm(surface.points - centre, axis=1) - radius
+    assert surface.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)
+    assert np.sqrt(np.mean(error**2)) < 0.15 * max(spacing)
+    assert np.abs(centroid(surface) - centre).max() < 0.02 * max(spacing)
+
+
+def test_edges_have_the_length_that_was_asked_for():
+    labels, _ = sphere_labels(30.0, [1.5, 1.5, 1.5], seed=2)
+    for edge in (2.0, 4.0):
+        triangles = extract_surface(labels, "tibia", edge).triangles
+        lengths = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
+        assert lengths.mean() == pytest.approx(edge, rel=0.1)
+
+
+def test_only_the_largest_body_is_kept():
+    labels, _ = sphere_labels(20.0, [2, 2, 2], seed=2)
+    array = labels.array.copy()
+    array[:2, :2, :2] = 2
+    assert extract_surface(labels.with_array(array), "tibia").volume == pytest.approx(33510, rel=0.02)
+
+
+def test_nothing_to_extract_is_said():
+    labels, _ = sphere_labels(20.0, [2, 2, 2], seed=2)
+    with pytest.raises(LabelError, match="'fibula'"):
+        extract_surface(labels, "fibula")
+    with pytest.raises(LabelError, match=r"no label is named 'hoof'.*tibia"):
+        extract_surface(labels, "hoof")
+
+
+@pytest.fixture(scope="module")
+def leg() -> LabelMap:
+    return leg_image([2.0, 2.0, 2.5], (62, 60, 60), DIRECTIONS["oblique"])[1]
+
+
+@pytest.fixture(scope="module")
+def anatomy(leg) -> Anatomy:
+    return build_anatomy(leg, 4.0)
+
+
+def test_anatomy_is_closed_flat_at_the_cut_and_open_to_the_bones(leg, anatomy):
+    check_anatomy(anatomy)
+    height = anatomy.height(anatomy.skin.points)
+    cap = np.abs(height) < 1e-3
+    assert height.max() < 1e-3
+    # The cap is the whole section of the leg, 2 mm inside the image's last slice, with a sharp rim.
+    face_in_cap = cap[anatomy.skin.faces].all(axis=1)
+    radius = 46 + 0.05 * (61 / 2 * 2.5 + 1.25 - 2)
+    assert anatomy.skin.face_areas[face_in_cap].sum() == pytest.approx(np.pi * radius**2, rel=0.02)
+    assert np.allclose(anatomy.cut_normal, leg.direction[:, 2])
+    end = leg.index_to_point([0, 0, 61.5])
+    assert (end - anatomy.cut_point) @ anatomy.cut_normal == pytest.approx(2.0)
+    assert set(anatomy.bones) == {"tibia", "fibula"}
+    for bone in anatomy.bones.values():
+        assert 3 < anatomy.height(bone.points).max() < 9
+
+
+def test_anatomy_has_the_legs_shape(leg, anatomy):
+    centre = leg.index_to_point((np.array(leg.size) - 1) / 2)
+    for name, surface in [("skin", anatomy.skin), *anatomy.bones.items()]:
+        below = surface.points[anatomy.height(surface.points) < -3]
+        p = (below - centre) @ leg.direction
+        depth = Leg().limb(p) if name == "skin" else Leg().bone(name, p)
+        side = p[:, 2] > -35  # bones end flat, with edges that smoothing rounds
+        assert np.sqrt(np.mean(depth[side] ** 2)) < 0.25 * 2.0, name  # a quarter of a voxel
+
+
+def test_a_given_cut_is_kept(leg):
+    point, normal = leg.index_to_point([30, 30, 40]), leg.direction @ np.array([0.1, -0.1, 1.0])
+    cut = build_anatomy(leg, 5.0, (point, 3 * normal))
+    assert np.allclose(cut.cut_normal, normal / np.linalg.norm(normal))
+    assert cut.height(cut.skin.points).max() == pytest.approx(0, abs=1e-3)
+    assert all(cut.height(bone.points).max() > 2 for bone in cut.bones.values())
+    check_anatomy(cut)
+    with pytest.raises(SurfaceError, match="misses the limb"):
+        build_anatomy(leg, 5.0, (point + 500 * normal, normal))
+
+
+def test_the_proximal_end_is_found_along_every_axis_and_sense(leg):
+    flipped = LabelMap(
+        leg.array[::-1].transpose(1, 0, 2),
+        leg.spacing[[0, 2, 1]],
+        leg.index_to_point([0, 0, 61]),
+        np.column_stack([leg.direction[:, 0], -leg.direction[:, 2], leg.direction[:, 1]]),
+    )
+    again = build_anatomy(flipped, 6.0)
+    assert np.allclose(again.cut_normal, leg.direction[:, 2])
+    assert (leg.index_to_point([0, 0, 61.5]) - again.cut_point) @ again.cut_normal == pytest.approx(2.0)
+
+
+def test_a_limb_cut_off_by_the_images_side_is_refused(leg):
+    with pytest.raises(LabelError, match="side of the image"):
+        build_anatomy(LabelMap(leg.array[:, :, 20:], leg.spacing, leg.origin, leg.direction), 5.0)
+
+
+def test_a_bone_outside_the_skin_is_refused(anatomy):
+    out = dict(anatomy.bones)
+    far = 40 * np.cross(anatomy.cut_normal, [1.0, 0, 0])
+    out["tibia"] = Surface(out["tibia"].points + far, out["tibia"].faces)
+    with pytest.raises(SurfaceError, match=r"tibia lies outside the skin.*RAS"):
+        check_anatomy(dataclasses.replace(anatomy, bones=out))
+    out["tibia"] = Surface(anatomy.bones["tibia"].points + 400 * anatomy.cut_normal, out["tibia"].faces)
+    with pytest.raises(SurfaceError, match="beyond the proximal cut"):
+        check_anatomy(dataclasses.replace(anatomy, bones=out))
+
+
+def test_saved_anatomy_comes_back(tmp_path, anatomy):
+    save_anatomy(tmp_path, anatomy)
+    back = load_anatomy(tmp_path)
+    check_anatomy(back)
+    assert list(back.bones) == list(anatomy.bones)
+    assert np.allclose(back.cut_point, anatomy.cut_point)
+    assert np.allclose(back.cut_normal, anatomy.cut_normal)
+    assert back.skin.volume == pytest.approx(anatomy.skin.volume, rel=1e-5)
+    (tmp_path / "surfaces.json").write_text("{}")
+    with pytest.raises(SurfaceError, match=r"surfaces\.json"):
+        load_anatomy(tmp_path)
+    shutil.rmtree(tmp_path)
+    with pytest.raises(SurfaceError):
+        load_anatomy(tmp_path)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS.keys())
+def test_a_physical_point_survives_from_dicom_to_stl(tmp_path, direction):
+    """A slab of tissue whose faces lie at known places, through DICOM, labels, surface and STL."""
+    image, _ = leg_image([2.0, 2.0, 2.5], (24, 30, 32), direction)
+    array = np.zeros(image.array.shape)
+    array[4:20, 5:25, 6:26] = 800
+    write_dicom(tmp_path / "dicom", image.with_array(array))
+    back = read_volume(tmp_path / "dicom")
+    labels = LabelMap(back.array > 400, back.spacing, back.origin, back.direction)
+    write_surface(tmp_path / "slab.stl", extract_surface(labels, None, 2.5))
+    surface = read_surface(tmp_path / "slab.stl")
+    # The middles of the slab's faces, half a voxel outside its outermost voxels, in the image as it was made.
+    middle = np.array([15.5, 14.5, 11.5])
+    for axis, ends in enumerate(((5.5, 25.5), (4.5, 24.5), (3.5, 19.5))):
+        for end in ends:
+            index = middle.copy()
+            index[axis] = end
+            expected = image.index_to_point(index)
+            along = image.direction[:, axis] * np.sign(end - middle[axis])
+            near = surface.points[np.linalg.norm(surface.points - expected, axis=1) < 6]
+            assert ((near - expected) @ along).mean() == pytest.approx(0, abs=0.15)
+    assert centroid(surface) == pytest.approx(image.index_to_point(middle), abs=0.01)
+
+
+def test_stl_keeps_coordinates_to_a_hundredth_of_a_millimetre(tmp_path):
+    far = Surface(ball(40).points + np.array([812.3, -955.7, -1420.9]), ball(40).faces)
+    write_surface(tmp_path / "far.stl", far)
+    back = read_surface(tmp_path / "far.stl")
+    order, other = (np.lexsort(np.round(s.points, 2).T) for s in (far, back))
+    assert np.abs(far.points[order] - back.points[other]).max() < 0.01
