@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fe import History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
+from .fe.observables import ElementFields, element_fields
+from .fe.system import Laws
 from .mesh import Mesh, read_vtu, write_vtu
 from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable
 
@@ -182,7 +184,7 @@ def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
     """
     mesh = _mesh(model)
     result = solve(build_problem(model, mesh, parameters), steps=_steps(model), store="peak")
-    fields = result.fields()
+    fields = _element_fields(result)
     cell_data = {
         "J": fields.J,
         "von_mises_kPa": von_mises(fields.cauchy) / KPA,
@@ -192,6 +194,13 @@ def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
     }
     write_vtu(mesh, file, point_data={"displacement_mm": result.states[0].u}, cell_data=cell_data)
     return result
+
+
+def _element_fields(result: Result) -> ElementFields:
+    """Fields of the one state that was stored."""
+    problem = result.problem
+    laws = Laws.build([problem.materials[region] for region in problem.mesh.region_names])
+    return element_fields(result.system, laws, result.states[0])
 
 
 def von_mises(cauchy: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..execution import make_executor
-from ..phantom import make_phantom
+from ..phantom.build import make_phantom
 from ..study import load_study
 from .context import Listener, Progress
 from .run import run_study

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..anatomy import sites as anatomy_sites
 from ..anatomy.amputation import amputate
-from ..anatomy.imaging import LabelMap, read_labels, read_volume, write_labels
+from ..anatomy.body import limb_mask, smoothed
+from ..anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_labels
 from ..anatomy.markers import find_markers, match_markers
-from ..anatomy.meshing import MeshSettings, mesh_site
-from ..anatomy.segmentation import body_mask, segment
+from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.segmentation import segment
+from ..anatomy.sites import indenter_axis, project_to_skin
 from ..anatomy.surfaces import (
     Anatomy,
-    Surface,
     build_anatomy,
     check_anatomy,
-    extract_skin,
+    check_closed,
+    extract_surface,
     load_anatomy,
-    read_closed_surface,
     read_surface,
     save_anatomy,
     write_surface,
@@ -53,9 +54,15 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     if study.image.markers is not None:
         context.tell("segment", 2, 3, "outlining the image with markers")
         marked = read_volume(study.path(study.image.markers), study.image.markers_series)
-        write_labels(folder / "markers.seg.nrrd", body_mask(marked))
+        write_labels(folder / "markers.seg.nrrd", outline(marked))
     write_json(folder / "segment.json", {"method": method, "volumes_cm3": label_volumes(labels)})
     return {}
+
+
+def outline(volume: Volume) -> LabelMap:
+    """The limb of an image as one label, markers included."""
+    limb = limb_mask(volume, smoothed(volume))
+    return LabelMap(limb.astype(np.uint8), volume.spacing, volume.origin, volume.direction, {1: "limb"})
 
 
 def label_volumes(labels: LabelMap) -> dict[str, float]:
@@ -78,7 +85,7 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
         if study.image is not None and study.image.markers is not None:
             context.tell("surfaces", 1, 2, "skin with markers")
             marked = read_labels(context.store["segment"] / "markers.seg.nrrd")
-            write_surface(folder / "skin-markers.stl", extract_skin(marked))
+            write_surface(folder / "skin-markers.stl", extract_surface(marked, None))
     check_anatomy(anatomy)
     save_anatomy(folder, anatomy)
     return {}
@@ -88,9 +95,8 @@ def _imaged_anatomy(context: Context) -> Anatomy:
     geometry = context.study.geometry
     labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
     if geometry.amputation is not None:
-        labels = amputate(
-            labels, geometry.amputation.point, geometry.amputation.normal, pad_mm=geometry.amputation_pad_mm
-        )
+        plane = geometry.amputation
+        labels = amputate(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
     cut = geometry.proximal_cut
     return build_anatomy(
         labels,
@@ -103,17 +109,17 @@ def given_anatomy(study: Study) -> Anatomy:
     """The anatomy from closed surfaces; without a stated cut the most proximal (highest z) face of the skin."""
     assert study.surfaces is not None
     tables = study.surfaces
-    skin = read_closed_surface(study.path(tables.skin), "skin", tables.coordinates)
-    bones = {
-        name: read_closed_surface(study.path(path), name, tables.coordinates)
-        for name, path in tables.bones.items()
-    }
+    files = {"skin": tables.skin, **tables.bones}
+    surfaces = {name: read_surface(study.path(path), tables.coordinates) for name, path in files.items()}
+    for name, surface in surfaces.items():
+        check_closed(surface, name, study.path(files[name]))
+    skin = surfaces.pop("skin")
     cut = study.geometry.proximal_cut
     if cut is not None:
         point, normal = np.array(cut.point), np.array(cut.normal)
     else:
         point, normal = np.array([0.0, 0.0, skin.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
-    return Anatomy(skin=skin, bones=bones, cut_point=point, cut_normal=normal / np.linalg.norm(normal))
+    return Anatomy(skin=skin, bones=surfaces, cut_point=point, cut_normal=normal / np.linalg.norm(normal))
 
 
 def run_sites(context: Context, folder: Path) -> dict[str, Any]:
@@ -131,7 +137,7 @@ def _matched_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
     hints = {site.name: np.array(site.near) for site in context.study.sites if site.near is not None}
     if not hints:
         return {}
-    marked: Surface = read_surface(context.store["surfaces"] / "skin-markers.stl")
+    marked = read_surface(context.store["surfaces"] / "skin-markers.stl")
     return dict(match_markers(find_markers(marked, anatomy.skin), hints))
 
 
@@ -145,8 +151,8 @@ def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[
     """
     wanted = np.array(site.position) if marker is None else marker.position
     try:
-        point, off = anatomy_sites.project_to_skin(anatomy, wanted)
-        axis = site.axis or anatomy_sites.indenter_axis(anatomy.skin, point, study.indenter.width_mm)
+        point, off = project_to_skin(anatomy, wanted)
+        axis = site.axis or indenter_axis(anatomy.skin, point, study.indenter.width_mm)
     except SiteError as error:
         raise SiteError(
             error.what, file=study.file, place=f"sites.{site.name}", remedy=error.remedy
@@ -174,6 +180,7 @@ class MeshJob:
 
     site: str
     surfaces: Path
+    surfaces_key: str
     position: tuple[float, ...]
     axis: tuple[float, ...]
     settings: MeshSettings
@@ -182,12 +189,19 @@ class MeshJob:
 
 def make_mesh(job: MeshJob) -> dict[str, Any]:
     """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
-    anatomy = load_anatomy(job.surfaces)
-    mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings)
+    anatomy, base = _base(job.surfaces, job.surfaces_key, job.settings)
+    mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
     write_vtu(mesh, job.file)
-    facts = report.as_dict()
+    facts = {**asdict(report), "element": job.settings.element}
     write_json(job.file.with_suffix(".json"), facts)
     return facts
+
+
+@lru_cache(maxsize=1)
+def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+    """What all sites of a study share; a worker makes it once."""
+    anatomy = load_anatomy(surfaces)
+    return anatomy, base_mesh(anatomy, settings)
 
 
 def mesh_settings(study: Study) -> MeshSettings:
@@ -208,10 +222,12 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     """One graded mesh per site, side by side; meshes of an interrupted run are kept."""
     settings = mesh_settings(context.study)
     sites = context.stored("sites", "sites.json")["sites"]
+    stamp = context.store.stamp("surfaces") or {}
     jobs = [
         MeshJob(
             site=site["site"],
             surfaces=context.store["surfaces"],
+            surfaces_key=str(stamp["key"]),
             position=tuple(site["position_mm"]),
             axis=tuple(site["axis"]),
             settings=settings,
