@@ -16,12 +16,12 @@ from limbfit.phantom.sites import markers_of, true_sites
 
 
 def outline(limb, grid, markers, seed) -> Surface:
-    """The limb's outline in an image: a contour through half the fat signal, closed where the image ends."""
+    """The limb's outline in an image: a contour below the muscle signal, closed where the image ends."""
     image = np.concatenate([signal for _, signal in slabs(limb, grid, markers, seed)])
     padded = np.pad(gaussian_filter(image, 0.4), 1)
     data = pv.ImageData(dimensions=padded.shape[::-1])
     data.point_data["signal"] = padded.ravel()
-    surface = bodies(from_pyvista(data.contour([0.45], scalars="signal", method="flying_edges")))[0]
+    surface = bodies(from_pyvista(data.contour([0.3], scalars="signal", method="flying_edges")))[0]
     index = (surface.points - 1) * np.array(grid.spacing)
     surface = Surface(grid.origin + index @ grid.direction.T, surface.faces)
     return surface if surface.volume > 0 else surface.flipped

@@ -113,9 +113,9 @@ class Limb:
         gradient = gradient_of(self.skin, points)
         return -gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
 
-    def tissue_thickness(self, point: Array, axis: Array, limit: float = 60.0) -> float:
+    def tissue_thickness(self, point: Array, axis: Array, limit: float = 40.0) -> float:
         """Soft tissue between a skin point and the first bone along ``axis``; ``limit`` where none is met."""
-        along = np.arange(0.0, limit, 0.05)
+        along = np.arange(0.0, limit, 0.1)
         inside = self.bones(point + along[:, None] * axis) < 0
         return float(along[inside.argmax()]) if inside.any() else limit
 

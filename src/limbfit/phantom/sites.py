@@ -121,12 +121,12 @@ def _true_site(limb: Limb, place: Place, random: np.random.Generator) -> TrueSit
 
 
 def _footprint(limb: Limb, position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Skin points (49, 3) under a square indenter at a position, found along its normal."""
+    """Skin points (25, 3) under a square indenter at a position, found along its normal."""
     normal = -limb.inward(position[None])[0]
     proximal = limb.proximal_normal - normal * (limb.proximal_normal @ normal)
     proximal /= np.linalg.norm(proximal)
     across = np.cross(normal, proximal)
-    ticks = np.linspace(-INDENTER_MM / 2, INDENTER_MM / 2, 7)
+    ticks = np.linspace(-INDENTER_MM / 2, INDENTER_MM / 2, 5)
     u, v = np.meshgrid(ticks, ticks)
     points = position + u.reshape(-1, 1) * across + v.reshape(-1, 1) * proximal
     for _ in range(8):  # Newton along the normal; the field is close to a distance

@@ -1,0 +1,132 @@
+"""The phantom's folder: a study that loads, records that read, a truth that agrees, nothing half made.
+
+The quick tests put a closed-form force in the place of the simulation, through the ``mapping`` that the
+function takes anyway; the slow one simulates.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbfit.anatomy.surfaces import load_anatomy
+from limbfit.errors import InputError, SiteError
+from limbfit.phantom import make_limb, make_phantom, true_parameters
+from limbfit.phantom.forces import TrueForce
+from limbfit.phantom.sites import DETAIL_SITES, FITTED
+from limbfit.study import PARAMETERS, TISSUES, load_study
+
+
+def cubic_law(_, jobs):
+    """Force 0.02 d^3 newton on the way in, a little less on the way out."""
+    for job in jobs:
+        times = np.linspace(0, 2 * job.ramp.peak_s, 101)
+        depth = np.interp(times, *job.ramp.knots)
+        lag = np.where(times > job.ramp.peak_s, 0.8, 1.0)
+        yield TrueForce(job.site, times, lag * 0.02 * depth**3, {"element": "none"})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("phantom") / "study"
+    steps = []
+    truth = make_phantom(folder, seed=2, mapping=cubic_law, progress=lambda *step: steps.append(step))
+    assert {text for text, _, _ in steps} == {"image", "forces"}
+    assert all(0 <= done <= total for _, done, total in steps)
+    return folder, truth
+
+
+def test_the_study_loads_and_names_what_is_there(made) -> None:
+    folder, truth = made
+    study = load_study(folder)
+    assert [site.name for site in study.sites] == sorted(DETAIL_SITES["coarse"])
+    assert [site.name for site in study.fitted] == list(FITTED)
+    for site, true in zip(study.sites, truth["sites"], strict=True):
+        assert site.region == true["region"]
+        assert 2.9 < np.linalg.norm(np.array(site.near) - true["position_mm"]) < 5.1
+        assert site.position is None
+        assert site.axis is None
+
+
+def test_truth_is_stored_and_complete(made) -> None:
+    folder, truth = made
+    assert json.loads((folder / "truth.json").read_text()) == truth
+    assert list(truth["parameters"]) == list(TISSUES)
+    assert all(list(values) == list(PARAMETERS) for values in truth["parameters"].values())
+    assert len(truth["markers"]) == 18
+    anatomy = load_anatomy(folder / "truth")
+    limb = make_limb(2)
+    np.testing.assert_allclose(anatomy.cut_point, limb.to_patient(np.array([0, 0, 250.0])), atol=1e-6)
+
+
+def test_records_hold_the_force_that_was_simulated(made) -> None:
+    folder, truth = made
+    for site in truth["sites"]:
+        table = np.loadtxt(folder / "traces" / f"site-{site['name']}.csv", delimiter=",", skiprows=1)
+        depth = np.interp(
+            table[:, 0],
+            site["touch_down_s"] + np.array([0, site["depth_mm"], 2 * site["depth_mm"]]) / site["speed_mm_s"],
+            [0, site["depth_mm"], 0],
+        )
+        loading = table[:, 0] < site["touch_down_s"] + site["depth_mm"] / site["speed_mm_s"]
+        residual = table[loading, 2] - 0.02 * depth[loading] ** 3
+        assert residual.std() < 0.06
+        assert abs(residual.mean()) < 0.01
+        assert site["peak_force_N"] == pytest.approx(0.02 * site["depth_mm"] ** 3, rel=1e-3)
+
+
+def test_one_patient_two_series(made) -> None:
+    folder, _ = made
+    plain, marked = (sorted((folder / "mri" / name).glob("*.dcm")) for name in ("plain", "markers"))
+    assert len(plain) == len(marked) > 100
+
+
+def test_another_seed_is_another_patient() -> None:
+    assert true_parameters(1) == true_parameters(1)
+    assert true_parameters(1) != true_parameters(2)
+    for seed in range(5):
+        parameters = true_parameters(seed)
+        assert 6.3 < parameters["skin"]["c_kPa"] < 8.7
+        assert 3.8 < parameters["muscle"]["c_kPa"] < 5.2
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path) -> None:
+    def breaks(function, jobs):
+        yield from cubic_law(function, list(jobs)[:1])
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        make_phantom(tmp_path / "study", mapping=breaks, sites=["01", "15"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("keywords", "error", "message"),
+    [
+        ({"detail": "fine"}, InputError, "unknown detail 'fine'"),
+        ({"sites": ["99"]}, SiteError, "no site '99'"),
+    ],
+)
+def test_impossible_wishes_are_refused(tmp_path, keywords, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_phantom(tmp_path / "study", mapping=cubic_law, **keywords)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_holds_something_is_not_touched(tmp_path) -> None:
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(InputError, match="there is something already"):
+        make_phantom(tmp_path, mapping=cubic_law)
+    assert (tmp_path / "mine.txt").read_text() == "keep"
+
+
+@pytest.mark.slow
+def test_simulated_forces_are_those_of_soft_tissue(tmp_path) -> None:
+    truth = make_phantom(tmp_path / "study", sites=["05", "15"])
+    tibia, posterior = truth["sites"]
+    assert tibia["peak_force_N"] > 1.0
+    assert posterior["peak_force_N"] > 1.0
+    stiffness = [site["peak_force_N"] / site["depth_mm"] for site in (tibia, posterior)]
+    assert stiffness[0] > 1.5 * stiffness[1]  # thin tissue over bone is stiffer
+    assert all(site["simulation"]["element"] == "tet10p0" for site in truth["sites"])
