@@ -9,7 +9,7 @@ Each vertex carries a bit mask of the surfaces it must stay on: ``PLANE`` and on
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,26 @@ PLANE, LAYER, BONE, FAR = 1, 2, 4, 8
 TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 # Kuhn's subdivision of a cube into six tetrahedra; corner bits are (x, y, z), all share the diagonal 0-7.
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+CELL_FACTORS = (8.0, 4.0, 2.0)  # of the spacing: cells that are settled by one value
+CELL_RANGE, CELL_OFFSET = 1 << 20, 1 << 19  # three cell indices in one integer
 SNAP_FRACTION = 0.15
-ROOT_STEPS = 4
+ROOT_STEPS = 2  # the mesher's nodes are put on the surfaces again
 SMALLEST_VOLUME = 1e-3  # of a grid tetrahedron: a snap that leaves less is undone
 
 
 @dataclass(frozen=True)
 class TetGrid:
-    """Points (n, 3), tetrahedra (m, 4) of positive volume and the surface mask (n,) of the points."""
+    """Points (n, 3), tetrahedra (m, 4) of positive volume, surface mask (n,) of the points, spacing in mm."""
 
     points: Array
     tets: Ints
     mask: Ints
+    spacing: float
 
     def kept(self, keep: NDArray[np.bool_]) -> TetGrid:
         """The grid of the chosen tetrahedra with its unused points dropped."""
         used, tets = np.unique(self.tets[keep], return_inverse=True)
-        return TetGrid(self.points[used], tets.reshape(-1, 4), self.mask[used])
+        return TetGrid(self.points[used], tets.reshape(-1, 4), self.mask[used], self.spacing)
 
 
 def box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
@@ -52,7 +55,7 @@ def box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
                for z in (0, 1) for y in (0, 1) for x in (0, 1)]  # fmt: skip
     tets = np.stack(corners, axis=1)[:, KUHN].reshape(-1, 4)
     mask = np.where(points[:, 2] == axes[2][-1], PLANE, 0)
-    return TetGrid(points, tets, mask)
+    return TetGrid(points, tets, mask, spacing)
 
 
 def volumes(points: Array, tets: Ints) -> Array:
@@ -74,7 +77,7 @@ def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool
     -------
     The cut grid and, per tetrahedron, whether it lies where the field is positive.
     """
-    values = field(grid.points)[0]
+    values = banded(field, grid.points, 0.0, grid.spacing)
     edges = _crossed_edges(grid.tets, values)
     t = _roots(grid.points, edges, values, field)
     grid, snapped = _snapped(grid, edges, t, bit)
@@ -88,7 +91,26 @@ def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool
         [np.where(values == 0, grid.mask | bit, grid.mask), (grid.mask[a] & grid.mask[b]) | bit]
     )
     values = np.concatenate([values, np.zeros(len(fresh))])
-    return TetGrid(np.vstack([grid.points, fresh]), tets, mask), values[tets].sum(axis=1) > 0
+    return TetGrid(np.vstack([grid.points, fresh]), tets, mask, grid.spacing), values[tets].sum(axis=1) > 0
+
+
+def banded(field: Field, points: Array, band: float, spacing: float) -> Array:
+    """Values (n,) of a distance-like field: exact up to ``band``, elsewhere of the right sign and beyond it.
+
+    A field that changes by at most 1 per mm cannot come back into the band within a cell whose centre is
+    farther from it than half the cell's diagonal; such cells of points are settled by one value.
+    """
+    values = np.zeros(len(points))
+    open_ = np.arange(len(points))  # indices that are not settled yet
+    for cell in [spacing * factor for factor in CELL_FACTORS]:
+        index = np.floor(points[open_] / cell).astype(np.int64)
+        keys = (index + CELL_OFFSET) @ [CELL_RANGE**2, CELL_RANGE, 1]
+        _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+        centres = np.asarray((index[first] + 0.5) * cell, dtype=np.float64)
+        values[open_] = field(centres)[0][inverse]
+        open_ = open_[np.abs(values[open_]) <= band + np.sqrt(0.75) * cell]
+    values[open_] = field(points[open_])[0]
+    return values
 
 
 def _crossed_edges(tets: Ints, values: Array) -> Ints:
@@ -133,7 +155,7 @@ def _snapped(grid: TetGrid, edges: Ints, t: Array, bit: int) -> tuple[TetGrid, N
     moved = np.zeros(len(grid.points), dtype=bool)
     moved[near[chosen]] = True
     moved = _without_inversion(grid, target, moved)
-    return TetGrid(np.where(moved[:, None], target, grid.points), grid.tets, grid.mask), moved
+    return replace(grid, points=np.where(moved[:, None], target, grid.points)), moved
 
 
 def _without_inversion(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:

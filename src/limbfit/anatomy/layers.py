@@ -112,9 +112,10 @@ class LimbFields:
         """Signed distance (n,) to the nearest bone as segmented, and its gradient."""
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         for bone in self.bones.values():
-            distance, slope = signed_distance(bone, points)
-            nearer = distance < value
-            value, gradient = np.where(nearer, distance, value), np.where(nearer[:, None], slope, gradient)
+            candidates = np.flatnonzero(_box_distance(bone, points) < value)
+            distance, slope = signed_distance(bone, points[candidates])
+            nearer = distance < value[candidates]
+            value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
 
     def trimmed(self) -> dict[str, TrimmedBone]:
@@ -200,6 +201,14 @@ def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1]
+
+
+def _box_distance(surface: Surface, points: Array) -> Array:
+    """Distance (n,) to the surface's bounding box, a lower bound of that to the surface; -inf inside."""
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    outside = np.maximum(np.maximum(low - points, points - high), 0.0)
+    distance = np.linalg.norm(outside, axis=1)
+    return np.where(distance > 0, distance, -np.inf)
 
 
 def _longest_edge(surface: Surface) -> float:

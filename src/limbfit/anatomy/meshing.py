@@ -83,10 +83,14 @@ class MeshSettings:
 
 @dataclass(frozen=True)
 class BaseMesh:
-    """The muscle of an anatomy as an ungraded grid, in the limb frame; shared by all its sites."""
+    """The muscle of an anatomy as an ungraded grid, in the limb frame; shared by all its sites.
+
+    ``size_limit`` (n,) is the edge length that layer and bones allow at the grid's points, mm.
+    """
 
     fields: LimbFields
     grid: TetGrid
+    size_limit: Array
     trimmed: Mapping[str, TrimmedBone]
     enclosed_mm3: float
 
@@ -95,8 +99,8 @@ class BaseMesh:
 class MeshReport:
     """What a mesh is like: counts, angles (degrees), volumes (mm3), lengths (mm), time (s).
 
-    ``volume_error`` is relative to the volume that the surfaces enclose. The layer's thickness is measured
-    from points all over the meshed interface to the meshed skin.
+    ``volume_error`` is relative to the volume that the surfaces enclose (None with ``local_radius_mm``). The
+    layer's thickness is measured from points all over the meshed interface to the meshed skin.
     """
 
     nodes: int
@@ -107,7 +111,7 @@ class MeshReport:
     min_scaled_jacobian: float
     volume_mm3: float
     region_volumes_mm3: Mapping[str, float]
-    volume_error: float
+    volume_error: float | None
     layer_mean_mm: float
     layer_std_mm: float
     trimmed_bone: Mapping[str, TrimmedBone]
@@ -137,7 +141,8 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings) -> BaseMesh:
     if not len(grid.tets):
         raise MeshingError("no muscle is left under the skin layer; choose a smaller skin_layer_mm")
     trimmed = fields.trimmed()
-    return BaseMesh(fields, grid, trimmed, enclosed_volume(anatomy, fields, trimmed))
+    limit = size_limit(fields, grid, settings)
+    return BaseMesh(fields, grid, limit, trimmed, enclosed_volume(anatomy, fields, trimmed))
 
 
 def mesh_site(
@@ -173,8 +178,11 @@ def mesh_site(
     base = base or base_mesh(anatomy, settings)
     fields, frame = base.fields, base.fields.frame
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
-    grid = base.grid if settings.local_radius_mm is None else _near(base.grid, site, settings.local_radius_mm)
-    task = _task(grid, site_size(fields, grid.points, site, inward, settings), settings)
+    grid, limit = base.grid, base.size_limit
+    if settings.local_radius_mm is not None:
+        grid = _near(grid, site, settings.local_radius_mm)
+        limit = size_limit(fields, grid, settings)
+    task = _task(grid, site_size(grid.points, limit, site, inward, settings), settings)
     muscle = _on_surfaces(ENGINES[settings.engine](task, settings.time_limit_s), fields)
     mesh, under = _with_skin_layer(muscle, fields)
     if settings.element == "tet10":
@@ -186,20 +194,25 @@ def mesh_site(
     return mesh.with_points(frame.to_patient(mesh.points)), report
 
 
-def site_size(fields: LimbFields, points: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:
-    """Wanted edge length (n,) at points (n, 3); everything in the limb frame."""
+def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:
+    """Wanted edge length (n,) at points (n, 3), at most ``limit`` (n,); everything in the limb frame."""
     offset = points - site
     axial = offset @ axis
     lateral = np.linalg.norm(offset - axial[:, None] * axis, axis=1)
     distance = np.hypot(lateral, DEPTH_RATIO * axial)
     beyond = np.maximum(distance - settings.near_radius_mm, 0.0)
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
-    depth, _ = fields.depth(points)
-    muscle_depth = np.maximum(depth - settings.skin_layer_mm, 0.0)
-    size = np.minimum(size, LAYER_RATIO * settings.skin_layer_mm + muscle_depth)
-    sheet = np.abs(fields.void(points)[0]) + muscle_depth
-    thinnest = np.minimum(settings.edge_near_mm, settings.bone_clearance_mm)
-    return np.minimum(size, np.maximum(SHEET_RATIO * sheet, thinnest))
+    return np.minimum(size, limit)
+
+
+def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
+    """Edge length (n,) at which layer and sheets of muscle over bone stay as thick as elements need."""
+    far = settings.edge_far_mm
+    under_layer = np.maximum(background.banded(fields.layer, grid.points, far, grid.spacing), 0.0)
+    sheet = np.abs(background.banded(fields.void, grid.points, far, grid.spacing)) + under_layer
+    thinnest = min(settings.edge_near_mm, settings.bone_clearance_mm)
+    over_bone = np.maximum(SHEET_RATIO * sheet, thinnest)
+    return np.minimum(LAYER_RATIO * settings.skin_layer_mm + under_layer, over_bone)
 
 
 def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
@@ -226,7 +239,11 @@ def _near(grid: TetGrid, site: Array, radius: float) -> TetGrid:
 
 
 def _on_surfaces(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
-    """Boundary nodes put on cut plane, layer and bone, as far as the elements allow."""
+    """Boundary nodes put on cut plane, layer and bone, and poor elements improved, as far as they allow."""
+    return _snapped(_smoothed(_snapped(muscle, fields), fields), fields)
+
+
+def _snapped(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
     in_plane = _nodes_on(muscle, PLANE)
     target = muscle.points.copy()
     target[in_plane, 2] = 0.0
@@ -236,23 +253,21 @@ def _on_surfaces(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
         target[nodes] = projected(level, target[nodes], free[nodes])
     points = guarded(muscle.points, target, muscle.tets, GOOD_DIHEDRAL_DEG)
     points[in_plane, 2] = 0.0
-    return _smoothed(replace(muscle, points=points), fields)
+    return replace(muscle, points=points)
 
 
 def _smoothed(muscle: VolumeMesh, fields: LimbFields) -> VolumeMesh:
-    """Poor elements improved: inner nodes move freely, those of one surface on it, those of two not."""
-    on = {surface: _nodes_on(muscle, surface) for surface in SURFACES}
-    levels = {LAYER: fields.layer, BONE: fields.void}
+    """Inner nodes of poor elements move freely, those on one surface along it, those on two not at all.
 
-    def allowed(node: int, places: Array) -> Array:
-        surfaces = [surface for surface, nodes in on.items() if nodes[node]]
-        if not surfaces:
-            return places
-        if len(surfaces) == 1 and surfaces[0] in levels:
-            return projected(levels[surfaces[0]], places, np.ones(len(places)))
-        return places[:0]
-
-    points = improved(muscle.points, muscle.tets, SMOOTHED_BELOW_DEG, allowed)
+    Where the limb was cut off about the site, the boundary has no shape to keep.
+    """
+    normals = np.zeros_like(muscle.points)
+    on = {surface: _nodes_on(muscle, surface) for surface in (PLANE, LAYER, BONE)}
+    normals[on[PLANE], 2] = 1.0
+    for surface, level in ((LAYER, fields.layer), (BONE, fields.void)):
+        normals[on[surface]] = level(muscle.points[on[surface]])[1]
+    movable = np.sum(list(on.values()), axis=0) < 2
+    points = improved(muscle.points, muscle.tets, SMOOTHED_BELOW_DEG, normals, movable)
     return replace(muscle, points=points)
 
 
@@ -350,7 +365,8 @@ def _interface_faces(mesh: Mesh) -> Ints:
 def _report(mesh: Mesh, base: BaseMesh, settings: MeshSettings, seconds: float) -> MeshReport:
     found = quality(mesh)
     mean, std = _layer_thickness(mesh)
-    true = base.enclosed_mm3
+    whole = settings.local_radius_mm is None
+    volume_error = found.volume_mm3 / base.enclosed_mm3 - 1.0 if whole else None
     shape = {name: int((mesh.regions == i).sum()) for i, name in enumerate(mesh.region_names)}
     return MeshReport(
         nodes=len(mesh.points),
@@ -361,13 +377,13 @@ def _report(mesh: Mesh, base: BaseMesh, settings: MeshSettings, seconds: float) 
         min_scaled_jacobian=found.min_scaled_jacobian,
         volume_mm3=found.volume_mm3,
         region_volumes_mm3=found.region_volumes_mm3,
-        volume_error=found.volume_mm3 / true - 1.0,
+        volume_error=volume_error,
         layer_mean_mm=mean,
         layer_std_mm=std,
         trimmed_bone=base.trimmed,
         seconds=seconds,
         engine=settings.engine,
-        warnings=_warnings(found.min_dihedral_deg, found.volume_mm3 / true - 1.0),
+        warnings=_warnings(found.min_dihedral_deg, volume_error or 0.0),
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,43 +17,41 @@ DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1,
 DIRECTIONS = DIRECTIONS[np.any(DIRECTIONS != 0, axis=1)]
 
 
-def improved(points: Array, tets: Ints, goal_deg: float, allowed: Callable[[int, Array], Array]) -> Array:
+def improved(points: Array, tets: Ints, goal_deg: float, normals: Array, movable: NDArray[np.bool_]) -> Array:
     """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
 
     Parameters
     ----------
     points, tets : the mesh.
     goal_deg : tetrahedra below it are worked on.
-    allowed : (node, candidates (k, 3)) to the candidates as the node may take them, on its surfaces.
+    normals : (n, 3) unit normals of the surface that a node moves on; zero where it moves freely.
+    movable : (n,) nodes that may move.
     """
     points = points.copy()
     order = np.argsort(tets, axis=None, kind="stable")
     starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
     worst = _worst_angle(points[tets])
     for _ in range(SWEEPS):
-        poor = tets[worst < goal_deg]
         before = points.copy()
-        for node in np.unique(poor):
+        nodes = np.unique(tets[worst < goal_deg])
+        for node in nodes[movable[nodes]]:
             star = order[starts[node] : starts[node + 1]] // 4
-            points[node] = _best_place(points, tets[star], node, allowed)
+            points[node] = _best_place(points, tets[star], node, normals[node])
             worst[star] = _worst_angle(points[tets[star]])
         if np.array_equal(before, points):
             break
     return points
 
 
-def _best_place(points: Array, star: Ints, node: int, allowed: Callable[[int, Array], Array]) -> Array:
+def _best_place(points: Array, star: Ints, node: int, normal: Array) -> Array:
     """Where the smallest angle of the star about a node is greatest, among a pattern of places."""
-    here = points[node]
-    corners = points[star]
-    mine = star == node
-    spokes = np.linalg.norm(corners - here, axis=2)
-    reach = spokes[~mine].min()
-    pattern = here + np.concatenate([step * reach * DIRECTIONS for step in STEPS])
-    places = np.vstack([here, allowed(node, pattern)])
+    here, corners, mine = points[node], points[star], star == node
+    reach = np.linalg.norm(corners - here, axis=2)[~mine].min()
+    moves = np.concatenate([np.zeros((1, 3)), *(step * reach * DIRECTIONS for step in STEPS)])
+    places = here + moves - (moves @ normal)[:, None] * normal
     trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
     angle = _worst_angle(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
-    return places[int(np.argmax(angle))]
+    return np.asarray(places[int(np.argmax(angle))])
 
 
 def _worst_angle(corners: Array) -> Array:
