@@ -61,7 +61,7 @@ def test_warm_start_gives_the_same_forces_with_fewer_iterations(problem, result)
 
 
 def test_iterate_and_solve_agree_and_states_are_kept_as_asked(problem, result):
-    steps = list(iterate(problem))
+    steps = list(iterate(problem, sensitivities=True))
     np.testing.assert_allclose([s.force for s in steps], result.force[1:], rtol=1e-6, atol=1e-9)
     assert len(result.states) == len(steps)
     peak = solve(problem, store="peak")

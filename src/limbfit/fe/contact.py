@@ -21,7 +21,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ContactSurface:
-    """Faces (f, k) that may touch: shape values (q, k), reference areas (f, q), rest points (n, 3)."""
+    """Faces (f, k) that may touch: shape values (q, k), reference areas (f, q), rest points (n, 3).
+
+    With the nodal rule a "face" is one node (k = q = 1) that stands for its share of the area.
+    """
 
     faces: NDArray[np.int64]
     N: Array
@@ -31,13 +34,48 @@ class ContactSurface:
     @classmethod
     def build(cls, element: Element, points: Array, faces: NDArray[np.int64], rule: str) -> ContactSurface:
         N, areas = face_quadrature(element, points, faces, rule)
+        if rule == "nodes":
+            nodes, owner = np.unique(faces[:, N.argmax(axis=1)], return_inverse=True)
+            faces, N = nodes[:, None], np.ones((1, 1))
+            areas = np.bincount(owner.ravel(), areas.ravel())[:, None]
         return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
+
+    @property
+    def nodal(self) -> bool:
+        """Whether every contact point is a node."""
+        return self.N.size == 1
 
     def gaps(self, indenter: Indenter, u: Array | None = None) -> Array:
         """Signed distances (f, q) at the quadrature points, mm."""
         x = self.points if u is None else self.points + u
         at = np.einsum("qk,fki->fqi", self.N, x[self.faces])
         return indenter.signed_distance(at.reshape(-1, 3)).reshape(self.areas.shape)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Contact points (c,) as springs: gap (mm, infinite where far), unit normal (c, 3), stiffness
+    ``weights (c,)`` along it (N/mm), and the tangent ``blocks (c, 3, 3)`` where the gap is closed."""
+
+    gaps: Array
+    normals: Array
+    weights: Array
+    blocks: Array
+
+    @property
+    def closed(self) -> NDArray[np.bool_]:
+        return self.gaps < 0.0
+
+    def under(self, closed: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Blocks (c, 3, 3) and the change of the contact forces (c, 3) were ``closed`` the points in touch.
+
+        A point that closes pulls until it touches; one that opens is let go.
+        """
+        change = closed.astype(float) - self.closed
+        stiff = self.weights[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
+        gaps = np.where(change != 0.0, self.gaps, 0.0)
+        blocks = np.where((change > 0)[:, None, None], stiff, self.blocks) * closed[:, None, None]
+        return blocks, (change * self.weights * gaps)[:, None] * self.normals
 
 
 def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: float = 1e-9) -> float:
@@ -57,12 +95,29 @@ def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: floa
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, X, u, centre, frame, kernel, penalty, tangent, positions, residual, data, advance
+    faces,
+    N,
+    areas,
+    X,
+    u,
+    centre,
+    frame,
+    kernel,
+    penalty,
+    tangent,
+    positions,
+    residual,
+    data,
+    advance,
+    gaps,
+    normals,
+    blocks,
 ):
     """Add the contact energy's gradient to ``residual`` and its hessian to ``data``.
 
     ``advance (n, 3)`` receives the mixed derivative with respect to displacement and indenter advance
-    (times -1 it is the derivative of the residual).  Returns energy, reaction along the axis (N), largest
+    (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals (f, q, 3)`` and ``blocks
+    (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point.  Returns energy, reaction along the axis (N), largest
     penetration (mm), reference area in touch (mm^2).
     """
     shape, half, radius = kernel
@@ -82,9 +137,14 @@ def contact(  # type: ignore[no-untyped-def]
                     x[i] += N[q, a] * (X[faces[f, a], i] + u[faces[f, a], i])
             for i in range(3):
                 local[i] = frame[i, 0] * x[0] + frame[i, 1] * x[1] + frame[i, 2] * x[2]
-            if local[2] > 0.0 or abs(local[0]) > reach or abs(local[1]) > reach:
+            gaps[f, q] = np.inf
+            if local[2] > half or abs(local[0]) > reach or abs(local[1]) > reach:
                 continue
             phi = signed_distance(shape, half, radius, local, gl, hl)
+            for i in range(3):
+                g[i] = frame[0, i] * gl[0] + frame[1, i] * gl[1] + frame[2, i] * gl[2]
+                normals[f, q, i] = g[i]
+            gaps[f, q] = phi
             if phi >= 0.0:
                 continue
             touched = True
@@ -93,8 +153,6 @@ def contact(  # type: ignore[no-untyped-def]
             force -= w * phi * gl[2]
             deepest = max(deepest, -phi)
             area += areas[f, q]
-            for i in range(3):
-                g[i] = frame[0, i] * gl[0] + frame[1, i] * gl[1] + frame[2, i] * gl[2]
             for a in range(k):
                 for i in range(3):
                     residual[faces[f, a], i] += w * phi * N[q, a] * g[i]
@@ -107,6 +165,7 @@ def contact(  # type: ignore[no-untyped-def]
                         for r in range(3):
                             value += frame[p, i] * hl[p, r] * frame[r, j]
                     h[i, j] = w * (g[i] * g[j] + phi * value)
+                    blocks[f, q, i, j] = h[i, j]
             for a in range(k):
                 for i in range(3):
                     along = h[i, 0] * frame[2, 0] + h[i, 1] * frame[2, 1] + h[i, 2] * frame[2, 2]

@@ -13,6 +13,7 @@ from .factor import Factor
 from .system import Evaluation, Increment, Laws, System
 
 Array = NDArray[np.float64]
+ACTIVE_SET_SWEEPS = 6
 
 
 @dataclass(frozen=True)
@@ -87,16 +88,29 @@ def _evaluate(
 
 
 def _direction(system: System, at: Evaluation, factor: Factor, forcing: float, stale: int) -> Array:
-    """Newton direction (n, 3): by the old factor where that is quick, else by a new one."""
-    b = -at.residual.ravel()[system.free]
-    x: Array | None = None
-    if factor.ready and stale:
-        x = factor.conjugate_gradients(at.data, b[:, None], forcing, stale)
-    if x is None:
-        factor.factorise(at.data)
-        x = factor.apply(b)
+    """Newton direction (n, 3) with the contact points that it closes and opens foreseen.
+
+    The set of closed points is iterated on the linear model (a primal-dual active set, Hintermueller, Ito and
+    Kunisch 2003), which costs a few products; each missed point would cost an assembly of all elements.
+    """
+    b = -at.residual.ravel()[system.free][:, None]
+    x, touch = np.zeros_like(b), at.touch
+    if touch is None:
+        x = factor.solve(at.data, b, None, forcing, stale, x)
+    else:
+        closed = touch.closed
+        for _ in range(ACTIVE_SET_SWEEPS):
+            blocks, change = touch.under(closed)
+            data = system.with_springs(at.data, blocks - touch.blocks)
+            right = b - system.at_springs(change)[:, None]
+            x = factor.solve(data, right, blocks, forcing, stale, x)
+            moved = np.einsum("ci,ci->c", touch.normals, system.springs_of(x[:, 0]))
+            foreseen = touch.gaps + moved < 0.0
+            if (foreseen == closed).all():
+                break
+            closed = foreseen
     direction = np.zeros(at.residual.size)
-    direction[system.free] = x.ravel()
+    direction[system.free] = x[:, 0]
     return direction.reshape(at.residual.shape)
 
 

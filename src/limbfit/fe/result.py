@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -88,7 +89,7 @@ class Result:
         lost = np.flatnonzero(self.force[peak:] <= 0.0)
         last = peak + int(lost[0]) if len(lost) and self.force[peak] > 0 else n - 1
         ends = [0, peak, last, n - 1]
-        return tuple(slice(a, b + 1) for a, b in zip(ends[:-1], ends[1:]) if b > a)
+        return tuple(slice(a, b + 1) for a, b in pairwise(ends) if b > a)
 
     def _interpolate(self, values: Array, t: Array) -> Array:
         """Cubic splines over each phase of the steps: one operator, linear in the nodal values."""

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .assembly import assemble
-from .contact import ContactSurface, contact, touching_offset
+from .contact import ContactSurface, Touch, contact, touching_offset
 from .elements import Element, reference_gradients
 from .indenter import Indenter
 from .materials import OgdenQLV
@@ -100,6 +100,7 @@ class Evaluation:
     contact_area: float = 0.0
     advance: Array | None = None
     contact_norm: float = 0.0
+    touch: Touch | None = None
 
 
 class System:
@@ -121,7 +122,8 @@ class System:
         if problem.indenter is not None:
             faces = np.asarray(problem.contact_faces, dtype=np.int64)
             self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
-            self.face_positions = _positions(faces, self.numbers, self.indptr, self.indices)
+            touching = self.surface.faces
+            self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
             if problem.start == "touching":
                 self.indenter = problem.indenter.moved(self._touching(problem.indenter))
 
@@ -192,19 +194,34 @@ class System:
         if not np.isfinite(energy) or self.surface is None or self.indenter is None:
             return Evaluation(energy, residual, data)
         advance, pushed = np.zeros_like(u), np.zeros_like(u)
-        found, force, deepest, area = self._contact(u, increment, True, pushed, data, advance)
-        norm = float(np.linalg.norm(pushed))
-        return Evaluation(energy + found, residual + pushed, data, force, deepest, area, advance, norm)
+        shape = self.surface.areas.shape
+        points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
+        found, force, deepest, area = self._contact(u, increment, True, pushed, data, advance, points)
+        norm, touch = float(np.linalg.norm(pushed)), None
+        if self.surface.nodal:
+            weights = increment.penalty * self.surface.areas[:, 0]
+            touch = Touch(points[0][:, 0], points[1][:, 0], weights, points[2][:, 0])
+        energy += found
+        return Evaluation(energy, residual + pushed, data, force, deepest, area, advance, norm, touch)
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
         """The contact part of the residual (n, 3), N."""
         pushed = np.zeros_like(u)
         if self.surface is not None:
-            self._contact(u, increment, False, pushed, np.empty(0), np.empty((0, 3)))
+            shape = self.surface.areas.shape
+            points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
+            self._contact(u, increment, False, pushed, np.empty(0), np.empty((0, 3)), points)
         return pushed
 
     def _contact(
-        self, u: Array, increment: Increment, tangent: bool, pushed: Array, data: Array, advance: Array
+        self,
+        u: Array,
+        increment: Increment,
+        tangent: bool,
+        pushed: Array,
+        data: Array,
+        advance: Array,
+        points: tuple[Array, Array, Array],
     ) -> tuple[float, float, float, float]:
         assert self.surface is not None
         assert self.indenter is not None
@@ -213,7 +230,30 @@ class System:
         return contact(
             surface.faces, surface.N, surface.areas, self.points, u, centre, frame, self.indenter.kernel,
             increment.penalty, tangent, self.face_positions, pushed, data, advance,
+            *points,
         )  # fmt: skip
+
+    def with_springs(self, data: Array, blocks: Array) -> Array:
+        """``data`` plus a block (c, 3, 3) on the diagonal of every (nodal) contact point."""
+        entries = blocks[:, *np.triu_indices(3)]
+        there = (self.face_positions >= 0) & (entries != 0.0)
+        data = data.copy()
+        data[self.face_positions[there]] += entries[there]
+        return data
+
+    def at_springs(self, forces: Array) -> Array:
+        """Forces (c, 3, ...) at the (nodal) contact points as a vector (or matrix) of the unknowns."""
+        assert self.surface is not None
+        out = np.zeros((self.unknowns, *forces.shape[2:]))
+        numbers = self.numbers[self.surface.faces[:, 0]]
+        out[numbers[numbers >= 0]] = forces[numbers >= 0]
+        return out
+
+    def springs_of(self, x: Array) -> Array:
+        """Values (c, 3, ...) of a vector (or matrix) of the unknowns at the (nodal) contact points."""
+        assert self.surface is not None
+        numbers = self.numbers[self.surface.faces[:, 0]]
+        return np.where((numbers >= 0).reshape(*numbers.shape, *[1] * (x.ndim - 1)), x[numbers], 0.0)
 
 
 @njit(cache=True)
