@@ -24,6 +24,7 @@ TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 CELL_FACTORS = (8.0, 4.0, 2.0)  # of the spacing: cells that are settled by one value
 CELL_RANGE, CELL_OFFSET = 1 << 20, 1 << 19  # three cell indices in one integer
+LONGEST_EDGE = 1.8  # of the spacing: the cubes' diagonal; both ends of a crossed edge are that near
 SNAP_FRACTION = 0.15
 ROOT_STEPS = 2  # the mesher's nodes are put on the surfaces again
 SMALLEST_VOLUME = 1e-3  # of a grid tetrahedron: a snap that leaves less is undone
@@ -77,7 +78,7 @@ def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool
     -------
     The cut grid and, per tetrahedron, whether it lies where the field is positive.
     """
-    values = banded(field, grid.points, 0.0, grid.spacing)
+    values = banded(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing)
     edges = _crossed_edges(grid.tets, values)
     t = _roots(grid.points, edges, values, field)
     grid, snapped = _snapped(grid, edges, t, bit)

@@ -138,8 +138,8 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings) -> BaseMesh:
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit)
         grid = grid.kept(positive)
-    if not len(grid.tets):
-        raise MeshingError("no muscle is left under the skin layer; choose a smaller skin_layer_mm")
+        if not len(grid.tets):
+            raise MeshingError("no muscle is left under the skin layer; choose a smaller skin_layer_mm")
     trimmed = fields.trimmed()
     limit = size_limit(fields, grid, settings)
     return BaseMesh(fields, grid, limit, trimmed, enclosed_volume(anatomy, fields, trimmed))

@@ -1,0 +1,256 @@
+"""Site meshes of an analytic limb and of a real mean limb: volumes, layer, quality, sets, failures."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import igl
+import numpy as np
+import pytest
+from limbs import SHARED, rotation
+
+from limbfit.anatomy import engines
+from limbfit.anatomy.background import LAYER, banded, box_grid, cut, volumes
+from limbfit.anatomy.layers import limb_fields, signed_distance
+from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.surfaces import Anatomy, Surface, read_surface
+from limbfit.errors import MeshingError, SurfaceError
+from limbfit.mesh import Mesh, boundary_faces, quality
+
+OPENLIMB = SHARED / "reference" / "openlimb-study"
+COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=15.0, near_radius_mm=10.0, growth=0.6)
+
+LENGTH, DISTAL, PROXIMAL, BONE_RADIUS = 70.0, 28.0, 34.0, 9.0
+
+
+def revolved(radii: np.ndarray, heights: np.ndarray, around: int = 72) -> Surface:
+    """A closed surface of revolution about z from its pole up to its pole."""
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    rings = [
+        np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(around, z)])
+        for r, z in zip(radii, heights)
+    ]
+    points = np.vstack([[0, 0, heights[0]], *rings, [0, 0, heights[-1]]])
+    here, there = 1 + np.arange(around), 1 + (np.arange(around) + 1) % around
+    faces = [np.column_stack([np.zeros(around, int), there, here])]
+    for ring in range(len(radii) - 1):
+        a, b = here + ring * around, there + ring * around
+        faces += [np.column_stack([a, b, b + around]), np.column_stack([a, b + around, a + around])]
+    last = (len(radii) - 1) * around
+    faces.append(np.column_stack([here + last, there + last, np.full(around, len(points) - 1)]))
+    return Surface(points, np.vstack(faces))
+
+
+def limb(turn: np.ndarray | None = None, bone_offset: float = 8.0) -> Anatomy:
+    """A tapered cylinder with a rounded end, cut at z = 0; one straight bone sticks out of the cut."""
+    t = np.linspace(0.02, 1, 16)
+    dome = np.sqrt(1 - (1 - t) ** 2)
+    rise = np.linspace(0, 1, 18)[1:]
+    radii = np.concatenate([DISTAL * dome, DISTAL + (PROXIMAL - DISTAL) * rise])
+    heights = np.concatenate([-LENGTH - DISTAL * (1 - t), -LENGTH + LENGTH * rise])
+    skin = revolved(radii, heights)
+    ends = np.array([0.5, 0.9, 1, 1, 1, 1, 1, 1, 1.0]) * BONE_RADIUS
+    bone = revolved(ends, np.array([-70.5, -70, -68.5, -50, -35, -20, -5, 3, 6.0]), 36)
+    bone = Surface(bone.points + np.array([bone_offset, 0, 0]), bone.faces)
+    turn = np.eye(3) if turn is None else turn
+    move = np.array([12.0, -80.0, 300.0]) if turn is not None else np.zeros(3)
+    skin, bone = (Surface(part.points @ turn.T + move, part.faces) for part in (skin, bone))
+    return Anatomy(skin, {"tibia": bone}, move, turn[:, 2])
+
+
+def site_of(anatomy: Anatomy, direction: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """The skin point and inward axis seen from the limb's axis in a direction of the limb frame."""
+    z = anatomy.cut_normal
+    side = direction - (direction @ z) * z
+    side /= np.linalg.norm(side)
+    start = anatomy.cut_point + height * z + 60 * side
+    _, _, nearest = igl.point_mesh_squared_distance(start[None], anatomy.skin.points, anatomy.skin.faces)
+    return nearest[0], -side
+
+
+@pytest.fixture(scope="module")
+def oblique() -> Anatomy:
+    return limb(rotation(3))
+
+
+@pytest.fixture(scope="module")
+def meshed(oblique: Anatomy) -> tuple:
+    position, axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)
+    return *mesh_site(oblique, position, axis, COARSE), position
+
+
+def conforms(mesh: Mesh) -> None:
+    """Every face has one or two cells (else this raises) and the boundary is a closed surface."""
+    faces = boundary_faces(mesh)[:, :3]
+    edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    counts = np.unique(edges, axis=0, return_counts=True)[1]
+    assert (counts % 2 == 0).all()
+
+
+def test_volume_layer_and_quality(meshed: tuple) -> None:
+    mesh, report, _ = meshed
+    assert abs(report.volume_error) < 0.005
+    assert report.layer_mean_mm == pytest.approx(3.0, abs=0.05)
+    assert report.layer_std_mm < 0.05
+    assert report.min_dihedral_deg >= 8.0
+    assert report.min_scaled_jacobian > 0.1
+    assert quality(mesh).inverted == 0
+    assert report.warnings == ()
+    assert sum(report.region_cells.values()) == report.cells == len(mesh.cells)
+
+
+def test_mesh_conforms(meshed: tuple) -> None:
+    conforms(meshed[0])
+
+
+def test_sets_lie_on_their_surfaces(meshed: tuple, oblique: Anatomy) -> None:
+    mesh, _, _ = meshed
+    assert set(mesh.node_sets) == {"fixed_bone", "fixed_proximal"}
+    on_cut = oblique.height(mesh.points[mesh.node_sets["fixed_proximal"]])
+    assert np.abs(on_cut).max() < 1e-9
+    missing = np.setdiff1d(
+        np.flatnonzero(np.abs(oblique.height(mesh.points)) < 1e-9), mesh.node_sets["fixed_proximal"]
+    )
+    assert len(missing) == 0
+    bone = mesh.points[mesh.node_sets["fixed_bone"]]
+    off_bone = np.abs(signed_distance(oblique.bones["tibia"], bone)[0])
+    assert np.median(off_bone) < 1e-3
+    assert np.percentile(off_bone, 95) < 0.25
+    assert off_bone.max() < 1.0  # the rim of the bone's end
+    faces = mesh.face_sets["skin"]
+    below = oblique.height(mesh.points[np.unique(faces)]) < -4
+    off_skin = np.abs(signed_distance(oblique.skin, mesh.points[np.unique(faces)][below])[0])
+    assert np.percentile(off_skin, 95) < 0.02
+    assert off_skin.max() < 0.3
+    corners = mesh.points[faces[:, :3]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = signed_distance(oblique.skin, corners.mean(axis=1))[1]
+    assert (np.einsum("ij,ij->i", normals, outward) > 0).all()
+
+
+def test_every_boundary_face_is_skin_bone_or_cut(meshed: tuple) -> None:
+    mesh, _, _ = meshed
+    faces = boundary_faces(mesh)
+    fixed = [np.isin(faces, nodes).all(axis=1) for nodes in mesh.node_sets.values()]
+    assert len(faces) == (fixed[0] | fixed[1]).sum() + len(mesh.face_sets["skin"])
+
+
+def test_elements_are_small_at_the_site_and_large_far_away(meshed: tuple) -> None:
+    mesh, _, position = meshed
+    ends = mesh.points[mesh.face_sets["skin"][:, :3]]
+    edges = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean(axis=1)
+    distance = np.linalg.norm(ends.mean(axis=1) - position, axis=1)
+    assert edges[distance < 10].mean() == pytest.approx(COARSE.edge_near_mm, rel=0.3)
+    assert edges[distance > 40].mean() > 1.4 * edges[distance < 10].mean()
+
+
+def test_curved_elements_follow_the_skin_better_than_straight_ones(meshed: tuple, oblique: Anatomy) -> None:
+    _, report, position = meshed
+    axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)[1]
+    _, straight = mesh_site(oblique, position, axis, replace(COARSE, curved=False))
+    assert abs(report.volume_error) < abs(straight.volume_error) / 2
+
+
+def test_shallow_bone_is_trimmed_and_reported() -> None:
+    deep, shallow = limb(), limb(bone_offset=19.0)
+    assert base_mesh(deep, COARSE).trimmed["tibia"].volume_mm3 == 0.0
+    position, axis = site_of(shallow, np.array([1.0, 0, 0]), -40.0)
+    mesh, report = mesh_site(shallow, position, axis, COARSE)
+    trimmed = report.trimmed_bone["tibia"]
+    fields = limb_fields(shallow, COARSE.skin_layer_mm, COARSE.bone_clearance_mm)
+    nearest = fields.depth(fields.frame.to_limb(shallow.bones["tibia"].points))[0][
+        fields_below(fields, shallow)
+    ].min()
+    assert trimmed.depth_mm == pytest.approx(4.5 - nearest, abs=1e-6)
+    assert trimmed.volume_mm3 > 0
+    depth = fields.depth(fields.frame.to_limb(mesh.points[mesh.node_sets["fixed_bone"]]))[0]
+    assert depth.min() > 4.5 - 0.1
+    assert abs(report.volume_error) < 0.005
+    assert report.min_dihedral_deg >= 8.0
+
+
+def fields_below(fields: object, anatomy: Anatomy) -> np.ndarray:
+    return anatomy.height(anatomy.bones["tibia"].points) <= 0
+
+
+def test_local_radius_keeps_the_neighbourhood_and_fixes_where_it_was_cut(oblique: Anatomy) -> None:
+    position, axis = site_of(oblique, np.array([0, 1.0, 0.1]), -35.0)
+    mesh, report = mesh_site(oblique, position, axis, replace(COARSE, local_radius_mm=30.0))
+    conforms(mesh)
+    distance = np.linalg.norm(mesh.points[mesh.node_sets["fixed_truncation"]] - position, axis=1)
+    assert 24 < distance.min() <= distance.max() < 36
+    assert np.linalg.norm(mesh.points - position, axis=1).max() < 36
+    assert report.volume_error is None
+    assert report.min_dihedral_deg >= 8.0
+
+
+def test_cutting_a_grid_keeps_volume_and_signs() -> None:
+    def ball(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance = np.linalg.norm(points, axis=1)
+        return 8.0 - distance, -points / np.maximum(distance, 1e-12)[:, None]
+
+    grid = box_grid(np.full(3, -10.0), np.full(3, 10.0), 1.7)
+    halves, positive = cut(grid, ball, LAYER)
+    size = volumes(halves.points, halves.tets)
+    assert size.min() > 0
+    assert size.sum() == pytest.approx(volumes(grid.points, grid.tets).sum(), rel=1e-12)
+    assert size[positive].sum() == pytest.approx(4 / 3 * np.pi * 512, rel=0.02)
+    on_level = (halves.mask & LAYER) > 0
+    assert np.abs(ball(halves.points[on_level])[0]).max() < 0.02
+    mesh = Mesh(halves.points, halves.tets, "tet4", positive.astype(np.int64), ("out", "in"))
+    conforms(mesh)
+    conforms(Mesh(halves.points, halves.tets[positive], "tet4", np.zeros(positive.sum(), np.int64), ("in",)))
+
+
+def test_settled_cells_have_the_exact_sign_and_band() -> None:
+    def field(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return 20.0 - np.linalg.norm(points, axis=1), points
+
+    points = np.random.default_rng(0).uniform(-60, 60, size=(4000, 3))
+    exact, found = field(points)[0], banded(field, points, 5.0, 4.0)
+    assert (np.sign(found) == np.sign(exact)).all()
+    inside = np.abs(exact) <= 5.0
+    np.testing.assert_array_equal(found[inside], exact[inside])
+    assert (np.abs(found[~inside]) > 5.0).all()
+
+
+def test_a_mesher_that_takes_too_long_is_stopped(oblique: Anatomy) -> None:
+    position, axis = site_of(oblique, np.array([1.0, 0, 0]), -35.0)
+    with pytest.raises(MeshingError, match=r"did not end in 0\.05 s"):
+        mesh_site(oblique, position, axis, replace(COARSE, time_limit_s=0.05))
+
+
+def test_a_mesher_that_crashes_is_an_error_not_a_crash() -> None:
+    dying = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"]
+    with pytest.raises(MeshingError, match="stopped with code -11"):
+        engines.run_worker(dying, 20.0)
+
+
+def test_nothing_under_the_layer_is_refused(oblique: Anatomy) -> None:
+    with pytest.raises(MeshingError, match="no muscle is left"):
+        base_mesh(oblique, replace(COARSE, skin_layer_mm=60.0))
+
+
+def test_a_skin_that_does_not_reach_the_cut_is_refused(oblique: Anatomy) -> None:
+    lifted = replace(oblique, cut_point=oblique.cut_point + 5 * oblique.cut_normal)
+    with pytest.raises(SurfaceError, match=r"5\.0 mm below"):
+        base_mesh(lifted, COARSE)
+
+
+@pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
+@pytest.mark.parametrize("name", ["1", "4"])
+def test_real_mean_limb(name: str) -> None:
+    bones = {bone: read_surface(OPENLIMB / f"{bone}.stl") for bone in ("tibia", "fibula")}
+    anatomy = Anatomy(
+        read_surface(OPENLIMB / "skin.stl"), bones, np.array([0, 0, 5.0]), np.array([0, 0, 1.0])
+    )
+    site = json.loads((OPENLIMB / "sites.json").read_text(encoding="utf-8"))["sites"][name]
+    settings = replace(COARSE, edge_far_mm=18.0)
+    mesh, report = mesh_site(anatomy, np.array(site["position"]), np.array(site["axis"]), settings)
+    conforms(mesh)
+    assert report.min_dihedral_deg >= 8.0
+    assert abs(report.volume_error) < 0.005
+    assert report.layer_mean_mm == pytest.approx(3.0, abs=0.1)
+    assert report.nodes < 12_000
