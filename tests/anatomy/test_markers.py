@@ -1,6 +1,7 @@
 """Markers: found on rendered images to 2 mm, one to one with names, misses and doubles told."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ def outline(limb, grid, markers, seed) -> Surface:
     return surface if surface.volume > 0 else surface.flipped
 
 
+@cache
 def scans(seed: int, motion: bool):
     """True sites, and outlines with and without markers; between the scans the limb may move."""
     limb = moved = make_limb(seed)

@@ -21,9 +21,9 @@ from ..indentation import SiteModel, build_problem, to_parameters
 from .record import Ramp
 
 ELEMENT = "tet10p0"
-STEPS = StepControl(load_steps=14, unload_steps=10)
+STEPS = StepControl(load_steps=12, unload_steps=8)
 MESHES = {
-    "coarse": MeshSettings(edge_near_mm=3.8, edge_far_mm=24.0, near_radius_mm=13.0, growth=0.6),
+    "coarse": MeshSettings(edge_near_mm=3.5, edge_far_mm=28.0, near_radius_mm=13.0, growth=0.6),
     "paper": MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
 }
 
