@@ -267,6 +267,13 @@ def test_touch_down_of_foreign_records(site):
     assert touch.uncertainty_mm < 0.1
 
 
+def test_a_force_that_comes_only_on_the_way_out_is_refused():
+    trace, _ = record()
+    after = trace.time_s > 6.0
+    with pytest.raises(TraceError, match="does not rise while the indenter goes in"):
+        find_touch_down(Trace(trace.time_s, trace.displacement_mm, np.where(after, 1.0, -0.1 * trace.time_s)))
+
+
 # --- regularisation
 
 

@@ -84,7 +84,7 @@ def regularise(trace: Trace, touch_down: TouchDown, smoothing: float | None = No
     Raises
     ------
     TraceError
-        Where fewer than 8 samples lie between touch-down and the peak.
+        Where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be chosen.
     """
     line = broken_line(trace.time_s, trace.displacement_mm)
     start = touch_down.time_s
@@ -152,7 +152,11 @@ def _spline(time: Array, force: Array, weight: Array, smoothing: float | None, p
     y = np.r_[force[keep], list(pinned.values())]
     w = np.r_[weight[keep], np.full(len(pinned), _PINNED * weight.sum())]
     order = np.argsort(x)
-    return make_smoothing_spline(x[order], y[order], w=w[order], lam=smoothing)
+    try:
+        return make_smoothing_spline(x[order], y[order], w=w[order], lam=smoothing)
+    except ValueError:
+        what = "cross-validation finds no smoothing for so short or so rough a record"
+        raise TraceError(what, remedy="give traces.smoothing in the study") from None
 
 
 def _grid(corners: Array, points: int) -> Array:

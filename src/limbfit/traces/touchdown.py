@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import TraceError
 from .displacement import broken_line
 from .numerics import Array, bins, noise_level
 from .record import MIN_SAMPLES, Trace
@@ -45,7 +46,7 @@ def find_touch_down(trace: Trace) -> TouchDown:
     Raises
     ------
     TraceError
-        Where the record never shows contact.
+        Where the force does not rise on the way in.
     """
     line = broken_line(trace.time_s, trace.displacement_mm)
     load = trace.time_s <= line.peak_s
@@ -82,7 +83,10 @@ def _onset(travel: Array, force: Array, level: float, noise: float, moving: int)
     """Likelihood-weighted onset of force over the part of loading below ``level`` of the peak."""
     at, smooth, _ = bins(np.arange(len(force), dtype=float), force, 200)
     base = float(np.median(force[: max(moving, len(force) // 50, 1)]))
-    threshold = max(level * (smooth.max() - base), _MIN_LEVEL_NOISE * noise)
+    rise = float(smooth.max()) - base
+    if rise <= 0.1 * float(np.ptp(smooth)):
+        raise TraceError("the force does not rise while the indenter goes in", remedy="check the record")
+    threshold = max(level * rise, _MIN_LEVEL_NOISE * noise)
     below = np.flatnonzero(smooth - base < threshold)
     end = min(int(at[below[-1]]) + 1, len(force)) if below.size else MIN_SAMPLES
     x, y, n = bins(travel[: max(end, 8)], force[: max(end, 8)], 300)
@@ -95,8 +99,8 @@ def _onset(travel: Array, force: Array, level: float, noise: float, moving: int)
     misfit = ((dy - slope[..., None] * centred) ** 2) @ n
     # A record without slack leaves the baseline free to take up the onset: hold it to a zeroed sensor,
     # loosely.
-    misfit = misfit + (noise * baseline / (0.02 * smooth.max())) ** 2
-    variance = max(noise**2, float(misfit.min()) / max(len(x) - 4, 1), (1e-4 * smooth.max()) ** 2)
+    misfit = misfit + (noise * baseline / (0.02 * rise)) ** 2
+    variance = max(noise**2, float(misfit.min()) / max(len(x) - 4, 1), (1e-4 * rise) ** 2)
     likelihood = np.exp(-(misfit - misfit.min()) / (2 * variance))
     likelihood /= likelihood.sum()
     mean = float(likelihood.sum(axis=1) @ d0)
