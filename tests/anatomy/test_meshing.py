@@ -51,8 +51,8 @@ def limb(turn: np.ndarray | None = None, bone_offset: float = 8.0) -> Anatomy:
     radii = np.concatenate([DISTAL * dome, DISTAL + (PROXIMAL - DISTAL) * rise])
     heights = np.concatenate([-LENGTH - DISTAL * (1 - t), -LENGTH + LENGTH * rise])
     skin = revolved(radii, heights)
-    ends = np.array([0.5, 0.9, 1, 1, 1, 1, 1, 1, 1.0]) * BONE_RADIUS
-    bone = revolved(ends, np.array([-70.5, -70, -68.5, -50, -35, -20, -5, 3, 6.0]), 36)
+    ends = np.concatenate([dome, np.ones(6)]) * BONE_RADIUS
+    bone = revolved(ends, np.concatenate([-61 - BONE_RADIUS * (1 - t), [-50, -35, -20, -5, 3, 6.0]]), 36)
     bone = Surface(bone.points + np.array([bone_offset, 0, 0]), bone.faces)
     turn = np.eye(3) if turn is None else turn
     move = np.array([12.0, -80.0, 300.0]) if turn is not None else np.zeros(3)
@@ -118,7 +118,7 @@ def test_sets_lie_on_their_surfaces(meshed: tuple, oblique: Anatomy) -> None:
     off_bone = np.abs(signed_distance(oblique.bones["tibia"], bone)[0])
     assert np.median(off_bone) < 1e-3
     assert np.percentile(off_bone, 95) < 0.25
-    assert off_bone.max() < 1.0  # the rim of the bone's end
+    assert off_bone.max() < 1.0
     faces = mesh.face_sets["skin"]
     below = oblique.height(mesh.points[np.unique(faces)]) < -4
     off_skin = np.abs(signed_distance(oblique.skin, mesh.points[np.unique(faces)][below])[0])
