@@ -36,8 +36,8 @@ class ContactSurface:
         N, areas = face_quadrature(element, points, faces, rule)
         if rule == "nodes":
             nodes, owner = np.unique(faces[:, N.argmax(axis=1)], return_inverse=True)
-            faces, N = nodes[:, None], np.ones((1, 1))
-            areas = np.bincount(owner.ravel(), areas.ravel())[:, None]
+            share = np.asarray(np.bincount(owner.ravel(), areas.ravel()), dtype=float)
+            return cls(nodes[:, None], np.ones((1, 1)), share[:, None], points)
         return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
 
     @property
@@ -117,7 +117,8 @@ def contact(  # type: ignore[no-untyped-def]
 
     ``advance (n, 3)`` receives the mixed derivative with respect to displacement and indenter advance
     (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals (f, q, 3)`` and ``blocks
-    (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point.  Returns energy, reaction along the axis (N), largest
+    (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point.  Returns energy,
+    reaction along the axis (N), largest
     penetration (mm), reference area in touch (mm^2).
     """
     shape, half, radius = kernel

@@ -79,7 +79,7 @@ class Factor:
     def solve(
         self, data: Array, b: Array, blocks: Array | None, tolerance: float, limit: int, x: Array
     ) -> Array:
-        """Solve ``A x = b (n, r)`` from the guess ``x``: by the old factor within ``limit`` products, or a new one.
+        """Solve ``A x = b (n, r)`` from the guess ``x``: within ``limit`` products, or by a new factor.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class Factor:
         return _Correction(self._system, frame[axes], points, D, Z)
 
     def _influence(self, points: NDArray[np.int64], axes: NDArray[np.int64], frame: Array) -> Array:
-        """Solutions (n, k) for unit forces at contact points along axes of ``frame``; kept with the factor."""
+        """Solutions (n, k) for unit forces at contact points along axes of ``frame``, kept."""
         keys = [int(key) for key in 3 * points + axes]
         new = [i for i, key in enumerate(keys) if key not in self._columns]
         if new:

@@ -197,8 +197,9 @@ class Simulation:
         pushed = system.contact_force(u, increment)
         change += pushed[..., None] * d_penalty
         b = -change.reshape(-1, laws.count)[system.free]
-        self.factor.factorise(at.data, None if at.touch is None else at.touch.blocks)
+        blocks = None if at.touch is None else at.touch.blocks
         du = np.zeros((u.size, laws.count))
+        self.factor.factorise(at.data, blocks)  # dearer products of many columns would not pay
         du[system.free] = self.factor.apply(b)
         d_force = at.force * d_penalty
         if at.advance is not None:
