@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import nrrd
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
@@ -67,16 +68,12 @@ def test_nifti_without_a_stated_orientation_is_refused(tmp_path):
 
 
 def test_nrrd_without_a_space_is_refused(tmp_path):
-    import nrrd
-
     nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((3, 4, 5), np.float32))
     with pytest.raises(ImageError, match="does not say how it lies"):
         read_volume(tmp_path / "bare.nrrd")
 
 
 def test_sheared_axes_are_refused(tmp_path):
-    import nrrd
-
     header = {
         "space": "left-posterior-superior",
         "space directions": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0.3, 1]]),

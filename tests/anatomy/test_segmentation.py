@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from limbs import CALF, DIRECTIONS, leg_image
+from scipy.ndimage import label
 
 from limbfit.anatomy.body import ball, bias_field, limb_mask, smoothed
 from limbfit.anatomy.bones import escape_level, find_bones, name_bones
@@ -104,8 +105,6 @@ def test_bias_field_is_the_coils():
 
 def escape_by_definition(plane: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Largest level at which a voxel is still connected to the outside, tried level by level."""
-    from scipy.ndimage import label
-
     found = np.zeros_like(plane)
     for level in np.unique(plane):
         parts, _ = label(~inside | (plane >= level))
@@ -185,8 +184,6 @@ def test_calf_in_every_slice():
 
 
 def _one_piece(labels: LabelMap) -> None:
-    from scipy.ndimage import label
-
     for name in labels.bone_names:
         parts, _ = label(labels.mask(name))
         assert np.bincount(parts.ravel())[1:].max() > 0.99 * labels.mask(name).sum()

@@ -10,6 +10,7 @@ import pytest
 import pyvista as pv
 from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
 
+from limbfit.anatomy.extraction import fine_surface
 from limbfit.anatomy.imaging import LabelMap, read_volume
 from limbfit.anatomy.surfaces import (
     Anatomy,
@@ -180,6 +181,14 @@ def test_edges_have_the_length_that_was_asked_for():
         triangles = extract_surface(labels, "tibia", edge).triangles
         lengths = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
         assert lengths.mean() == pytest.approx(edge, rel=0.1)
+
+
+@pytest.mark.parametrize("edge", [2.0, 6.0])
+def test_smoothing_and_coarse_triangles_keep_the_volume(edge):
+    labels, _ = sphere_labels(12.0, [1.5, 1.5, 1.5], seed=3)
+    volume = labels.mask("tibia").sum() * labels.voxel_mm3
+    assert fine_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
+    assert extract_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
 
 
 def test_only_the_largest_body_is_kept():
