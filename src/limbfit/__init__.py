@@ -1,3 +1,47 @@
-"""limbfit: patient-specific viscoelastic finite-element models of residual limbs."""
+"""limbfit: patient-specific viscoelastic finite-element models of residual limbs.
+
+Everything the command line does is one call away:
+
+========================  =========================================================
+``limbfit demo``          ``run_demo(folder, seed=0, listener=print)``
+``limbfit phantom``       ``make_phantom_study(folder, detail="coarse", seed=0, listener=print)``
+``limbfit check``         ``check_study(load_study(path), listener=print)``
+``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
+``limbfit status``        ``study_status(load_study(path))``
+``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
+``limbfit report``        ``report_study(load_study(path), listener=print)``
+========================  =========================================================
+
+Names are loaded when first used, so that a worker process that only solves does not load images and graphics.
+"""
+
+from importlib import import_module
+from typing import Any
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "LimbfitError": "errors",
+    "InputError": "errors",
+    "Study": "study",
+    "load_study": "study",
+    "Progress": "pipeline",
+    "check_study": "pipeline",
+    "make_phantom_study": "pipeline",
+    "report_study": "pipeline",
+    "run_demo": "pipeline",
+    "run_study": "pipeline",
+    "simulate_site": "pipeline",
+    "study_status": "pipeline",
+}
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'limbfit' has no attribute {name!r}")
+    return getattr(import_module(f"limbfit.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,36 @@
+"""The public names exist, and the light part of the package stays light."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import limbfit
+
+
+def test_all_public_names_exist():
+    for name in limbfit.__all__:
+        assert getattr(limbfit, name) is not None
+    assert set(limbfit.__all__) <= set(dir(limbfit))
+
+
+def test_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        limbfit.nonsense  # noqa: B018
+
+
+def test_version_is_that_of_the_project():
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    assert limbfit.__version__ == project["project"]["version"]
+
+
+def test_the_solver_loads_without_images_and_pictures():
+    """Worker processes that only solve start quickly."""
+    heavy = ("pyvista", "SimpleITK", "matplotlib")
+    code = f"import sys, limbfit.indentation; print([m for m in {heavy} if m in sys.modules])"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "[]"
