@@ -168,7 +168,8 @@ def simulate(
     else:
         STDOUT.print(
             f"site {site}: peak force {found['peak_force_N']:.3f} N at {found['depth_mm']:.2f} mm, "
-            f"penetration {found['penetration_mm']:.3f} mm, {found['element']}, {found['unknowns']} unknowns\n"
+            f"penetration {found['penetration_mm']:.3f} mm, "
+            f"{found['element']}, {found['unknowns']} unknowns\n"
             f"curve: {found['curve']}\nfields: {found['fields']}"
         )
     if not found["completed"]:

@@ -17,7 +17,7 @@ from .store import read_json
 def make_phantom_study(
     folder: Path, *, detail: str, seed: int, listener: Listener, workers: int = 0
 ) -> dict[str, Any]:
-    """Make a synthetic patient in ``folder``; returns its truth (see :func:`limbfit.phantom.make_phantom`)."""
+    """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
     with make_executor(workers) as executor:
         return make_phantom(
             folder,

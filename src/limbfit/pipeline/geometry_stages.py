@@ -106,7 +106,7 @@ def _imaged_anatomy(context: Context) -> Anatomy:
 
 
 def given_anatomy(study: Study) -> Anatomy:
-    """The anatomy from closed surfaces; without a stated cut the most proximal (highest z) face of the skin."""
+    """The anatomy from closed surfaces; without a stated cut the highest (z) face of the skin."""
     assert study.surfaces is not None
     tables = study.surfaces
     files = {"skin": tables.skin, **tables.bones}

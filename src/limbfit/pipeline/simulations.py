@@ -1,4 +1,4 @@
-"""Simulations of a study that are never done twice: kept on disk as they finish, keyed by what decides them."""
+"""Simulations of a study, never done twice: kept on disk as they finish, keyed by what decides them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CURVE_POINTS = 81  # times, evenly over the indentation, at which measured and s
 
 
 class SimulationCache:
-    """Finished simulations in ``folder``, one file each; ``also`` are folders of earlier stages to look in."""
+    """Finished simulations in ``folder``, one file each; ``also`` are other folders to look in."""
 
     def __init__(self, folder: Path, also: Sequence[Path] = ()) -> None:
         self.folder = folder

@@ -1,8 +1,8 @@
 """Stage folders on disk: what is done, what is stale, and writes that are never half done.
 
-A stage works in ``results/.work-<stage>-<key>`` and is renamed to ``results/<stage>`` when complete. The key is
-a digest of everything the stage depends on, so a run that was killed finds its own unfinished folder again and
-goes on in it, and a folder of other inputs is dropped.
+A stage works in ``results/.work-<stage>-<key>`` and is renamed to ``results/<stage>`` when complete. The key
+is a digest of everything the stage depends on, so a run that was killed finds its own unfinished folder again
+and goes on in it, and a folder of other inputs is dropped.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
 
 @dataclass(frozen=True)
 class StageState:
-    """What the disk says of a stage: ``done``, ``stale`` (made from other inputs), ``begun`` or ``missing``."""
+    """What the disk says of a stage: ``done``, ``stale`` (of other inputs), ``begun`` or ``missing``."""
 
     stage: str
     state: str
