@@ -72,7 +72,7 @@ class SimulationCache:
 def _load(file: Path) -> Simulation:
     with np.load(file, allow_pickle=False) as stored:
         facts: dict[str, Any] = json.loads(str(stored["facts"]))
-        jacobian = stored["jacobian"] if "jacobian" in stored else None
+        jacobian = stored.get("jacobian")
         return Simulation(force_N=stored["force_N"], jacobian=jacobian, **facts)
 
 
