@@ -13,11 +13,13 @@ from limbs import SHARED, rotation
 
 from limbfit.anatomy import engines
 from limbfit.anatomy.background import LAYER, banded, box_grid, cut, volumes
+from limbfit.anatomy.curving import with_diagonals
+from limbfit.anatomy.extrusion import prism_tets
 from limbfit.anatomy.layers import limb_fields, signed_distance
 from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.anatomy.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
-from limbfit.mesh import Mesh, boundary_faces, quality
+from limbfit.mesh import Mesh, boundary_faces, quality, to_tet10
 
 OPENLIMB = SHARED / "reference" / "openlimb-study"
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=15.0, near_radius_mm=10.0, growth=0.6)
@@ -237,6 +239,20 @@ def test_a_skin_that_does_not_reach_the_cut_is_refused(oblique: Anatomy) -> None
     lifted = replace(oblique, cut_point=oblique.cut_point + 5 * oblique.cut_normal)
     with pytest.raises(SurfaceError, match=r"5\.0 mm below"):
         base_mesh(lifted, COARSE)
+
+
+def test_diagonals_follow_the_curved_edges_above_and_below() -> None:
+    points = np.array([[0.0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 1], [6, 0, 1], [0, 6, 1]])
+    tets = prism_tets(np.array([[0, 1, 2]]), np.array([3, 4, 5]))
+    mesh = to_tet10(Mesh(points, tets, "tet4", np.zeros(3, np.int64), ("skin",)))
+    flat = np.isin(mesh.points[:, 2], [0.0, 1.0]) & (np.arange(len(mesh.points)) >= 6)
+    target = mesh.points + np.where(flat, 2.0, 0.0)[:, None] * np.array([0, 0, 1.0])
+    found = with_diagonals(mesh, target, np.array([0, 1, 2, 0, 1, 2])) - mesh.points
+    upright = (mesh.points[:, 2] == 0.5) & np.isin(mesh.points[:, :2], points[:, :2]).all(axis=1)
+    diagonal = (mesh.points[:, 2] == 0.5) & (mesh.points[:, :2] % 6 != 0).any(axis=1)
+    assert diagonal.sum() == 3
+    np.testing.assert_allclose(found[diagonal], np.tile([0, 0, 2.0], (3, 1)))
+    np.testing.assert_array_equal(found[upright & ~diagonal], 0.0)
 
 
 @pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
