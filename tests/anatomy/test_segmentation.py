@@ -160,6 +160,19 @@ def test_fat_enclosed_by_muscle_is_no_bone():
     assert bone.sum() == pytest.approx(20 * (radius < 8).sum(), rel=0.05)
 
 
+def test_a_leak_in_the_cortex_does_not_part_a_bone():
+    levels = np.ones((30, 40, 40), np.float32)
+    limb = np.zeros(levels.shape, bool)
+    limb[:, 4:-4, 4:-4] = True
+    j, i = np.mgrid[:40, :40]
+    radius = np.hypot(j - 20, i - 20)
+    levels[:, radius < 6] = 2.0
+    levels[:, (radius >= 6) & (radius < 8)] = 0.2
+    levels[14:16, 20, 24:30] = 2.0
+    (bone,) = find_bones(levels, limb, np.ones(3), 100.0)
+    assert (bone & (radius < 6)).any(axis=(1, 2)).all()
+
+
 def test_ball_is_round_in_millimetres():
     assert ball(3.0, np.array([1.0, 1.5, 3.0])).shape == (3, 5, 7)
 

@@ -9,6 +9,7 @@ negative image.) Grey levels are relative to muscle throughout.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
@@ -56,6 +57,7 @@ def find_bones(levels: Field, limb: Mask, spacing: Spacing, smallest_mm3: float)
         return []
     for value in range(1, parts.max() + 1):
         _follow(parts, value, levels, deep, spacing)
+    parts = _rejoined(parts)
     owned = _with_cortex(parts, levels, deep, spacing)
     bones = [owned == value for value in range(1, parts.max() + 1)]
     large = [bone for bone in bones if bone.sum() * np.prod(spacing) >= smallest_mm3]
@@ -124,6 +126,18 @@ def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) ->
     section = binary_opening(section, ball(_STEP_IN_MM, flat)[0])
     ratio = section.sum() / previous.sum()
     return section if _GROWTH[0] <= ratio <= _GROWTH[1] else None
+
+
+def _rejoined(parts: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Cavities that lie on each other in neighbouring slices are one: a leak in the ring parted them."""
+    root = np.arange(parts.max() + 1)
+    for low, high in pairwise(parts):
+        both = (low > 0) & (high > 0) & (low != high)
+        for a, b in np.unique(np.column_stack([low[both], high[both]]), axis=0):
+            shared = int((both & (low == a) & (high == b)).sum())
+            if shared > 0.5 * min(int((low == a).sum()), int((high == b).sum())):
+                root[root == root[b]] = root[a]
+    return np.unique(root, return_inverse=True)[1].astype(np.int32)[parts]
 
 
 def _with_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Spacing) -> NDArray[np.int32]:
