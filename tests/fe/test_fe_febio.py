@@ -102,16 +102,20 @@ def difference(problem: Problem, times: np.ndarray, force: np.ndarray, **control
     return 100 * np.abs(result.force - force).max() / force.max()
 
 
+# FEBio's penalty is three times 3 mu A/V of each element: softer than ours, and softer for hexahedra than for
+# the smaller tetrahedra.  ``penalty`` (1/mm) matches it; with it the curves meet, without it ours are stiffer.
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "element"), [("tet4", "tet4"), ("tet10", "tet10g8")])
-def test_residuum(kind, element):
-    # FEBio's penalty, three times its automatic one, is about 10 shear moduli per mm; Gauss points as there.
-    problem, times, force = residuum(kind, element=element, contact_rule="gauss")
-    assert difference(problem, times, force, penalty=10.0, penetration=1.0) < 1.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "element"), [("hex8", "hex8"), ("tet4", "tet4"), ("tet10", "tet10g8")])
-def test_block(kind, element):
-    problem, times, force = block(kind, element=element, contact_rule="gauss")
-    assert difference(problem, times, force, penalty=10.0, penetration=1.0) < 1.5
+@pytest.mark.parametrize(
+    ("case", "kind", "rule", "penalty", "percent"),
+    [
+        (residuum, "tet10", "nodes", None, 1.0),
+        (residuum, "tet4", "gauss", 10.0, 2.5),
+        (block, "hex8", "gauss", 10.0, 0.5),
+        (block, "tet4", "gauss", 30.0, 1.0),
+        (block, "tet4", "nodes", None, 1.0),
+    ],
+)
+def test_indentation(case, kind, rule, penalty, percent):
+    problem, times, force = case(kind, contact_rule=rule)
+    deep = 0.01 if penalty is None else 1.0
+    assert difference(problem, times, force, penalty=penalty, penetration=deep) < percent

@@ -34,7 +34,9 @@ class Factor:
         self._blocks: Array | None = None
         self._columns: dict[int, int] = {}
         self._Z = np.empty((system.unknowns, 0))
+        self._shift = 0.0
         self.ready = False
+        self.fresh = False
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float, factor=time.perf_counter() - started)
 
@@ -48,16 +50,18 @@ class Factor:
         ``blocks (c, 3, 3)``: the contact springs that are in ``data``.
         """
         started = time.perf_counter()
-        shift = 0.0
         typical = float(np.abs(data[self._diagonal]).mean())
+        shift = 0.2 * self._shift if self._shift > 1e-3 * typical else 0.0
         while True:
             self.counts["factorisations"] += 1
             try:
                 self._solver.factorise(self._shifted(data, shift))
                 break
             except NotPositiveDefiniteError:
-                shift = max(10.0 * shift, 1e-3 * typical)
-        self.ready, self._blocks = True, blocks
+                shift = max(5.0 * shift, 1e-3 * typical)
+        self._shift = shift
+        self.ready = self.fresh = True
+        self._blocks = blocks
         self._columns, self._Z = {}, np.empty((self._system.unknowns, 0))
         self.seconds["factor"] += time.perf_counter() - started
 
@@ -80,6 +84,9 @@ class Factor:
         self, data: Array, b: Array, blocks: Array | None, tolerance: float, limit: int, x: Array
     ) -> Array:
         """Solve ``A x = b (n, r)`` from the guess ``x``: within ``limit`` products, or by a new factor.
+
+        Where A is not positive definite the result is only a direction of descent; ``fresh`` says that
+        the factor was made at the present iterate.
 
         Parameters
         ----------
@@ -111,12 +118,12 @@ class Factor:
             Ap = self._product(data, p)
             curvature = np.einsum("ij,ij->j", p, Ap)
             live = rz > 0.0
-            if (curvature[live] <= 0.0).any():
-                return None
+            if (curvature[live] <= 0.0).any():  # Steihaug 1983: stop at the edge of the convex region
+                return (x if x.any() else z) if self.fresh else None
             step = np.where(live, rz / np.where(live, curvature, 1.0), 0.0)
             x += step * p
             r -= step * Ap
-        return x if (np.linalg.norm(r, axis=0) <= target).all() else None
+        return x if self.fresh or (np.linalg.norm(r, axis=0) <= target).all() else None
 
     def _product(self, data: Array, x: Array) -> Array:
         self.counts["products"] += 1

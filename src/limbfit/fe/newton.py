@@ -93,6 +93,7 @@ def _direction(system: System, at: Evaluation, factor: Factor, forcing: float, s
     The set of closed points is iterated on the linear model (a primal-dual active set, Hintermueller, Ito and
     Kunisch 2003), which costs a few products; each missed point would cost an assembly of all elements.
     """
+    factor.fresh = False
     b = -at.residual.ravel()[system.free][:, None]
     x, touch = np.zeros_like(b), at.touch
     if touch is None:
