@@ -102,8 +102,8 @@ def difference(problem: Problem, times: np.ndarray, force: np.ndarray, **control
     return 100 * np.abs(result.force - force).max() / force.max()
 
 
-# FEBio's penalty is three times 3 mu A/V of each element: softer than ours, and softer for hexahedra than for
-# the smaller tetrahedra.  ``penalty`` (1/mm) matches it; with it the curves meet, without it ours are stiffer.
+# FEBio's penalty is three times 3 mu A/V of each element: softer than ours, and softer for hexahedra than
+# for the smaller tetrahedra.  ``penalty`` (1/mm) matches it; with it the curves meet, without it ours are stiffer.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "kind", "rule", "penalty", "percent"),
