@@ -103,7 +103,7 @@ def difference(problem: Problem, times: np.ndarray, force: np.ndarray, **control
 
 
 # FEBio's penalty is three times 3 mu A/V of each element: softer than ours, and softer for hexahedra than
-# for the smaller tetrahedra.  ``penalty`` (1/mm) matches it; with it the curves meet, without it ours are stiffer.
+# for the smaller tetrahedra.  ``penalty`` (1/mm) matches it; without that our curves are stiffer.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "kind", "rule", "penalty", "percent"),
