@@ -127,12 +127,12 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     )
 
 
-_KEPT = 9  # meshes and last results that a worker keeps: its share of the sites of one study
-_meshes: OrderedDict[str, Mesh] = OrderedDict()
-_last: OrderedDict[str, Result] = OrderedDict()
+_KEPT = 9  # problems and last results that a worker keeps: its share of the sites of one study
+_problems: OrderedDict[SiteModel, Problem] = OrderedDict()
+_last: OrderedDict[SiteModel, Result] = OrderedDict()
 
 
-def _keep(cache: OrderedDict, key: str, value: Any) -> Any:
+def _keep(cache: OrderedDict, key: SiteModel, value: Any) -> Any:
     cache[key] = value
     cache.move_to_end(key)
     while len(cache) > _KEPT:
@@ -140,8 +140,12 @@ def _keep(cache: OrderedDict, key: str, value: Any) -> Any:
     return value
 
 
-def _mesh(model: SiteModel) -> Mesh:
-    return _meshes.get(model.mesh_digest) or _keep(_meshes, model.mesh_digest, read_vtu(model.mesh))
+def _problem(model: SiteModel, parameters: Parameters) -> Problem:
+    """The site's problem; discretisation and warm start stay valid while only the materials change."""
+    known = _problems.get(model)
+    if known is None:
+        known = _keep(_problems, model, build_problem(model, read_vtu(model.mesh), parameters))
+    return known.with_materials(materials(parameters, model.kappa_ratio))
 
 
 def _steps(model: SiteModel) -> StepControl:
@@ -154,16 +158,15 @@ def simulate(job: SimulationJob) -> Simulation:
     The last simulation of the same site in this process gives the first guesses.
     """
     model = job.model
-    problem = build_problem(model, _mesh(model), to_parameters(np.array(job.parameters)))
     result = solve(
-        problem,
+        _problem(model, to_parameters(np.array(job.parameters))),
         steps=_steps(model),
         sensitivities=job.sensitivities,
-        warm_start=_last.get(model.mesh_digest),
+        warm_start=_last.get(model),
         store="all",
     )
     if result.completed:
-        _keep(_last, model.mesh_digest, result)
+        _keep(_last, model, result)
     times = np.array(job.times_s)
     return Simulation(
         site=model.name,
@@ -182,8 +185,9 @@ def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
     Point data ``displacement_mm``; cell data ``J``, ``von_mises_kPa`` (Cauchy), ``largest_stretch``,
     ``smallest_stretch`` and ``energy_kPa`` (long-term elastic energy density).
     """
-    mesh = _mesh(model)
-    result = solve(build_problem(model, mesh, parameters), steps=_steps(model), store="peak")
+    problem = _problem(model, parameters)
+    warm_start = _last.get(model)
+    result = solve(problem, steps=_steps(model), warm_start=warm_start, store="peak")
     fields = _element_fields(result)
     cell_data = {
         "J": fields.J,
@@ -192,7 +196,7 @@ def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
         "smallest_stretch": fields.stretches[:, 2],
         "energy_kPa": fields.energy / KPA,
     }
-    write_vtu(mesh, file, point_data={"displacement_mm": result.states[0].u}, cell_data=cell_data)
+    write_vtu(problem.mesh, file, point_data={"displacement_mm": result.states[0].u}, cell_data=cell_data)
     return result
 
 

@@ -93,6 +93,7 @@ class MeshTable(_Table):
     edge_far_mm: Positive = 12.0
     near_radius_mm: Positive = 16.0
     growth: Positive = 0.35
+    flatness: Annotated[float, Field(ge=1, le=2)] = 1.0
     time_limit_s: Positive = 600.0
 
 

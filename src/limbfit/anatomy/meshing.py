@@ -55,7 +55,8 @@ class MeshSettings:
     The edge length is ``edge_near_mm`` within ``near_radius_mm`` of the site and grows from there by
     ``growth`` mm per mm up to ``edge_far_mm``. ``curved`` puts mid-edge nodes on the smooth surfaces.
     With ``local_radius_mm`` only the limb within that distance of the site is meshed, and the nodes where it
-    was cut off are fixed (node set ``fixed_truncation``); that stiffens the answer.
+    was cut off are fixed (node set ``fixed_truncation``); that stiffens the answer. ``flatness`` is how much
+    flatter than by default elements may be away from the site: fewer nodes, smaller angles.
     """
 
     element: Literal["tet4", "tet10"] = "tet10"
@@ -68,17 +69,18 @@ class MeshSettings:
     time_limit_s: float = 600.0
     curved: bool = True
     local_radius_mm: float | None = None
+    flatness: float = 1.0
     engine: Literal["mmg"] = "mmg"
 
     @property
     def base_spacing_mm(self) -> float:
         """Edge of the base grid: fine enough for the layer, no finer than the far mesh needs."""
-        return float(np.clip(self.edge_far_mm / 3.0, 3.0, 6.0))
+        return float(np.clip(self.edge_far_mm / 3.0, 3.0, 6.0 * np.sqrt(self.flatness)))
 
     @property
     def hausdorff_mm(self) -> float:
         """How far the faceted surfaces may stray from the smooth ones."""
-        return float(np.clip(self.edge_far_mm**2 / HAUSDORFF_RADIUS_MM, 0.1, 2.5))
+        return float(np.clip(self.edge_far_mm**2 / HAUSDORFF_RADIUS_MM, 0.1, 2.5)) * self.flatness**2
 
 
 @dataclass(frozen=True)
@@ -211,8 +213,8 @@ def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Arr
     under_layer = np.maximum(background.banded(fields.layer, grid.points, far, grid.spacing), 0.0)
     sheet = np.abs(background.banded(fields.void, grid.points, far, grid.spacing)) + under_layer
     thinnest = min(settings.edge_near_mm, settings.bone_clearance_mm)
-    over_bone = np.maximum(SHEET_RATIO * sheet, thinnest)
-    return np.minimum(LAYER_RATIO * settings.skin_layer_mm + under_layer, over_bone)
+    over_bone = np.maximum(SHEET_RATIO * settings.flatness * sheet, thinnest)
+    return np.minimum(LAYER_RATIO * settings.flatness * settings.skin_layer_mm + under_layer, over_bone)
 
 
 def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:

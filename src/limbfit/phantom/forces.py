@@ -8,13 +8,14 @@ uses the plain one. So what a calibration recovers, it does not recover by repea
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.meshing import MeshSettings, mesh_site
-from ..anatomy.surfaces import load_anatomy
+from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
 from ..indentation import SiteModel, build_problem, to_parameters
@@ -51,6 +52,13 @@ class TrueForce:
     facts: dict[str, float | int | str]
 
 
+@lru_cache(maxsize=1)
+def _base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+    """What all sites of a phantom share; a worker makes it once."""
+    anatomy = load_anatomy(folder)
+    return anatomy, base_mesh(anatomy, settings)
+
+
 def site_force(job: ForceJob) -> TrueForce:
     """Mesh and solve one site.
 
@@ -59,8 +67,8 @@ def site_force(job: ForceJob) -> TrueForce:
     RunError
         When the simulation does not complete.
     """
-    anatomy = load_anatomy(job.anatomy)
-    mesh, _ = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.mesh)
+    anatomy, base = _base(job.anatomy, job.mesh)
+    mesh, _ = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.mesh, base)
     knots_s, knots_mm = job.ramp.knots
     model = SiteModel(
         name=job.site,

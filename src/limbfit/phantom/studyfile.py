@@ -34,10 +34,15 @@ width_mm = {width:.1f}
 _MESH = {
     "coarse": """
 [mesh]
-edge_near_mm = 4.5
+edge_near_mm = 5.0
 edge_far_mm = 30.0
 near_radius_mm = 12.0
-growth = 0.7
+growth = 0.9
+flatness = 1.6
+
+[solver]
+load_steps = 8
+unload_steps = 6
 """,
     "paper": "",
 }

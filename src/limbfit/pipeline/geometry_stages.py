@@ -212,6 +212,7 @@ def mesh_settings(study: Study) -> MeshSettings:
         edge_far_mm=table.edge_far_mm,
         near_radius_mm=table.near_radius_mm,
         growth=table.growth,
+        flatness=table.flatness,
         time_limit_s=table.time_limit_s,
         skin_layer_mm=geometry.skin_layer_mm,
         bone_clearance_mm=geometry.bone_clearance_mm,

@@ -262,7 +262,9 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     covariance = np.array(calibration["uncertainty"]["covariance_log"])
     records = [site_record(context, site) for site in study.sites if site.trace is not None]
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    jobs = [record.job(two) for record in records] + [record.job(one) for record in records]
+    jobs = [record.job(two) for record in records]
+    # At the fitted sites the calibration has simulated the one-material optimum already, with sensitivities.
+    jobs += [record.job(one, sensitivities=record.site.fitted) for record in records]
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
