@@ -27,6 +27,13 @@ bones = { tibia = "surfaces/tibia.stl", fibula = "surfaces/fibula.stl" }
 [geometry]
 skin_layer_mm = 3.0
 
+[mesh]                          # about 12,000 nodes a site
+element = "tet10"
+edge_near_mm = 4.0
+edge_far_mm = 16.0
+near_radius_mm = 14.0
+growth = 0.5
+
 [indenter]                      # the punch that FEBio pushed: 20 mm square, edges rounded by 2 mm
 shape = "square"
 width_mm = 20.0

@@ -11,10 +11,17 @@ from .context import Context
 
 
 def run_report(context: Context, folder: Path) -> dict[str, Any]:
-    """``report.html``; a phantom's ``truth.json`` beside the study is shown in it."""
+    """``report.html``; a phantom's ``truth.json`` beside the study is shown in it.
+
+    It is drawn on the executor: graphics libraries can crash, and a worker that dies is an error in words.
+    """
     context.tell("report", 0, 1, "drawing figures")
     truth = context.study.folder / "truth.json"
     if truth.is_file():
         shutil.copyfile(truth, context.store.folder / "truth.json")
-    build_report(context.store.folder, folder)
+    list(context.executor.map(_draw, [(context.store.folder, folder)]))
     return {}
+
+
+def _draw(folders: tuple[Path, Path]) -> None:
+    build_report(*folders)

@@ -9,7 +9,7 @@ from typing import Any
 
 from .. import __version__
 from ..errors import InputError
-from ..execution import SerialExecutor, make_executor
+from ..execution import make_executor
 from ..study import Study
 from .context import Context, Listener
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
@@ -162,8 +162,8 @@ def run_record(study: Study) -> dict[str, Any]:
 def report_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     """Make the report anew from what is stored, stale or not; nothing is solved."""
     store = Store(study.results)
-    with lock(study.results):
-        context = Context(study, store, SerialExecutor(), listener)
+    with lock(study.results), make_executor(study.execution.workers) as executor:
+        context = Context(study, store, executor, listener)
         _do(context, "report", keys(study)["report"])
         return summarise(study)
 

@@ -1,0 +1,62 @@
+"""A small study that every test may copy: a rounded stump around a bone, two sites with records."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+STUDY = """
+[study]
+name = "stump"
+[surfaces]
+skin = "skin.stl"
+bones = { tibia = "tibia.stl" }
+[[sites]]
+name = "1"
+fitted = true
+trace = "1.csv"
+position = [40.0, 0.0, 60.0]
+[[sites]]
+name = "2"
+trace = "2.csv"
+position = [0.0, 40.0, 50.0]
+"""
+
+
+def stump(radius: float, length: float, top: float) -> pv.PolyData:
+    """Half an ellipsoid of revolution about z, closed by a flat cap at ``top``, outward."""
+    whole = pv.Icosphere(radius=1.0, nsub=4)
+    whole.points *= [radius, radius, length]
+    whole.points[:, 2] += top
+    half = whole.clip_closed_surface("-z", origin=(0, 0, top))
+    return half.triangulate().clean().compute_normals(auto_orient_normals=True, consistent_normals=True)
+
+
+def write_trace(path, *, depth=5.0, peak=6.0, touch=0.4, rate=100.0, header="time_s,displacement_mm,force_N"):
+    random = np.random.default_rng(1)
+    speed, span = 0.96, (depth + touch) / 0.96
+    time = np.arange(0.0, 2 * span, 1 / rate)
+    displacement = speed * (span - np.abs(time - span))
+    force = peak * np.clip((displacement - touch) / depth, 0, None) ** 1.3
+    force += random.normal(0, 0.03, time.size)
+    np.savetxt(path, np.column_stack([time, displacement, force]), delimiter=",", header=header, comments="")
+    return np.column_stack([time, displacement, force])
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pristine")
+    stump(42.0, 150.0, 120.0).save(folder / "skin.stl")
+    stump(13.0, 125.0, 126.0).save(folder / "tibia.stl")
+    for name in ("1", "2"):
+        write_trace(folder / f"{name}.csv")
+    (folder / "study.toml").write_text(STUDY)
+    return folder
+
+
+@pytest.fixture
+def study(pristine, tmp_path):
+    return shutil.copytree(pristine, tmp_path / "study")

@@ -1,0 +1,126 @@
+"""Runs that go on where they stopped, do nothing twice, and store what the report needs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from limbfit.mesh import read_vtu
+from limbfit.pipeline import Progress, run_study, simulate_site, study_status
+from limbfit.study import load_study
+
+COARSE = """
+[mesh]
+element = "tet4"
+edge_near_mm = 8.0
+edge_far_mm = 24.0
+near_radius_mm = 8.0
+growth = 1.0
+flatness = 2.0
+[solver]
+load_steps = 4
+unload_steps = 3
+[calibration]
+max_iterations = 2
+[execution]
+workers = 1
+[material]
+start = { c_kPa = 6.0, m = 4.0, gamma = 1.0, tau_s = 1.0 }
+"""
+
+
+def quiet(event: Progress) -> None:
+    """A listener that does nothing."""
+
+
+@pytest.fixture
+def coarse(study):
+    file = study / "study.toml"
+    file.write_text(file.read_text() + COARSE)
+    return study
+
+
+class StoppedError(Exception):
+    """Stands for a kill: nothing in limbfit catches it."""
+
+
+def stop_at(text: str):
+    def listen(event: Progress) -> None:
+        if text in event.text:
+            raise StoppedError
+
+    return listen
+
+
+def finished_simulations(study) -> dict[str, int]:
+    return {p.name: p.stat().st_mtime_ns for p in study.glob("results/.work-calibrate-*/runs/*.npz")}
+
+
+def test_interrupted_calibration_goes_on_and_ends_the_same(coarse, tmp_path_factory):
+    other = shutil.copytree(coarse, tmp_path_factory.mktemp("other") / "study")
+    with pytest.raises(StoppedError):
+        run_study(load_study(coarse), listener=stop_at("evaluation 3"))
+    kept = finished_simulations(coarse)
+    assert len(kept) >= 2
+    states = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
+    assert states["mesh"] == "done"
+    assert states["calibrate"] == "begun"
+    resumed = run_study(load_study(coarse), listener=quiet)
+    runs = coarse / "results/calibrate/runs"
+    assert all((runs / name).stat().st_mtime_ns == stamp for name, stamp in kept.items())
+    straight = run_study(load_study(other), listener=quiet)
+    for tissue, values in straight["parameters"].items():
+        for name, value in values.items():
+            assert resumed["parameters"][tissue][name] == pytest.approx(value, rel=1e-4)
+    assert resumed["mean_error_heldout_percent"] == pytest.approx(
+        straight["mean_error_heldout_percent"], rel=1e-3
+    )
+    check_stored(coarse)
+    check_repeated_run_does_nothing(coarse)
+
+
+def check_stored(study) -> None:
+    """Formats that ParaView, a spreadsheet and the report read."""
+    results = study / "results"
+    predicted = json.loads((results / "predict/predict.json").read_text())
+    assert [row["site"] for row in predicted["sites"]] == ["1", "2"]
+    assert all(row["completed"] for row in predicted["sites"])
+    curve = np.genfromtxt(results / "predict/1.csv", delimiter=",", names=True)
+    error = 100 * np.abs(curve["force_simulated_N"] - curve["force_measured_N"]).mean()
+    assert predicted["sites"][0]["error_percent"] == pytest.approx(
+        error / curve["force_measured_N"].max(), rel=1e-4
+    )
+    assert np.all(curve["force_low_N"] <= curve["force_high_N"])
+    mesh = read_vtu(results / "predict/1.vtu")
+    assert mesh.region_names == ("skin", "muscle")
+    report = (results / "report/report.html").read_text()
+    assert "stump" in report
+    run = json.loads((results / "run.json").read_text())
+    assert set(run["inputs"]) == {"skin.stl", "tibia.stl", "1.csv", "2.csv"}
+    assert all(stage["seconds"] > 0 for stage in run["stages"].values())
+    assert not [p for p in results.iterdir() if p.name.startswith((".work", ".old"))]
+
+
+def check_repeated_run_does_nothing(study) -> None:
+    told = []
+    run_study(load_study(study), listener=told.append)
+    assert {event.text for event in told} == {"is up to date"}
+
+
+def test_planned_indentation_is_simulated_without_a_record(coarse):
+    file = coarse / "study.toml"
+    planned = "depth_mm = 3.0\nposition = [0.0, 40.0, 50.0]"
+    file.write_text(file.read_text().replace('trace = "2.csv"\nposition = [0.0, 40.0, 50.0]', planned))
+    found = simulate_site(load_study(coarse), "2", parameters=None, listener=quiet)
+    assert found["completed"]
+    assert found["depth_mm"] == 3.0
+    assert found["parameters_from"] == "start of the study"
+    assert found["penetration_mm"] <= 0.0101 * 3.0
+    curve = np.genfromtxt(coarse / "results/simulate/2.csv", delimiter=",", names=True)
+    assert curve["force_N"].argmax() == pytest.approx(len(curve) // 2, abs=1)  # peak force at the peak depth
+    assert curve["force_N"].max() == pytest.approx(found["peak_force_N"], rel=0.02)
+    fields = read_vtu(coarse / "results/simulate/2.vtu")
+    assert len(fields.points) > 100
