@@ -108,7 +108,12 @@ def _surfaces(folder: Path) -> None:
         bone.triangulate().save(folder / f"bone-{name}.stl")
     _json(
         folder / "surfaces.json",
-        {"cut_point": [0, 0, 60], "cut_normal": [0, 0, 1], "volumes_cm3": {"skin": 1153.1, "tibia": 117.2}},
+        {
+            "cut_point": [0, 0, 60],
+            "cut_normal": [0, 0, 1],
+            "skin": {"volume_mm3": 1153100.0},
+            "bones": {"tibia": {"volume_mm3": 117200.0}},
+        },
     )
 
 

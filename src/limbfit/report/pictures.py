@@ -33,6 +33,8 @@ SKIN_SURFACE = "#d9a07c"
 MATT: dict[str, Any] = {"ambient": 0.35, "diffuse": 0.75, "specular": 0.0}
 FITTED, HELD_OUT = "#0072b2", "#d55e00"
 FIELD_MAP = "viridis"
+SIDES = ("anterior view", "left view", "posterior view", "right view")
+MARKER_COLOUR_MM = 4.0  # the height of a skin marker in the image
 FIELDS = (
     ("von_mises_kPa", "von Mises stress (kPa)"),
     ("displacement_mm", "displacement (mm)"),
@@ -145,13 +147,7 @@ def surface_figure(store: Store) -> Figure | None:
     for name, file in files.items():
         if name != "skin":
             plotter.add_mesh(pv.read(file), color=BONE, **MATT)
-    left, back, up = limb_frame(store)
-    sides = (("anterior", back), ("left", -left), ("posterior", -back), ("right", left))
-    points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
-    half = np.abs(points).max(axis=0) * 1.06 + 4
-    width = 2 * max(half[0], half[1]) + 8
-    size = (round(1000 * width / (2 * half[2])), 1000)
-    views = [View(np.array(skin.center), side, up, half[2], size) for _, side in sides]
+    views = _four_sides(store, skin)
     shots = [(_shoot(plotter, view), view, _facing(store, view)) for view in views]
     plotter.close()
     alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
@@ -159,8 +155,42 @@ def surface_figure(store: Store) -> Figure | None:
         "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
         "Filled: sites that were fitted; open: held out."
     )
-    markup = _strip(shots, [f"{name} view" for name, _ in sides], alt)
-    return Figure("model", markup, caption)
+    return Figure("model", _strip(shots, SIDES, alt), caption)
+
+
+@_without_display_warning()
+def marker_figure(store: Store) -> Figure | None:
+    """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
+    marked_file, plain_file = store.folder / "surfaces" / "skin-markers.stl", store.surface_files.get("skin")
+    if plain_file is None or not marked_file.is_file():
+        return None
+    plain = pv.read(plain_file)
+    marked = pv.read(marked_file).compute_implicit_distance(plain)
+    plotter = _plotter()
+    limits = (0.0, float(np.ceil(MARKER_COLOUR_MM)))
+    plotter.add_mesh(
+        marked, scalars="implicit_distance", clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, **MATT
+    )
+    views = _four_sides(store, plain)
+    shots = [(_shoot(plotter, view), view, _facing(store, view)) for view in views]
+    plotter.close()
+    alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
+    caption = (
+        "Skin of the image with markers, coloured by its distance from the skin without: each site of the "
+        "study was matched to one of the bumps."
+    )
+    bar = _colour_bar(limits, "distance (mm)")
+    return Figure("markers", _strip(shots, SIDES, alt) + bar, caption)
+
+
+def _four_sides(store: Store, skin: Any) -> list[View]:
+    """Views of the whole limb, in the order of ``SIDES``."""
+    left, back, up = limb_frame(store)
+    points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
+    half = np.abs(points).max(axis=0) * 1.06 + 4
+    width = 2 * max(half[0], half[1]) + 8
+    size = (round(1000 * width / (2 * half[2])), 1000)
+    return [View(np.array(skin.center), side, up, half[2], size) for side in (back, -left, -back, left)]
 
 
 def _facing(store: Store, view: View) -> list[Mark]:

@@ -140,13 +140,16 @@ def _verdict(store: Store) -> tuple[str, ...]:
     for name, word in stored.items():
         groups.setdefault(str(word), []).append(names.get(name, name))
     words = [f"{word.capitalize()}: {', '.join(found)}." for word, found in groups.items()]
-    return (*words, *(str(sentence) for sentence in uncertainty.get("combinations") or ()))
+    combinations = [str(sentence) for sentence in uncertainty.get("combinations") or ()]
+    told = [sentence for sentence in combinations if not sentence.endswith("not determined by these data")]
+    return (*words, *told)
 
 
 def model(store: Store) -> Section:
     """Surfaces, sites and volumes."""
     blocks = _blocks(
         pictures.surface_figure(store),
+        pictures.marker_figure(store),
         tables.volume_table(store),
         tables.place_table(store) if store.sites else None,
         otherwise="No surfaces and sites are stored yet.",
