@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ..errors import MeshingError
+from ..errors import MeshingError, ProblemError
 from ..mesh import Mesh, boundary_faces, check, quality, to_tet10
 from . import background
 from .background import BONE, FAR, LAYER, PLANE, TetGrid
@@ -191,9 +191,18 @@ def mesh_site(
         mesh = to_tet10(mesh)
         if settings.curved:
             mesh = curved(mesh, with_diagonals(mesh, _curved_target(mesh, fields), under))
-    check(mesh)
+    _check_usable(mesh)
     report = _report(mesh, base, settings, time.perf_counter() - start)
     return mesh.with_points(frame.to_patient(mesh.points)), report
+
+
+def _check_usable(mesh: Mesh) -> None:
+    try:
+        check(mesh)
+    except ProblemError as error:
+        raise MeshingError(
+            f"the mesh cannot be used: {error.what}; choose smaller edges, or round off sharp rims of the skin"
+        ) from None
 
 
 def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:

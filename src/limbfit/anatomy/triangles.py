@@ -285,16 +285,19 @@ def _near_pairs(surface: Surface) -> NDArray[np.int64]:
 
 
 def _pairs_within(centre: Array, radius: Array) -> NDArray[np.int64]:
-    """Pairs whose spheres meet; a few large faces are searched apart so that the rest stays local."""
-    usual = float(np.quantile(radius, 0.99))
-    small = np.flatnonzero(radius <= usual)
-    pairs = small[cKDTree(centre[small]).query_pairs(2 * usual, output_type="ndarray")]
-    found = [pairs]
-    tree = cKDTree(centre)
-    for face in np.flatnonzero(radius > usual):
-        near = np.array(tree.query_ball_point(centre[face], radius[face] + radius.max()), dtype=np.int64)
-        near = near[(near != face) & ((radius[near] <= usual) | (near > face))]
-        found.append(np.column_stack([np.full(len(near), face), near]))
+    """Pairs (p, 2) whose spheres may meet; faces of a size together, as large ones are few."""
+    octave = np.floor(np.log2(radius / radius.min())).astype(int)
+    groups = [np.flatnonzero(octave == k) for k in np.unique(octave)]
+    trees = [cKDTree(centre[group]) for group in groups]
+    found = []
+    for i, (group, tree) in enumerate(zip(groups, trees)):
+        reach = radius[group].max()
+        found.append(group[tree.query_pairs(2 * reach, output_type="ndarray")])
+        for larger, other in zip(groups[i + 1 :], trees[i + 1 :]):
+            near = other.query_ball_tree(tree, reach + radius[larger].max())
+            counts = [len(members) for members in near]
+            members = group[np.concatenate([np.array(m, dtype=np.int64) for m in near])]
+            found.append(np.column_stack([members, np.repeat(larger, counts)]))
     return np.concatenate(found).astype(np.int64).reshape(-1, 2)
 
 
