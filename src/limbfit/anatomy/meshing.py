@@ -201,7 +201,7 @@ def _check_usable(mesh: Mesh) -> None:
         check(mesh)
     except ProblemError as error:
         raise MeshingError(
-            f"the mesh cannot be used: {error.what}; choose smaller edges, or round off sharp rims of the skin"
+            f"the mesh cannot be used: {error.what}; choose smaller edges, or round off sharp skin"
         ) from None
 
 
