@@ -38,7 +38,7 @@ def edit(study, old: str, new: str) -> None:
     file.write_text(text.replace(old, new))
 
 
-def refused(call, study, *fragments: str) -> None:
+def check_refused(call, study, *fragments: str) -> None:
     """Exit code 2, one error line with all fragments, no traceback, no results."""
     for verb in ("check", "run"):
         code, out, err = call(verb, study)
@@ -112,7 +112,7 @@ def test_sites_lie_on_the_skin_with_inward_axes(limbfit, study):
 @pytest.mark.parametrize("name", ["skin.stl", "tibia.stl", "1.csv"])
 def test_missing_files(limbfit, study, name):
     (study / name).unlink()
-    refused(limbfit, study, "study.toml", name, "does not exist")
+    check_refused(limbfit, study, "study.toml", name, "does not exist")
 
 
 def test_no_study(limbfit, tmp_path):
@@ -123,28 +123,28 @@ def test_no_study(limbfit, tmp_path):
 
 def test_unknown_key(limbfit, study):
     edit(study, '[study]\nname = "stump"', '[study]\nname = "stump"\nnmae = 1')
-    refused(limbfit, study, "study.toml", "study.nmae", "unknown key")
+    check_refused(limbfit, study, "study.toml", "study.nmae", "unknown key")
 
 
 def test_open_surface(limbfit, study):
     surface = pv.read(study / "skin.stl")
     surface.extract_cells(range(20, surface.n_cells)).extract_surface(algorithm=None).save(study / "skin.stl")
-    refused(limbfit, study, "skin.stl", "open")
+    check_refused(limbfit, study, "skin.stl", "open")
 
 
 def test_inverted_surface(limbfit, study):
     pv.read(study / "tibia.stl").flip_faces().save(study / "tibia.stl")
-    refused(limbfit, study, "tibia.stl", "inward")
+    check_refused(limbfit, study, "tibia.stl", "inward")
 
 
 def test_bone_outside_the_skin(limbfit, study):
     pv.read(study / "tibia.stl").translate((35.0, 0, 0)).save(study / "tibia.stl")
-    refused(limbfit, study, "tibia", "outside")
+    check_refused(limbfit, study, "tibia", "outside")
 
 
 def test_site_off_the_skin(limbfit, study):
     edit(study, "position = [40.0, 0.0, 60.0]", "position = [46.5, 0.0, 60.0]")
-    refused(limbfit, study, "study.toml", "sites.1", "off the skin")
+    check_refused(limbfit, study, "study.toml", "sites.1", "off the skin")
 
 
 def rewrite(study, change) -> None:
@@ -185,7 +185,7 @@ def spoil_unit(table):
 )
 def test_bad_traces(limbfit, study, change, fragment):
     rewrite(study, change)
-    refused(limbfit, study, "1.csv", fragment)
+    check_refused(limbfit, study, "1.csv", fragment)
 
 
 def test_bad_usage(limbfit, study):
