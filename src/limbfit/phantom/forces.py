@@ -24,7 +24,7 @@ from .record import Ramp
 ELEMENT = "tet10p0"
 STEPS = StepControl(load_steps=12, unload_steps=8)
 MESHES = {
-    "coarse": MeshSettings(edge_near_mm=3.5, edge_far_mm=28.0, near_radius_mm=13.0, growth=0.6),
+    "coarse": MeshSettings(edge_near_mm=3.5, edge_far_mm=28.0, near_radius_mm=13.0, growth=0.7, flatness=1.3),
     "paper": MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
 }
 
