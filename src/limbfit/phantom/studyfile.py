@@ -43,6 +43,9 @@ flatness = 1.6
 [solver]
 load_steps = 8
 unload_steps = 6
+
+[calibration]
+relative_tolerance = 0.01
 """,
     "paper": "",
 }
