@@ -88,15 +88,15 @@ def square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
 
 def _samples(skin: Surface, centre: Array, width: float) -> tuple[Array, Array]:
     """Centroids and area vectors of small pieces of the faces near a footprint."""
-    corners = skin.points[skin.faces]
-    sphere = np.linalg.norm(corners.mean(axis=1) - centre, axis=1)
-    reach = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    corners = corners[sphere - reach < width]
-    while len(corners) and _longest_edge(corners) > SAMPLE_EDGE_MM:
-        corners = _quartered(corners)
-    centroids = corners.mean(axis=1)
-    near = np.linalg.norm(centroids - centre, axis=1) < width
-    return centroids[near], _area_vectors(corners[near])
+    corners, fine = skin.points[skin.faces], []
+    while len(corners):
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        close = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - edges < width
+        fine.append(corners[close & (edges <= SAMPLE_EDGE_MM)])
+        corners = _quartered(corners[close & (edges > SAMPLE_EDGE_MM)])
+    corners = np.concatenate(fine)
+    near = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < width
+    return corners[near].mean(axis=1), _area_vectors(corners[near])
 
 
 def _quartered(corners: Array) -> Array:
@@ -108,10 +108,6 @@ def _quartered(corners: Array) -> Array:
 
 def _area_vectors(corners: Array) -> Array:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
-
-
-def _longest_edge(corners: Array) -> float:
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
 def _unit(vector: Array) -> Array:
