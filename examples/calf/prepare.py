@@ -31,6 +31,10 @@ amputation_pad_mm = 15.0
 
 [mesh]
 element = "tet10"
+edge_near_mm = 4.0
+edge_far_mm = 20.0
+near_radius_mm = 14.0
+growth = 0.6
 
 [[sites]]                       # over the gastrocnemius: 45 mm and more of soft tissue
 name = "posterior"
