@@ -22,9 +22,9 @@ from ..indentation import SiteModel, build_problem, to_parameters
 from .record import Ramp
 
 ELEMENT = "tet10p0"
-STEPS = StepControl(load_steps=12, unload_steps=8)
+STEPS = StepControl(load_steps=10, unload_steps=8)
 MESHES = {
-    "coarse": MeshSettings(edge_near_mm=3.5, edge_far_mm=28.0, near_radius_mm=13.0, growth=0.7, flatness=1.3),
+    "coarse": MeshSettings(edge_near_mm=3.8, edge_far_mm=28.0, near_radius_mm=13.0, growth=0.8, flatness=1.6),
     "paper": MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
 }
 

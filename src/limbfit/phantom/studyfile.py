@@ -33,6 +33,9 @@ width_mm = {width:.1f}
 # A coarse phantom is there to be identified in minutes: the far field, which hardly strains, is meshed wide.
 _MESH = {
     "coarse": """
+[geometry]
+surface_edge_mm = 4.0
+
 [mesh]
 edge_near_mm = 5.0
 edge_far_mm = 30.0
@@ -41,8 +44,8 @@ growth = 0.9
 flatness = 1.6
 
 [solver]
-load_steps = 8
-unload_steps = 6
+load_steps = 7
+unload_steps = 5
 
 [calibration]
 relative_tolerance = 0.01
