@@ -20,6 +20,7 @@ markers = "mri/markers"   # the same limb with skin markers on
 
 [geometry]
 skin_layer_mm = 3.0       # skin and adipose tissue, uniform
+surface_edge_mm = {surface:.1f}
 
 [indenter]
 shape = "square"
@@ -33,9 +34,6 @@ width_mm = {width:.1f}
 # A coarse phantom is there to be identified in minutes: the far field, which hardly strains, is meshed wide.
 _MESH = {
     "coarse": """
-[geometry]
-surface_edge_mm = 4.0
-
 [mesh]
 edge_near_mm = 5.0
 edge_far_mm = 30.0
@@ -53,6 +51,8 @@ relative_tolerance = 0.01
     "paper": "",
 }
 
+_SURFACE_EDGE_MM = {"coarse": 4.0, "paper": 3.0}
+
 _SITE = """
 [[sites]]
 name = "{name}"
@@ -65,7 +65,8 @@ near = [{x:.1f}, {y:.1f}, {z:.1f}]
 
 def study_text(sites: Sequence[TrueSite], detail: str, seed: int) -> str:
     """The content of ``study.toml`` for some sites."""
-    parts = [_HEAD.format(seed=seed, detail=detail, width=INDENTER_MM, mesh=_MESH[detail])]
+    surface = _SURFACE_EDGE_MM[detail]
+    parts = [_HEAD.format(seed=seed, detail=detail, surface=surface, width=INDENTER_MM, mesh=_MESH[detail])]
     for site in sites:
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
