@@ -102,7 +102,7 @@ def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]
 
 
 def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
-    """The site's boundary-value problem: bones and proximal cut fixed, skin in contact with the indenter.
+    """The site's boundary-value problem: node sets ``fixed_*`` held, skin in contact with the indenter.
 
     Only skin near the indenter enters the contact: what it cannot reach costs time for nothing.
     """
@@ -120,7 +120,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     return Problem(
         mesh=mesh,
         materials=materials(parameters, model.kappa_ratio),
-        fixed=np.union1d(mesh.node_sets["fixed_bone"], mesh.node_sets["fixed_proximal"]),
+        fixed=np.unique(np.concatenate([n for s, n in mesh.node_sets.items() if s.startswith("fixed_")])),
         contact_faces=faces[near],
         indenter=indenter,
         history=History(np.array(model.knots_s), np.array(model.knots_mm)),
@@ -183,11 +183,14 @@ def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
     """Simulate an indentation and store its fields at the deepest point as VTU.
 
     Point data ``displacement_mm``; cell data ``J``, ``von_mises_kPa`` (Cauchy), ``largest_stretch``,
-    ``smallest_stretch`` and ``energy_kPa`` (long-term elastic energy density).
+    ``smallest_stretch`` and ``energy_kPa`` (long-term elastic energy density). A simulation that fails in its
+    first step has no fields, and no file is written.
     """
     problem = _problem(model, parameters)
     warm_start = _last.get(model)
     result = solve(problem, steps=_steps(model), warm_start=warm_start, store="peak")
+    if not result.states:
+        return result
     fields = _element_fields(result)
     cell_data = {
         "J": fields.J,

@@ -63,7 +63,7 @@ def simulate_site(
         "element": result.statistics["element"],
         "unknowns": result.statistics["unknowns"],
         "curve": str(curve),
-        "fields": str(folder / f"{name}.vtu"),
+        "fields": str(folder / f"{name}.vtu") if result.states else None,
     }
     write_json(folder / f"{name}.json", found)
     return found
