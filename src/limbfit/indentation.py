@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fe import History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
+from .fe.laws import Laws
 from .fe.observables import ElementFields, element_fields
-from .fe.system import Laws
 from .mesh import Mesh, read_vtu, write_vtu
 from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable
 

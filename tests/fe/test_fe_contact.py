@@ -11,8 +11,9 @@ from blocks import MUSCLE, SKIN, block, punch
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
 from limbfit.fe.indenter import signed_distance
+from limbfit.fe.laws import Laws
 from limbfit.fe.linear import symmetric_product
-from limbfit.fe.system import Increment, Laws
+from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
 
 SHAPES = [("square", 0.0), ("square", 2.0), ("sphere", 0.0), ("cylinder", 0.0), ("cylinder", 2.0)]

@@ -9,9 +9,10 @@ import pytest
 from blocks import block
 
 from limbfit.fe import ELEMENTS, History, OgdenQLV, Problem, Support, System, solve
+from limbfit.fe.laws import Laws
 from limbfit.fe.observables import element_fields
 from limbfit.fe.stepping import StepControl, iterate
-from limbfit.fe.system import Increment, Laws
+from limbfit.fe.system import Increment
 
 NAMES = sorted(ELEMENTS)
 TISSUE = OgdenQLV(0.005, 4.8, 3.6, 0.3)

@@ -9,8 +9,8 @@ import pytest
 from feb_reader import Feb, read_feb, read_log
 
 from limbfit.fe import History, Indenter, Problem, StepControl, Support, System, iterate, solve
+from limbfit.fe.laws import Laws
 from limbfit.fe.observables import element_fields
-from limbfit.fe.system import Laws
 from limbfit.mesh import Mesh
 
 REFERENCE = Path(__file__).parents[2] / ".." / "shared" / "reference"

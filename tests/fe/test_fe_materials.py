@@ -9,11 +9,11 @@ from blocks import block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, StepControl, Support, System, iterate
 from limbfit.fe.kinematics import logarithmic_stretches, principal
+from limbfit.fe.laws import Laws
 from limbfit.fe.materials import VOLUMETRIC_LAWS, prony_factors
 from limbfit.fe.materials.ogden import ogden
 from limbfit.fe.materials.volumetric import volumetric
 from limbfit.fe.observables import element_fields
-from limbfit.fe.system import Laws
 
 LAW = OgdenQLV(0.00522, 4.79, 3.57, 0.32)
 

@@ -9,9 +9,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .kinematics import deformation_gradient, from_principal, logarithmic_stretches, principal
+from .laws import Laws
 from .materials import prony_factors
 from .materials.ogden import ogden
-from .system import Increment, Laws, System
+from .system import Increment, System
 
 Array = NDArray[np.float64]
 

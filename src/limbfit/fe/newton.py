@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .factor import Factor
-from .system import Evaluation, Increment, Laws, System
+from .laws import Laws
+from .system import Evaluation, Increment, System
 
 Array = NDArray[np.float64]
 ACTIVE_SET_SWEEPS = 6

@@ -16,10 +16,11 @@ from .kinematics import (
     principal,
     push_forward,
 )
+from .laws import Laws
 from .materials.ogden import ogden
 from .materials.volumetric import volumetric
 from .result import State
-from .system import Laws, System
+from .system import System
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from .history import Memory
 from .kinematics import deformation_gradient, from_principal, logarithmic_stretches, principal
+from .laws import Laws
 from .materials import prony_factors
 from .materials.ogden import ogden, ogden_derivative
 from .materials.volumetric import volumetric
-from .system import Increment, Laws, System
+from .system import Increment, System
 
 Array = NDArray[np.float64]
 

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from .factor import Factor
 from .history import Memory
+from .laws import Laws
 from .newton import Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .problem import History, Problem
 from .result import Result, State, Step
 from .sensitivity import MemoryDerivative
-from .system import Evaluation, Increment, Laws, System
+from .system import Evaluation, Increment, System
 
 Array = NDArray[np.float64]
 

@@ -17,61 +17,10 @@ from .assembly import assemble
 from .contact import ContactSurface, Touch, contact, touching_offset
 from .elements import Element, reference_gradients
 from .indenter import Indenter
-from .materials import OgdenQLV
+from .laws import Laws
 from .problem import Problem, ProblemError, check
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Laws:
-    """Materials of all regions as padded arrays; see `MaterialTable`.
-
-    ``parameter_index (r, p)`` says which global parameter each region's p-th one is (-1: none).
-    """
-
-    terms: Array
-    kappa: Array
-    law: NDArray[np.int64]
-    prony: Array
-    d_terms: Array
-    d_kappa: Array
-    d_prony: Array
-    parameter_index: NDArray[np.int64]
-    modulus: float
-    modulus_gradient: Array
-
-    @property
-    def tables(self) -> tuple[Array, Array, NDArray[np.int64]]:
-        return self.terms, self.kappa, self.law
-
-    @property
-    def count(self) -> int:
-        """Number of parameters of all regions."""
-        return len(self.modulus_gradient)
-
-    @classmethod
-    def build(cls, materials: list[OgdenQLV]) -> Laws:
-        tables, slopes = [m.table() for m in materials], [m.derivatives() for m in materials]
-        K = max(len(t.terms) for t in tables)
-        L = max(len(t.prony) for t in tables)
-        P = max(len(d) for d in slopes)
-        R = len(materials)
-        terms, prony = np.tile([0.0, 1.0], (R, K, 1)), np.tile([0.0, 1.0], (R, L, 1))
-        d_terms, d_prony, d_kappa = np.zeros((R, P, K, 2)), np.zeros((R, P, L, 2)), np.zeros((R, P))
-        index, at = np.full((R, P), -1), 0
-        for r, (table, slope) in enumerate(zip(tables, slopes)):
-            terms[r, : len(table.terms)], prony[r, : len(table.prony)] = table.terms, table.prony
-            for p, d in enumerate(slope):
-                d_terms[r, p, : len(d.terms)], d_prony[r, p, : len(d.prony)] = d.terms, d.prony
-                d_kappa[r, p] = d.kappa
-                index[r, p] = at
-                at += 1
-        modulus = float(np.mean([m.instantaneous_modulus for m in materials]))
-        gradient = np.concatenate([m.instantaneous_modulus_gradient for m in materials]) / R
-        kappa = np.array([t.kappa for t in tables])
-        law = np.array([t.volumetric for t in tables])
-        return cls(terms, kappa, law, prony, d_terms, d_kappa, d_prony, index, modulus, gradient)
 
 
 @dataclass(frozen=True)
