@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from .elements import ELEMENTS
 from .indenter import Indenter
-from .materials import OgdenQLV
+from .materials import VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .stepping import StepControl, iterate, solve
@@ -25,8 +25,13 @@ from .system import System
 
 __all__ = [
     "ELEMENTS",
+    "VOLUMETRIC_LAWS",
     "History",
     "Indenter",
+    "Material",
+    "MooneyRivlin",
+    "NeoHookean",
+    "Ogden",
     "OgdenQLV",
     "Problem",
     "Result",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .materials import OgdenQLV
+from .materials import Material
 
 Array = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ class Laws:
         return len(self.modulus_gradient)
 
     @classmethod
-    def build(cls, materials: list[OgdenQLV]) -> Laws:
+    def build(cls, materials: Sequence[Material]) -> Laws:
         tables, slopes = [m.table() for m in materials], [m.derivatives() for m in materials]
         K = max(len(t.terms) for t in tables)
         L = max(len(t.prony) for t in tables)

@@ -12,7 +12,7 @@ from ..errors import ProblemError
 from ..mesh import Mesh
 from .elements import ELEMENTS, Element, reference_gradients
 from .indenter import Indenter
-from .materials import OgdenQLV
+from .materials import Material
 
 FACE_NODES = {"tet4": 3, "tet10": 6, "hex8": 4}
 
@@ -82,7 +82,7 @@ class Problem:
     """
 
     mesh: Mesh
-    materials: Mapping[str, OgdenQLV]
+    materials: Mapping[str, Material]
     fixed: NDArray[np.int64]
     contact_faces: NDArray[np.int64]
     indenter: Indenter | None
@@ -93,7 +93,7 @@ class Problem:
     contact_rule: str = "nodes"
     name: str = field(default="", compare=False)
 
-    def with_materials(self, materials: Mapping[str, OgdenQLV]) -> Problem:
+    def with_materials(self, materials: Mapping[str, Material]) -> Problem:
         """The same problem with other materials; a prepared system stays valid."""
         return replace(self, materials=materials)
 

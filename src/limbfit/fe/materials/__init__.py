@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
-from .ogden import MaterialTable, OgdenQLV
+from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from .material import Material, MaterialTable
 from .viscoelastic import prony_factors
 from .volumetric import VOLUMETRIC_LAWS
 
-__all__ = ["VOLUMETRIC_LAWS", "MaterialTable", "OgdenQLV", "prony_factors"]
+__all__ = [
+    "VOLUMETRIC_LAWS",
+    "Material",
+    "MaterialTable",
+    "MooneyRivlin",
+    "NeoHookean",
+    "Ogden",
+    "OgdenQLV",
+    "prony_factors",
+]

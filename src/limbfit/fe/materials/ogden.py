@@ -1,4 +1,4 @@
-"""Ogden hyperelasticity in principal logarithmic stretches, and the paper's material.
+"""Ogden hyperelasticity in principal logarithmic stretches: the kernels of every law of this room.
 
 ``W = sum_k c_k/m_k^2 sum_i (exp(m_k e_i) - 1)`` with ``e_i = ln(lambda_i) - ln(J)/3``.  All differences of
 principal values are divided differences of exponentials, so that the tangent is exact where stretches
@@ -7,91 +7,8 @@ repeat.  Neo-Hookean (m = 2) and Mooney-Rivlin (m = 2, -2) are tables of terms o
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
-
-from ...errors import ProblemError
-from .volumetric import VOLUMETRIC_LAWS
-
-
-@dataclass(frozen=True)
-class MaterialTable:
-    """What the kernels know of a material, or a derivative of it.
-
-    ``terms (k, 2)``: Ogden moduli c_k (MPa) and exponents m_k; ``kappa``: bulk modulus (MPa);
-    ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law.
-    """
-
-    terms: NDArray[np.float64]
-    kappa: float
-    prony: NDArray[np.float64]
-    volumetric: int = 0
-
-
-@dataclass(frozen=True)
-class OgdenQLV:
-    """The paper's tissue: symmetric second-order Ogden with one relaxation term.
-
-    ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``.
-
-    Parameters
-    ----------
-    c : long-term shear modulus of small strains, MPa.
-    m : exponent.
-    gamma : relaxation amplitude, dimensionless (0: elastic).
-    tau : relaxation time, s.
-    kappa_ratio : bulk modulus over ``c``; the bulk modulus moves with ``c``.
-    """
-
-    c: float
-    m: float
-    gamma: float
-    tau: float
-    kappa_ratio: float = 100.0
-
-    parameter_names = ("c", "m", "gamma", "tau")
-
-    def __post_init__(self) -> None:
-        for name in ("c", "m", "tau", "kappa_ratio"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ProblemError(f"material parameter {name} = {value} is not positive")
-        if not (math.isfinite(self.gamma) and self.gamma >= 0):
-            raise ProblemError(f"material parameter gamma = {self.gamma} is negative")
-
-    @property
-    def parameters(self) -> tuple[float, ...]:
-        return self.c, self.m, self.gamma, self.tau
-
-    @property
-    def instantaneous_modulus(self) -> float:
-        """``c (1 + gamma)``, MPa."""
-        return self.c * (1.0 + self.gamma)
-
-    @property
-    def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
-        """Derivative of `instantaneous_modulus` with respect to each parameter."""
-        return 1.0 + self.gamma, 0.0, self.c, 0.0
-
-    def table(self) -> MaterialTable:
-        """The material as the kernels read it."""
-        terms = np.array([[self.c, self.m], [self.c, -self.m]])
-        prony = np.array([[self.gamma, self.tau]])
-        return MaterialTable(terms, self.kappa_ratio * self.c, prony, VOLUMETRIC_LAWS["log"])
-
-    def derivatives(self) -> tuple[MaterialTable, ...]:
-        """Derivative of the table with respect to each parameter."""
-        none, still = np.zeros((2, 2)), np.zeros((1, 2))
-        return (
-            MaterialTable(np.array([[1.0, 0.0], [1.0, 0.0]]), self.kappa_ratio, still),
-            MaterialTable(np.array([[0.0, 1.0], [0.0, -1.0]]), 0.0, still),
-            MaterialTable(none, 0.0, np.array([[1.0, 0.0]])),
-            MaterialTable(none, 0.0, np.array([[0.0, 1.0]])),
-        )
 
 
 @njit(cache=True)

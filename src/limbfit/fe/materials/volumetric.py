@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-VOLUMETRIC_LAWS = {"log": 0, "nike3d": 1, "abaqus": 2}
+# FEBio's default, NIKE3D, Abaqus and Abaqus-GOH; the last, kappa/2 ((J^2 - 1)/2 - ln J), is the second.
+VOLUMETRIC_LAWS = {"log": 0, "nike3d": 1, "abaqus": 2, "abaqus-goh": 1}
 
 
 @njit(cache=True)

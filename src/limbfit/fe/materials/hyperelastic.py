@@ -1,0 +1,198 @@
+"""The material laws, each with its parameters; their moduli follow FEBio's conventions.
+
+==================  ===================================================================================
+`OgdenQLV`          ``c/m^2 sum_i (lt_i^m + lt_i^-m - 2)``, one relaxation term: the paper's tissue
+`Ogden`             ``sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``, up to six terms
+`NeoHookean`        ``mu/2 (I1 - 3)``
+`MooneyRivlin`      ``c1 (I1 - 3) + c2 (I2 - 3)``
+==================  ===================================================================================
+
+``I1, I2`` are the invariants of the isochoric stretches: ``I1 = sum lt_i^2``, ``I2 = sum lt_i^-2``.
+Source: FEBio user manual, uncoupled materials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import ProblemError
+from .material import Array, PronyTerms, Uncoupled, finite, not_negative, pairs, positive
+
+MAX_OGDEN_TERMS = 6  # as FEBio
+
+
+@dataclass(frozen=True)
+class OgdenQLV(Uncoupled):
+    """The paper's tissue: symmetric second-order Ogden with one relaxation term.
+
+    ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``.
+
+    Parameters
+    ----------
+    c : long-term shear modulus of small strains, MPa.
+    m : exponent.
+    gamma : relaxation amplitude, dimensionless (0: elastic).
+    tau : relaxation time, s.
+    kappa_ratio : bulk modulus over ``c``; the bulk modulus moves with ``c``.
+    """
+
+    c: float
+    m: float
+    gamma: float
+    tau: float
+    kappa_ratio: float = 100.0
+
+    parameter_names = ("c", "m", "gamma", "tau")
+    volumetric = "log"
+
+    def __post_init__(self) -> None:
+        for name in ("c", "m", "tau", "kappa_ratio"):
+            positive(name, getattr(self, name))
+        not_negative("gamma", self.gamma)
+
+    @property
+    def prony(self) -> PronyTerms:
+        return ((self.gamma, self.tau),)
+
+    @property
+    def elastic_parameters(self) -> tuple[float, ...]:
+        return self.c, self.m
+
+    def ogden_terms(self) -> Array:
+        return np.array([[self.c, self.m], [self.c, -self.m]])
+
+    def ogden_term_derivatives(self) -> Array:
+        return np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
+
+
+@dataclass(frozen=True)
+class Ogden(Uncoupled):
+    """Ogden's law: ``W = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3) + U(J)``.
+
+    Parameters
+    ----------
+    terms : one to six (c_k, m_k): modulus in MPa, exponent.  Single moduli may be negative, their sum, twice
+        the shear modulus of small strains, may not.
+    prony : (g_l, tau_l): amplitude, relaxation time in s; any number.
+    kappa_ratio : bulk modulus over the long-term shear modulus ``sum c_k / 2``.
+    volumetric : name in `VOLUMETRIC_LAWS`.
+
+    Raises
+    ------
+    ProblemError
+        Where no material has such parameters.
+    """
+
+    terms: PronyTerms
+    prony: PronyTerms = ()
+    kappa_ratio: float = 100.0
+    volumetric: str = "log"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", pairs("the terms", self.terms))
+        object.__setattr__(self, "prony", pairs("the Prony terms", self.prony))
+        if not 1 <= len(self.terms) <= MAX_OGDEN_TERMS:
+            raise ProblemError(f"an Ogden material has 1 to {MAX_OGDEN_TERMS} terms, not {len(self.terms)}")
+        for k, (c, m) in enumerate(self.terms, 1):
+            finite(f"c{k}", c)
+            finite(f"m{k}", m)
+            if m == 0.0:
+                raise ProblemError(f"material parameter m{k} is zero")
+        self._check_shared()
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return *_numbered(("c", "m"), len(self.terms)), *_prony_names(self)
+
+    @property
+    def elastic_parameters(self) -> tuple[float, ...]:
+        return tuple(value for term in self.terms for value in term)
+
+    def ogden_terms(self) -> Array:
+        return np.array(self.terms, dtype=float)
+
+    def ogden_term_derivatives(self) -> Array:
+        count = 2 * len(self.terms)
+        return np.eye(count).reshape(count, -1, 2)
+
+
+@dataclass(frozen=True)
+class NeoHookean(Uncoupled):
+    """The uncoupled neo-Hookean law: ``W = mu/2 (I1 - 3) + U(J)``.
+
+    Parameters
+    ----------
+    mu : long-term shear modulus, MPa.
+    prony, kappa_ratio, volumetric : as `Ogden`.
+    """
+
+    mu: float
+    prony: PronyTerms = ()
+    kappa_ratio: float = 100.0
+    volumetric: str = "log"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "prony", pairs("the Prony terms", self.prony))
+        positive("mu", self.mu)
+        self._check_shared()
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return "mu", *_prony_names(self)
+
+    @property
+    def elastic_parameters(self) -> tuple[float, ...]:
+        return (self.mu,)
+
+    def ogden_terms(self) -> Array:
+        return np.array([[2.0 * self.mu, 2.0]])
+
+    def ogden_term_derivatives(self) -> Array:
+        return np.array([[[2.0, 0.0]]])
+
+
+@dataclass(frozen=True)
+class MooneyRivlin(Uncoupled):
+    """The Mooney-Rivlin law: ``W = c1 (I1 - 3) + c2 (I2 - 3) + U(J)``.
+
+    Parameters
+    ----------
+    c1, c2 : moduli, MPa; the shear modulus of small strains, ``2 (c1 + c2)``, is positive.
+    prony, kappa_ratio, volumetric : as `Ogden`.
+    """
+
+    c1: float
+    c2: float
+    prony: PronyTerms = ()
+    kappa_ratio: float = 100.0
+    volumetric: str = "log"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "prony", pairs("the Prony terms", self.prony))
+        finite("c1", self.c1)
+        finite("c2", self.c2)
+        self._check_shared()
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return "c1", "c2", *_prony_names(self)
+
+    @property
+    def elastic_parameters(self) -> tuple[float, ...]:
+        return self.c1, self.c2
+
+    def ogden_terms(self) -> Array:
+        return np.array([[4.0 * self.c1, 2.0], [4.0 * self.c2, -2.0]])
+
+    def ogden_term_derivatives(self) -> Array:
+        return np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [4.0, 0.0]]])
+
+
+def _prony_names(material: Uncoupled) -> tuple[str, ...]:
+    return _numbered(("g", "tau"), len(material.prony))
+
+
+def _numbered(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    return tuple(f"{name}{k}" for k in range(1, count + 1) for name in names)

@@ -1,0 +1,192 @@
+"""What the solver asks of a material, and what the laws of this room share.
+
+Every law here is *uncoupled*: ``W = W_dev(lt_1, lt_2, lt_3) + U(J)`` with ``lt_i = J^(-1/3) lambda_i``, a
+deviatoric part that is a sum of Ogden terms,
+``W_dev = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``, and a relaxation function
+``G(t) = 1 + sum_l g_l exp(-t/tau_l)`` on the deviatoric stress (FEBio's "uncoupled viscoelastic", g0 = 1).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import ProblemError
+from .volumetric import VOLUMETRIC_LAWS
+
+Array = NDArray[np.float64]
+PronyTerms = Sequence[tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class MaterialTable:
+    """What the kernels know of a material, or a derivative of it.
+
+    ``terms (k, 2)``: Ogden moduli c_k (MPa) and exponents m_k; ``kappa``: bulk modulus (MPa);
+    ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law.
+    """
+
+    terms: Array
+    kappa: float
+    prony: Array
+    volumetric: int = 0
+
+
+class Material(Protocol):
+    """A material of a `Problem`.
+
+    Sensitivities are with respect to ``parameters``, in their order; units mm, N, s, MPa.
+    """
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, unique within the material."""
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Their values."""
+
+    @property
+    def instantaneous_modulus(self) -> float:
+        """Shear modulus of small, sudden strains, MPa."""
+
+    @property
+    def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
+        """Derivative of `instantaneous_modulus` with respect to each parameter."""
+
+    def table(self) -> MaterialTable:
+        """The material as the kernels read it."""
+
+    def derivatives(self) -> tuple[MaterialTable, ...]:
+        """Derivative of the table with respect to each parameter."""
+
+
+class Uncoupled(ABC):
+    """The tables of a law that says which Ogden terms it is made of.
+
+    ``kappa_ratio`` is the bulk modulus over the long-term shear modulus of small strains: a law given by its
+    bulk modulus ``k`` has ``kappa_ratio = k / shear_modulus``.  The bulk modulus moves with the shear
+    modulus, so that an identified material keeps its compressibility.
+    """
+
+    @property
+    @abstractmethod
+    def kappa_ratio(self) -> float:
+        """Bulk modulus over `shear_modulus`."""
+
+    @property
+    @abstractmethod
+    def volumetric(self) -> str:
+        """Name in `VOLUMETRIC_LAWS`."""
+
+    @property
+    @abstractmethod
+    def prony(self) -> PronyTerms:
+        """Amplitude g_l and relaxation time tau_l (s) of each relaxation term."""
+
+    @property
+    @abstractmethod
+    def elastic_parameters(self) -> tuple[float, ...]:
+        """The parameters before those of relaxation."""
+
+    @abstractmethod
+    def ogden_terms(self) -> Array:
+        """Moduli c_k (MPa) and exponents m_k (k, 2)."""
+
+    @abstractmethod
+    def ogden_term_derivatives(self) -> Array:
+        """Derivative (p, k, 2) of `ogden_terms` with respect to each elastic parameter."""
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Elastic parameters, then g_1, tau_1, g_2, ..."""
+        return *self.elastic_parameters, *(value for term in self.prony for value in term)
+
+    @property
+    def shear_modulus(self) -> float:
+        """Long-term shear modulus of small strains, ``sum c_k / 2``, MPa."""
+        return float(self.ogden_terms()[:, 0].sum() / 2.0)
+
+    @property
+    def instantaneous_modulus(self) -> float:
+        """``shear_modulus (1 + sum g_l)``, MPa."""
+        return self.shear_modulus * self._relaxation
+
+    @property
+    def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
+        """Derivative of `instantaneous_modulus` with respect to each parameter."""
+        elastic = [float(d) * self._relaxation for d in self._shear_modulus_gradient]
+        return *elastic, *[self.shear_modulus, 0.0] * len(self.prony)
+
+    @property
+    def _relaxation(self) -> float:
+        return 1.0 + sum(g for g, _ in self.prony)
+
+    @property
+    def _shear_modulus_gradient(self) -> Array:
+        return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
+
+    def table(self) -> MaterialTable:
+        """The material as the kernels read it."""
+        prony = np.array(self.prony, dtype=float).reshape(-1, 2)
+        law = VOLUMETRIC_LAWS[self.volumetric]
+        return MaterialTable(self.ogden_terms(), self.kappa_ratio * self.shear_modulus, prony, law)
+
+    def derivatives(self) -> tuple[MaterialTable, ...]:
+        """Derivative of the table with respect to each parameter."""
+        still, slopes = np.zeros((len(self.prony), 2)), self._shear_modulus_gradient
+        elastic = [
+            MaterialTable(terms, float(self.kappa_ratio * slope), still)
+            for terms, slope in zip(self.ogden_term_derivatives(), slopes)
+        ]
+        rest, units = np.zeros_like(self.ogden_terms()), np.eye(2 * len(self.prony))
+        return *elastic, *(MaterialTable(rest, 0.0, unit.reshape(-1, 2)) for unit in units)
+
+    def _check_shared(self) -> None:
+        """Raise `ProblemError` where what all laws share is impossible."""
+        positive("kappa_ratio", self.kappa_ratio)
+        if self.volumetric not in VOLUMETRIC_LAWS:
+            known = ", ".join(VOLUMETRIC_LAWS)
+            raise ProblemError(f"unknown volumetric law {self.volumetric!r}", remedy=f"use one of {known}")
+        for l, (g, tau) in enumerate(self.prony, 1):
+            not_negative(f"g{l}", g)
+            positive(f"tau{l}", tau)
+        if not self.shear_modulus > 0:
+            raise ProblemError(
+                f"the shear modulus of small strains is {self.shear_modulus:.4g} MPa, not positive",
+                remedy="check the signs of the moduli",
+            )
+
+
+def finite(name: str, value: float) -> None:
+    """Raise `ProblemError` unless ``value`` is a finite number."""
+    if not math.isfinite(value):
+        raise ProblemError(f"material parameter {name} = {value} is not finite")
+
+
+def positive(name: str, value: float) -> None:
+    """Raise `ProblemError` unless ``value`` is finite and above zero."""
+    finite(name, value)
+    if not value > 0:
+        raise ProblemError(f"material parameter {name} = {value} is not positive")
+
+
+def not_negative(name: str, value: float) -> None:
+    """Raise `ProblemError` unless ``value`` is finite and zero or above."""
+    finite(name, value)
+    if value < 0:
+        raise ProblemError(f"material parameter {name} = {value} is negative")
+
+
+def pairs(name: str, values: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
+    """``values`` as a tuple of pairs of numbers."""
+    try:
+        return tuple((float(a), float(b)) for a, b in values)
+    except (TypeError, ValueError):
+        raise ProblemError(f"{name} of a material are not pairs of numbers") from None
