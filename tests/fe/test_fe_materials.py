@@ -162,7 +162,7 @@ def test_forces_and_stiffness_are_derivatives_of_the_energy(law, stretches):
 
 
 def affine(law, direction, times, history) -> list[np.ndarray]:
-    """Cauchy stresses (6,) at the steps of a block whose boundary moves by ``displacement(t) direction X``."""
+    """Cauchy stresses (6,) at the steps of a block; its boundary moves by ``displacement(t) direction X``."""
     lines = np.array([0.0, 0.5, 1.0])
     mesh = block("hex8", lines, lines, lines)
     X = mesh.points
