@@ -10,6 +10,7 @@ Everything the command line does is one call away:
 ``limbfit status``        ``study_status(load_study(path))``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
+``limbfit bench``         ``bench_febio_parity(tell=print)``, ``bench_forward(..)``, ``bench_scaling(..)``
 ========================  =========================================================
 
 Names are loaded when first used, so that a worker process that only solves does not load images and graphics.
@@ -26,6 +27,9 @@ _HOME = {
     "Study": "study",
     "load_study": "study",
     "Progress": "pipeline",
+    "bench_febio_parity": "bench",
+    "bench_forward": "bench",
+    "bench_scaling": "bench",
     "check_study": "pipeline",
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",

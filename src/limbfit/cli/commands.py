@@ -1,51 +1,24 @@
-"""The command line: one verb, one library call; the only place that prints and exits.
-
-Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 130 interrupted (the study can be resumed).
-"""
+"""The verbs of a study, in the order of ``limbfit --help``."""
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
-from . import __version__, pipeline
-from .errors import InputError, LimbfitError
-from .study import PARAMETERS, TISSUES, load_study
+import limbfit
 
-app = typer.Typer(
-    name="limbfit",
-    help="Patient-specific viscoelastic finite-element models of residual limbs, from MRI and indentations.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    add_completion=False,
-)
-STDOUT = Console(highlight=False, markup=False)
-STDERR = Console(stderr=True, highlight=False, markup=False)
+from ..errors import InputError
+from ..study import PARAMETERS, TISSUES
+from .console import STDERR, STDOUT, AsJson, listening, print_json
 
 StudyPath = Annotated[
     Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object and nothing else")]
 
 
 class Detail(StrEnum):
@@ -64,16 +37,6 @@ class StageName(StrEnum):
     report = "report"
 
 
-@app.callback(invoke_without_command=True)
-def top(
-    version: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False,
-) -> None:
-    if version:
-        STDOUT.print(f"limbfit {__version__}")
-        raise typer.Exit
-
-
-@app.command()
 def demo(
     folder: Annotated[Path, typer.Argument(help="where to put the demo study")] = Path("limbfit-demo"),
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
@@ -82,12 +45,11 @@ def demo(
     """Make a coarse synthetic patient and identify it: the whole path, from DICOM to report."""
     start = perf_counter()
     with listening() as listener:
-        summary = pipeline.run_demo(folder, seed=seed, listener=listener)
+        summary = limbfit.run_demo(folder, seed=seed, listener=listener)
     summary["seconds"] = round(perf_counter() - start, 1)
     show_summary(summary, as_json)
 
 
-@app.command()
 def phantom(
     folder: Annotated[Path, typer.Argument(help="a folder that does not exist yet", show_default=False)],
     detail: Annotated[
@@ -98,18 +60,17 @@ def phantom(
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
     with listening() as listener:
-        truth = pipeline.make_phantom_study(folder, detail=detail.value, seed=seed, listener=listener)
+        truth = limbfit.make_phantom_study(folder, detail=detail.value, seed=seed, listener=listener)
     if as_json:
         print_json({"study": str(folder / "study.toml"), **truth})
     else:
         STDOUT.print(f"synthetic patient in {folder}; next: limbfit run {folder}")
 
 
-@app.command()
 def check(study: StudyPath, as_json: AsJson = False) -> None:
     """Read every input of a study and say what is wrong with it, before anything runs."""
     with listening() as listener:
-        findings = pipeline.check_study(load_study(study), listener=listener)
+        findings = limbfit.check_study(limbfit.load_study(study), listener=listener)
     if as_json:
         print_json(findings)
         return
@@ -118,7 +79,6 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
     STDOUT.print("the study can be run")
 
 
-@app.command()
 def run(
     study: StudyPath,
     until: Annotated[StageName | None, typer.Option(help="stop after this stage")] = None,
@@ -127,17 +87,16 @@ def run(
     """Do every stage that is missing or stale; a stopped run goes on where it stopped."""
     start = perf_counter()
     with listening() as listener:
-        summary = pipeline.run_study(
-            load_study(study), until=until.value if until else None, listener=listener
+        summary = limbfit.run_study(
+            limbfit.load_study(study), until=until.value if until else None, listener=listener
         )
     summary["seconds"] = round(perf_counter() - start, 1)
     show_summary(summary, as_json)
 
 
-@app.command()
 def status(study: StudyPath, as_json: AsJson = False) -> None:
     """Say which stages are done, begun, stale or missing."""
-    states = pipeline.study_status(load_study(study))
+    states = limbfit.study_status(limbfit.load_study(study))
     if as_json:
         print_json({"stages": states})
         return
@@ -148,7 +107,6 @@ def status(study: StudyPath, as_json: AsJson = False) -> None:
     STDOUT.print(table)
 
 
-@app.command()
 def simulate(
     study: StudyPath,
     site: Annotated[str, typer.Option(help="name of the site", show_default=False)],
@@ -160,8 +118,8 @@ def simulate(
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
     with listening() as listener:
-        found = pipeline.simulate_site(
-            load_study(study), site, parameters=parse_parameters(parameters), listener=listener
+        found = limbfit.simulate_site(
+            limbfit.load_study(study), site, parameters=parse_parameters(parameters), listener=listener
         )
     if as_json:
         print_json(found)
@@ -177,11 +135,10 @@ def simulate(
         raise typer.Exit(1)
 
 
-@app.command()
 def report(study: StudyPath, as_json: AsJson = False) -> None:
     """Make the report anew from what is stored; nothing is solved."""
     with listening() as listener:
-        summary = pipeline.report_study(load_study(study), listener=listener)
+        summary = limbfit.report_study(limbfit.load_study(study), listener=listener)
     show_summary(summary, as_json)
 
 
@@ -200,10 +157,6 @@ def parse_parameters(text: str | None) -> dict[str, dict[str, float]] | None:
         )
     numbers = iter(values)
     return {tissue: {name: next(numbers) for name in PARAMETERS} for tissue in TISSUES}
-
-
-def print_json(content: Any) -> None:
-    sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def show_summary(summary: dict[str, Any], as_json: bool) -> None:
@@ -242,64 +195,4 @@ def show_sites(summary: dict[str, Any]) -> None:
             STDOUT.print(f"mean error at the {kind} sites: {summary[key]:.2f} %")
 
 
-@contextmanager
-def listening() -> Iterator[Callable[[pipeline.Progress], None]]:
-    """A listener that draws bars on a terminal and prints plain lines elsewhere, on standard error."""
-    if not STDERR.is_terminal:
-        yield plain_listener()
-        return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description:<10}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
-    )
-    with Progress(*columns, console=STDERR) as bars:
-        tasks: dict[str, Any] = {}
-
-        def listen(event: pipeline.Progress) -> None:
-            if event.stage not in tasks:
-                tasks[event.stage] = bars.add_task(event.stage, text="", total=None)
-            bars.update(tasks[event.stage], completed=event.done, total=event.total or None, text=event.text)
-
-        yield listen
-
-
-def plain_listener() -> Callable[[pipeline.Progress], None]:
-    start = perf_counter()
-
-    def listen(event: pipeline.Progress) -> None:
-        share = f" {event.done:g}/{event.total:g}" if event.total else ""
-        text = f": {event.text}" if event.text else ""
-        STDERR.print(f"[{perf_counter() - start:7.1f} s] {event.stage}{share}{text}", soft_wrap=True)
-
-    return listen
-
-
-def main() -> None:
-    """The entry point: errors become one line and an exit code."""
-    try:
-        app()
-    except LimbfitError as error:
-        fail(str(error), 2 if isinstance(error, InputError) else 1)
-    except KeyboardInterrupt:
-        fail("interrupted; run the same command again to go on", 130)
-    except BrokenPipeError:
-        sys.exit(1)
-    except Exception as error:
-        if os.environ.get("LIMBFIT_TRACEBACK"):
-            raise
-        fail(
-            f"internal error: {type(error).__name__}: {error}; set LIMBFIT_TRACEBACK=1 to see where, "
-            "and please report it",
-            1,
-        )
-
-
-def fail(text: str, code: int) -> None:
-    """One line on standard error, without control characters, then the exit."""
-    line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
-    STDERR.print(f"error: {line}", soft_wrap=True)
-    sys.exit(code)
+VERBS = (demo, phantom, check, run, status, simulate, report)

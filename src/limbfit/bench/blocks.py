@@ -1,0 +1,82 @@
+"""Structured two-layer blocks under the square punch, of any size: meshes that need no mesher."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
+from ..mesh import Mesh, boundary_faces, to_tet10
+
+Array = NDArray[np.float64]
+# Kuhn's six tetrahedra of a box whose corners are numbered 4 i + 2 j + k.
+SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+HEX = np.array([0, 4, 6, 2, 1, 5, 7, 3])
+SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)
+HALF, DEPTH, LAYER = 30.0, 30.0, 3.0  # mm
+INDENTATION, SPEED = 6.0, 0.96  # mm, mm/s
+
+
+def punched_block(element: str, divisions: int) -> Problem:
+    """The square punch on a block of 60 x 60 x 30 mm with a 3 mm layer; ``divisions`` cells along 60 mm."""
+    mesh = layered_block(ELEMENTS[element].cell_type, divisions)
+    ramp = INDENTATION / SPEED
+    return Problem(
+        mesh=mesh,
+        materials={"skin": SKIN, "muscle": MUSCLE},
+        fixed=mesh.node_sets["bottom"],
+        contact_faces=mesh.face_sets["skin"],
+        indenter=Indenter("square", 20.0, 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
+        history=History(np.array([0.0, ramp, 2 * ramp]), np.array([0.0, INDENTATION, 0.0])),
+        element=element,
+    )
+
+
+def layered_block(cell_type: str, divisions: int) -> Mesh:
+    """Boxes of equal size below a layer; node set ``bottom``, face set ``skin`` (the whole top)."""
+    side = np.linspace(-HALF, HALF, divisions + 1)
+    n_below, n_above = _through(divisions)
+    below, above = np.linspace(-DEPTH, -LAYER, n_below + 1), np.linspace(-LAYER, 0.0, n_above + 1)
+    points, boxes = _boxes(side, side, np.concatenate([below, above[1:]]))
+    cells = boxes[:, HEX] if cell_type == "hex8" else _upright(points, boxes[:, SIX_TETS].reshape(-1, 4))
+    skin = points[cells][:, :, 2].mean(axis=1) > -LAYER
+    linear = "hex8" if cell_type == "hex8" else "tet4"
+    mesh = Mesh(points, cells, linear, np.where(skin, 0, 1), ("skin", "muscle"))
+    faces = boundary_faces(mesh)
+    mesh = Mesh(
+        points, cells, linear, mesh.regions, mesh.region_names,
+        {"bottom": np.flatnonzero(points[:, 2] <= -DEPTH)},
+        {"skin": faces[(points[faces][:, :, 2] >= 0.0).all(axis=1)]},
+    )  # fmt: skip
+    return to_tet10(mesh) if cell_type == "tet10" else mesh
+
+
+def _through(divisions: int) -> tuple[int, int]:
+    """Cells through the depth, below the layer and in it, of about the same size as along the side."""
+    size = 2 * HALF / divisions
+    return max(round((DEPTH - LAYER) / size), 1), max(round(LAYER / size), 1)
+
+
+def divisions_for(element: str, unknowns: int) -> int:
+    """Fewest cells along the side that give a block that many unknowns."""
+    order = 2 if ELEMENTS[element].cell_type == "tet10" else 1
+    divisions = 2
+    while 3 * (order * divisions + 1) ** 2 * order * sum(_through(divisions)) < unknowns:
+        divisions += 1
+    return divisions
+
+
+def _boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Grid points (n, 3) and the corners (m, 8) of each box, numbered 4 i + 2 j + k."""
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+    index = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
+    low, high = slice(None, -1), slice(1, None)
+    corners = [index[i, j, k].ravel() for i in (low, high) for j in (low, high) for k in (low, high)]
+    return grid.reshape(-1, 3), np.stack(corners, axis=1)
+
+
+def _upright(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
+    edges = points[tets[:, 1:]] - points[tets[:, :1]]
+    flip = np.linalg.det(edges) < 0.0
+    tets[flip] = tets[flip][:, [0, 2, 1, 3]]
+    return tets

@@ -1,0 +1,74 @@
+"""One simulation of a reference case, plain and with sensitivities, beside FEBio's time for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from .measuring import in_fresh_process, timed_solve
+from .reference import PUNCHED, ReferenceCase, Tell, find_reference, load_case
+
+# FEBio 4.11 with PARDISO, alone on 2 cores (Intel Xeon, 2.5 GHz), 2 threads.
+FEBIO_SECONDS = {"residuum/posterior_tet10": 144.8, "residuum/posterior_tet4": 10.6}
+CASES = {case.name: case for case in PUNCHED}
+
+
+@dataclass(frozen=True)
+class ForwardJob:
+    """A simulation to be timed in a process of its own."""
+
+    case: ReferenceCase
+    folder: Path
+    sensitivities: bool
+
+
+def bench_forward(
+    reference: Path | None = None,
+    case: str = "residuum/posterior_tet10",
+    element: str = "",
+    threads: int = 1,
+    *,
+    tell: Tell,
+) -> dict[str, Any]:
+    """Time a reference case with limbfit's own contact on FEBio's mesh and steps.
+
+    Parameters
+    ----------
+    reference : folder of FEBio's results; None: ``shared/reference``, here or above.
+    case : a case with an indenter in it.
+    element : name in the element table; empty: that of the mesh.
+    threads : of the linear algebra.
+
+    Raises
+    ------
+    InputError
+        Where the case is missing or the element does not fit its mesh.
+    """
+    if case not in CASES:
+        raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(CASES)}")
+    folder = reference or find_reference(Path.cwd())
+    job = ForwardJob(replace(CASES[case], problem={"element": element}, control={}), folder, False)
+    tell(0, 2, f"{case}, plain")
+    plain = in_fresh_process(run_forward, job, threads)
+    tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")
+    full = in_fresh_process(run_forward, replace(job, sensitivities=True), threads)
+    tell(2, 2, f"{full['seconds']:.1f} s with sensitivities")
+    febio = FEBIO_SECONDS.get(case)
+    return {
+        "case": case,
+        **plain,
+        "seconds_with_sensitivities": full["seconds"],
+        "sensitivities_over_plain": full["seconds"] / plain["seconds"],
+        "max_rss_with_sensitivities_MB": full["max_rss_MB"],
+        "seconds_by_part_with_sensitivities": full["seconds_by_part"],
+        "threads": threads,
+        "febio_seconds": febio,
+        "ratio": None if febio is None else febio / plain["seconds"],
+    }
+
+
+def run_forward(job: ForwardJob) -> dict[str, Any]:
+    problem, control, _ = load_case(job.case, job.folder)
+    return timed_solve(problem, control, job.sensitivities)

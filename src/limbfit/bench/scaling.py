@@ -1,0 +1,72 @@
+"""How time and memory grow with the number of unknowns, on structured blocks under the square punch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..fe import StepControl
+from .blocks import divisions_for, punched_block
+from .measuring import in_fresh_process, timed_solve
+from .reference import Tell
+
+UNKNOWNS, LARGE_UNKNOWNS = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
+# The paper's model of one site: about 150,000 linear tetrahedra.
+PAPER_ELEMENT, PAPER_DIVISIONS = "tet4", 37
+CONTROL = StepControl()
+
+
+@dataclass(frozen=True)
+class BlockJob:
+    """A block to be timed in a process of its own."""
+
+    element: str
+    divisions: int
+    control: StepControl
+
+
+def bench_scaling(
+    element: str = "tet10",
+    large: bool = False,
+    threads: int = 1,
+    *,
+    tell: Tell,
+    control: StepControl = CONTROL,
+) -> dict[str, Any]:
+    """Seconds and memory over unknowns, the exponent of their power law, and a model of the paper's size.
+
+    Parameters
+    ----------
+    large : also the sizes above 100,000 unknowns.
+    """
+    sizes = UNKNOWNS + (LARGE_UNKNOWNS if large else ())
+    jobs = [BlockJob(element, divisions_for(element, size), control) for size in sizes]
+    jobs.append(BlockJob(PAPER_ELEMENT, PAPER_DIVISIONS, control))
+    rows = []
+    for i, job in enumerate(jobs):
+        tell(i, len(jobs), f"{job.element}, {job.divisions} cells along 60 mm")
+        rows.append(in_fresh_process(run_block, job, threads))
+    tell(len(jobs), len(jobs), "done")
+    *curve, paper = rows
+    return {
+        "element": element,
+        "threads": threads,
+        "sizes": curve,
+        "seconds_exponent": exponent(curve, "seconds"),
+        "memory_exponent": exponent(curve, "max_rss_MB"),
+        "paper_sized": paper,
+    }
+
+
+def run_block(job: BlockJob) -> dict[str, Any]:
+    problem = punched_block(job.element, job.divisions)
+    return {"cells": len(problem.mesh.cells), **timed_solve(problem, job.control, sensitivities=False)}
+
+
+def exponent(rows: list[dict[str, Any]], key: str) -> float:
+    """Slope of the least-squares line of log ``key`` over log unknowns."""
+    x = np.log([row["unknowns"] for row in rows])
+    slope, _ = np.polyfit(x, np.log([row[key] for row in rows]), 1)
+    return float(slope)

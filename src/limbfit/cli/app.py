@@ -1,0 +1,57 @@
+"""The ``limbfit`` command: its verbs, and the one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from .. import __version__
+from ..errors import InputError, LimbfitError
+from . import bench, commands
+from .console import STDOUT, fail
+
+app = typer.Typer(
+    name="limbfit",
+    help="Patient-specific viscoelastic finite-element models of residual limbs, from MRI and indentations.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    add_completion=False,
+)
+
+
+@app.callback(invoke_without_command=True)
+def top(
+    version: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False,
+) -> None:
+    if version:
+        STDOUT.print(f"limbfit {__version__}")
+        raise typer.Exit
+
+
+for verb in commands.VERBS:
+    app.command()(verb)
+app.add_typer(bench.app, name="bench")
+
+
+def main() -> None:
+    """The entry point: errors become one line and an exit code."""
+    try:
+        app()
+    except LimbfitError as error:
+        fail(str(error), 2 if isinstance(error, InputError) else 1)
+    except KeyboardInterrupt:
+        fail("interrupted; run the same command again to go on", 130)
+    except BrokenPipeError:
+        sys.exit(1)
+    except Exception as error:
+        if os.environ.get("LIMBFIT_TRACEBACK"):
+            raise
+        fail(
+            f"internal error: {type(error).__name__}: {error}; set LIMBFIT_TRACEBACK=1 to see where, "
+            "and please report it",
+            1,
+        )

@@ -1,0 +1,99 @@
+"""``limbfit bench``: the solver against FEBio's results, and its time and memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+import limbfit
+
+from ..execution import usable_cores
+from .console import STDOUT, AsJson, listening, print_json
+
+app = typer.Typer(help="Benchmarks of the solver.", no_args_is_help=True, rich_markup_mode=None)
+
+Reference = Annotated[
+    Path | None,
+    typer.Option(help="folder of FEBio's results; default: shared/reference, here or above"),
+]
+Threads = Annotated[int, typer.Option(min=1, help="of the linear algebra; default: all cores")]
+CORES = usable_cores()
+
+
+@app.command()
+def febio_parity(reference: Reference = None, as_json: AsJson = False) -> None:
+    """Compare forces and stresses with FEBio 4.11 on the same mesh, with the same element and steps."""
+    with listening() as listener:
+        rows = limbfit.bench_febio_parity(reference, tell=teller(listener, "febio-parity"))
+    if as_json:
+        print_json(rows)
+        return
+    table = Table("case", "element", "difference (%)", "peak", "FEBio's peak", "what explains it", box=None)
+    for row in rows:
+        difference, unit = row["max_difference_percent"], "kPa" if "peak_stress_kPa" in row else "N"
+        peaks = [
+            row.get(f"{who}peak_{'stress' if unit == 'kPa' else 'force'}_{unit}") for who in ("", "febio_")
+        ]
+        shown = "-" if difference is None else f"{difference:.2g}"
+        table.add_row(
+            row["case"], row["element"], shown,
+            *("-" if peak is None else f"{peak:.4g} {unit}" for peak in peaks), row["note"],
+        )  # fmt: skip
+    STDOUT.print(table)
+
+
+@app.command()
+def forward(
+    reference: Reference = None,
+    case: Annotated[str, typer.Option(help="case of the reference folder")] = "residuum/posterior_tet10",
+    element: Annotated[str, typer.Option(help="name in the element table; default: that of the mesh")] = "",
+    threads: Threads = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Time one simulation, plain and with sensitivities, beside FEBio's time for it."""
+    with listening() as listener:
+        found = limbfit.bench_forward(reference, case, element, threads, tell=teller(listener, "forward"))
+    if as_json:
+        print_json(found)
+    else:
+        show_facts(found)
+
+
+@app.command()
+def scaling(
+    element: Annotated[str, typer.Option(help="name in the element table")] = "tet10",
+    large: Annotated[bool, typer.Option("--large", help="also 125,000 to 300,000 unknowns")] = False,
+    threads: Threads = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Time and memory over the number of unknowns, and of a model of the paper's size."""
+    with listening() as listener:
+        found = limbfit.bench_scaling(element, large, threads, tell=teller(listener, "scaling"))
+    if as_json:
+        print_json(found)
+        return
+    table = Table("element", "cells", "unknowns", "steps", "seconds", "memory (MB)", box=None)
+    for row in (*found["sizes"], found["paper_sized"]):
+        table.add_row(
+            row["element"], f"{row['cells']}", f"{row['unknowns']}", f"{row['steps']}",
+            f"{row['seconds']:.1f}", f"{row['max_rss_MB']:.0f}",
+        )  # fmt: skip
+    STDOUT.print(table)
+    STDOUT.print(f"seconds grow as unknowns^{found['seconds_exponent']:.2f}")
+
+
+def teller(listener: Callable[[limbfit.Progress], None], stage: str) -> Callable[[int, int, str], None]:
+    return lambda done, total, text: listener(limbfit.Progress(stage, done, total, text))
+
+
+def show_facts(facts: dict[str, Any]) -> None:
+    table = Table(box=None, show_header=False)
+    for key, value in facts.items():
+        rows = {f"{key}: {part}": v for part, v in value.items()} if isinstance(value, dict) else {key: value}
+        for name, entry in rows.items():
+            table.add_row(name, f"{entry:.4g}" if isinstance(entry, float) else str(entry))
+    STDOUT.print(table)

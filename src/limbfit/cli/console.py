@@ -1,0 +1,74 @@
+"""What the commands print with: results on standard output, progress and errors on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+import limbfit
+
+STDOUT = Console(highlight=False, markup=False)
+STDERR = Console(stderr=True, highlight=False, markup=False)
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+
+
+def print_json(content: Any) -> None:
+    sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+@contextmanager
+def listening() -> Iterator[Callable[[limbfit.Progress], None]]:
+    """A listener that draws bars on a terminal and prints plain lines elsewhere, on standard error."""
+    if not STDERR.is_terminal:
+        yield plain_listener()
+        return
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description:<10}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}"),
+    )
+    with Progress(*columns, console=STDERR) as bars:
+        tasks: dict[str, Any] = {}
+
+        def listen(event: limbfit.Progress) -> None:
+            if event.stage not in tasks:
+                tasks[event.stage] = bars.add_task(event.stage, text="", total=None)
+            bars.update(tasks[event.stage], completed=event.done, total=event.total or None, text=event.text)
+
+        yield listen
+
+
+def plain_listener() -> Callable[[limbfit.Progress], None]:
+    start = perf_counter()
+
+    def listen(event: limbfit.Progress) -> None:
+        share = f" {event.done:g}/{event.total:g}" if event.total else ""
+        text = f": {event.text}" if event.text else ""
+        STDERR.print(f"[{perf_counter() - start:7.1f} s] {event.stage}{share}{text}", soft_wrap=True)
+
+    return listen
+
+
+def fail(text: str, code: int) -> None:
+    """One line on standard error, without control characters, then the exit."""
+    line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
+    STDERR.print(f"error: {line}", soft_wrap=True)
+    sys.exit(code)
