@@ -1,0 +1,422 @@
+"""How often does a simulation come to its end, whatever limb, indenter and material it is given?
+
+    python benchmarks/robustness.py --cases 200 --seed 0 --json robustness.json
+    python benchmarks/robustness.py --only 17            # one case of the same 200
+
+Every case is drawn from (seed, number) alone: body, site, depth, indenter, speed, and the eight material
+parameters over the whole bounds of the calibration.  Each runs in a worker process with a time limit; what
+came of it is ``completed``, ``partial`` (with the solver's reason), ``crash`` or ``hang``.  Completed
+simulations are then held against physics; see `broken_laws`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mapped_bodies import Array, Body, Indices, limb, slab
+
+from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, solve
+from limbfit.mesh import node_jacobians
+from limbfit.study import PARAMETERS, TISSUES, MaterialTable
+
+SITES = (
+    "slab-mid", "slab-slanted", "slab-thin", "ridge-edge", "ridge-thin", "limb-mid", "limb-slanted",
+    "limb-thin", "limb-edge", "twin-thin", "twin-between",
+)  # fmt: skip
+FARTHEST_MM = 30.0  # travel to the bone that is taken where the indenter would pass it by
+
+
+@dataclass(frozen=True)
+class Case:
+    """A drawn case: the body's measures, the indenter and the parameters (kPa, -, -, s); lengths in mm."""
+
+    number: int
+    site: str
+    tool: str
+    body: dict[str, float]
+    width: float
+    tilt: tuple[float, float]
+    depth_share: float
+    speed: float
+    parameters: dict[str, dict[str, float]]
+
+
+@dataclass
+class Outcome:
+    """What came of a case; ``broken`` names the laws of `broken_laws` that a completed run breaks."""
+
+    number: int
+    outcome: str
+    reason: str = ""
+    broken: list[str] = field(default_factory=list)
+    seconds_cpu: float = 0.0
+    facts: dict[str, float] = field(default_factory=dict)
+    case: dict[str, Any] = field(default_factory=dict)
+
+
+# Indenters by name: width and edge radius to the fields of `Indenter`.
+TOOLS: dict[str, Callable[[float, np.random.Generator], dict[str, Any]]] = {
+    "square-sharp": lambda width, rng: {"shape": "square", "width": width},
+    "square-rounded": lambda width, rng: {
+        "shape": "square", "width": width, "edge_radius": width * rng.uniform(0.05, 0.3),
+    },
+    "sphere": lambda width, rng: {"shape": "sphere", "width": width},
+    "cylinder": lambda width, rng: {
+        "shape": "cylinder", "width": width, "edge_radius": width * rng.choice([0.0, 0.1]),
+    },
+}  # fmt: skip
+
+
+def draw(seed: int, number: int) -> Case:
+    """Case ``number`` of the set ``seed``; it does not depend on the others."""
+    rng = np.random.default_rng([seed, number])
+    site = SITES[number % len(SITES)]
+    tool = list(TOOLS)[rng.integers(len(TOOLS))]
+    thin = rng.uniform(4.0, 8.0) if "thin" in site or "edge" in site else rng.uniform(8.0, 25.0)
+    slant = rng.uniform(8.0, 20.0) if "slanted" in site else rng.uniform(0.0, 4.0)
+    return Case(
+        number=number,
+        site=site,
+        tool=tool,
+        body=_measures(site, thin, rng),
+        width=float(rng.choice([20.0, 20.0, rng.uniform(10.0, 25.0)])),
+        tilt=(float(np.radians(slant)), float(rng.uniform(0.0, 2.0 * np.pi))),
+        depth_share=float(rng.uniform(0.1, 0.6)),
+        speed=float(rng.uniform(0.46, 1.46)),  # 0.96 +- 0.5 mm/s, the source paper's section 2.1
+        parameters={tissue: _parameters(rng) for tissue in TISSUES},
+    )
+
+
+def _parameters(rng: np.random.Generator) -> dict[str, float]:
+    """One tissue, logarithmically even over the bounds of the calibration."""
+    bounds = MaterialTable()
+    ends = [(getattr(bounds.lower, name), getattr(bounds.upper, name)) for name in PARAMETERS]
+    return {name: float(np.exp(rng.uniform(*np.log(end)))) for name, end in zip(PARAMETERS, ends)}
+
+
+def _measures(site: str, thin: float, rng: np.random.Generator) -> dict[str, float]:
+    """The measures of the body under a site; see `slab` and `limb`."""
+    layer = rng.uniform(1.0, 4.0)
+    if site.startswith(("slab", "ridge")):
+        ridge = rng.uniform(8.0, 20.0) if site.startswith("ridge") else 0.0
+        edge = {"ridge-edge": rng.uniform(-4.0, 4.0), "ridge-thin": -12.0}.get(site, 0.0)
+        return {"thickness": thin + ridge, "layer": layer, "ridge": ridge, "edge": edge}
+    bone = rng.uniform(7.0, 14.0)
+    radius = bone + thin + rng.uniform(12.0, 30.0)
+    angle = {
+        "limb-thin": rng.uniform(-0.2, 0.2), "limb-edge": rng.choice([-1, 1]) * rng.uniform(0.5, 1.0),
+        "twin-thin": rng.uniform(-0.2, 0.2), "twin-between": rng.uniform(0.6, 0.9),
+    }.get(site, rng.uniform(1.2, np.pi))  # fmt: skip
+    values = {"radius": radius, "bone": bone, "thin": thin, "taper": rng.uniform(0.0, 0.4)}
+    values |= {"layer": layer, "angle": float(angle)}
+    if site.startswith("twin"):
+        second = rng.uniform(4.0, 7.0)
+        away = bone + second + rng.uniform(4.0, 8.0)
+        values |= {"second_radius": second, "second_away": away, "second_angle": rng.uniform(1.5, 1.9)}
+    return values
+
+
+def body_of(case: Case) -> Body:
+    inner, b = 0.5 * case.width + 2.0, case.body
+    if case.site.startswith(("slab", "ridge")):
+        count = 2 if b["thickness"] < 10.0 else 3
+        half = inner + 10.0 + b["thickness"]
+        return slab(b["thickness"], b["layer"], inner, half, b["ridge"], b["edge"], count)
+    second = None
+    if "second_radius" in b:
+        second = (b["second_radius"], b["second_away"], b["second_angle"])
+    measures = (b["radius"], b["bone"], b["thin"], b["taper"], b["layer"], b["angle"])
+    return limb(*measures, inner, 3 if second else 2, second)
+
+
+def problem_of(case: Case, seed: int) -> Problem:
+    """The case as a problem: loading to the drawn depth and unloading at the same speed."""
+    body = body_of(case)
+    rng = np.random.default_rng([seed, case.number, 1])
+    centre, axis = body.site - 2.0 * body.inward, _tilted(body.inward, *case.tilt)
+    tool = Indenter(centre=centre, axis=axis, **TOOLS[case.tool](case.width, rng))
+    points = body.mesh.points
+    faces = body.mesh.face_sets["skin"]
+    travel = advance(tool, points[body.bone]) - advance(tool, points[np.unique(faces)])
+    depth = case.depth_share * min(travel, FARTHEST_MM)
+    reach = 0.71 * case.width + depth + 8.0
+    near = np.linalg.norm(points[faces[:, :3]].mean(axis=1) - body.site, axis=1) < reach
+    duration = depth / case.speed
+    return Problem(
+        mesh=body.mesh,
+        materials={tissue: _material(values) for tissue, values in case.parameters.items()},
+        fixed=body.held,
+        contact_faces=faces[near],
+        indenter=tool,
+        history=History(np.array([0.0, duration, 2.0 * duration]), np.array([0.0, depth, 0.0])),
+        name=f"{case.number} {case.site} {case.tool}",
+    )
+
+
+def _material(values: dict[str, float]) -> OgdenQLV:
+    return OgdenQLV(1e-3 * values["c_kPa"], values["m"], values["gamma"], values["tau_s"])
+
+
+def _tilted(axis: Array, angle: float, about: float) -> Array:
+    """``axis`` turned by ``angle`` towards the direction ``about`` around it, rad."""
+    side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.8 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    towards = np.cos(about) * side + np.sin(about) * np.cross(axis, side)
+    return np.cos(angle) * axis + np.sin(angle) * towards
+
+
+def advance(tool: Indenter, points: Array) -> float:
+    """How far the indenter can go along its axis until it touches one of the points, mm."""
+    low, high = -50.0, 150.0
+    while high - low > 1e-6:
+        middle = 0.5 * (low + high)
+        if tool.moved(middle).signed_distance(points).min() > 0.0:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def broken_laws(result: Result) -> list[str]:
+    """What a completed simulation does that no body does (store="all").
+
+    Force finite, and not negative; none after unloading; penetration under 1 % of the depth; no element
+    folded at a quadrature point (the solver sees to it) or in its straight corners; no node inside an
+    element that it does not belong to.  Tissue cannot enter a bone without one of the last two.
+    """
+    force, depth = result.force, float(result.displacement.max())
+    broken = []
+    if not np.isfinite(force).all():
+        broken.append("force not finite")
+    if force.min() < -1e-9 * max(force.max(), 1e-12):
+        broken.append("negative force")
+    if force[-1] > 0.01 * force.max():
+        broken.append("force after unloading")
+    if result.penetration.max() > 0.01 * depth:
+        broken.append("penetration above 1 %")
+    mesh = result.problem.mesh
+    for state in result.states:
+        points = mesh.points + state.u
+        if (_corner_volumes(points, mesh.corners) <= 0.0).any():
+            broken.append("folded element")
+            break
+    peak = max(result.states, key=lambda state: state.displacement)
+    if _self_penetrating(mesh.points + peak.u, mesh.corners):
+        broken.append("tissue inside tissue")
+    return broken
+
+
+def _corner_volumes(points: Array, corners: Indices) -> Array:
+    """Six times the volumes (m,) of the straight tetrahedra."""
+    at = points[corners]
+    return np.linalg.det(at[:, 1:] - at[:, :1])
+
+
+def _self_penetrating(points: Array, corners: Indices, tolerance: float = 0.05) -> int:
+    """How many corner nodes lie inside (by ``tolerance`` in barycentric terms) a tetrahedron not theirs."""
+    at = points[corners]
+    low, high = at.min(axis=1), at.max(axis=1)
+    inverse = np.linalg.pinv((at[:, 1:] - at[:, :1]).transpose(0, 2, 1))
+    count = 0
+    for node in np.unique(corners):
+        boxes = np.flatnonzero(((points[node] > low) & (points[node] < high)).all(axis=1))
+        boxes = boxes[(corners[boxes] != node).all(axis=1)]
+        inside = np.einsum("mij,mj->mi", inverse[boxes], points[node] - at[boxes, 0])
+        shares = np.column_stack([1.0 - inside.sum(axis=1), inside])
+        count += bool((shares.min(axis=1) > tolerance).any())
+    return count
+
+
+def run_case(seed: int, number: int) -> Outcome:
+    """Draw, build and solve one case; an exception is a crash with its last line as the reason."""
+    started = time.process_time()
+    case = draw(seed, number)
+    try:
+        problem = problem_of(case, seed)
+        result = solve(problem, store="all")
+    except Exception:
+        reason = traceback.format_exc().strip().splitlines()
+        spent = time.process_time() - started
+        return Outcome(number, "crash", f"{reason[-1]} ({reason[-3].strip()})", [], spent, {}, asdict(case))
+    spent = time.process_time() - started
+    done = result.completed
+    outcome = Outcome(number, "completed" if done else "partial", result.reason, [], spent, case=asdict(case))
+    outcome.broken = broken_laws(result) if done else []
+    outcome.facts = _facts(result)
+    return outcome
+
+
+def _facts(result: Result) -> dict[str, float]:
+    names = ("steps", "newton_iterations", "factorisations", "solves", "cuts", "unknowns")
+    folded = 0
+    for state in result.states:
+        shape = result.problem.mesh.with_points(result.problem.mesh.points + state.u)
+        folded = max(folded, int((node_jacobians(shape) <= 0).any(axis=1).sum()))
+    return {name: float(result.statistics[name]) for name in names} | {
+        "depth_mm": float(result.problem.history.displacement.max()),
+        "reached_mm": float(result.displacement.max()),
+        "reached_share": float(result.times[-1] / result.problem.history.times[-1]),
+        "peak_force_N": result.peak_force,
+        "penetration_share": float(result.penetration.max() / result.displacement.max())
+        if result.displacement.max() > 0
+        else 0.0,
+        "cells_folded_at_nodes": float(folded),
+    }
+
+
+class Worker:
+    """A process that runs cases; killed and replaced when a case takes too long or takes it down."""
+
+    def __init__(self, seed: int, limit_s: float) -> None:
+        self.seed, self.limit_s = seed, limit_s
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, far = context.Pipe()
+        self.process = context.Process(target=_serve, args=(far, self.seed), daemon=True)
+        self.process.start()
+        far.close()
+        self.pipe.recv()  # ready: kernels are compiled
+
+    def run(self, number: int) -> Outcome:
+        case = asdict(draw(self.seed, number))
+        self.pipe.send(number)
+        try:
+            if self.pipe.poll(self.limit_s):
+                return self.pipe.recv()
+            found = Outcome(number, "hang", f"not done after {self.limit_s:g} s", case=case)
+        except EOFError:
+            self.process.join()
+            found = Outcome(number, "crash", f"the process died (exit {self.process.exitcode})", case=case)
+        self.stop()
+        self._start()
+        return found
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _serve(pipe: Connection, seed: int) -> None:
+    """Warm up, then run the cases that are asked for."""
+    body = slab(10.0, 2.0, 5.0, 20.0, 0.0, 0.0, 1)
+    tool = Indenter(centre=body.site, axis=body.inward, width=8.0)
+    materials = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}
+    history = History(np.array([0.0, 0.5]), np.array([0.0, 0.5]))
+    solve(Problem(body.mesh, materials, body.held, body.mesh.face_sets["skin"], tool, history))
+    pipe.send("ready")
+    while True:
+        pipe.send(run_case(seed, pipe.recv()))
+
+
+def run_all(seed: int, numbers: list[int], limit_s: float, workers: int) -> Iterator[Outcome]:
+    """Outcomes as they come, in order, from a number of workers."""
+    made = [Worker(seed, limit_s) for _ in range(workers)]
+    idle = list(made)
+
+    def one(number: int) -> Outcome:
+        worker = idle.pop()
+        try:
+            return worker.run(number)
+        finally:
+            idle.append(worker)
+
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            yield from pool.map(one, numbers)
+    finally:
+        for worker in made:
+            worker.stop()
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Rates, and the 50th, 90th and 100th percentile of what the cases cost."""
+    counts = Counter(outcome.outcome for outcome in outcomes)
+    lawful = sum(o.outcome == "completed" and not o.broken for o in outcomes)
+    costs = {}
+    for name in ("newton_iterations", "factorisations", "cuts"):
+        costs[name] = _spread([o.facts[name] for o in outcomes if name in o.facts])
+    costs["seconds_cpu"] = _spread([o.seconds_cpu for o in outcomes])
+    return {
+        "cases": len(outcomes),
+        "outcomes": dict(counts),
+        "completed_percent": 100.0 * counts["completed"] / max(len(outcomes), 1),
+        "completed_and_lawful_percent": 100.0 * lawful / max(len(outcomes), 1),
+        "broken": dict(Counter(law for o in outcomes for law in o.broken)),
+        "costs": costs,
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    if not values:
+        return {}
+    p50, p90, p100 = np.percentile(values, [50, 90, 100])
+    return {"median": float(p50), "p90": float(p90), "max": float(p100), "sum": float(np.sum(values))}
+
+
+def _line(outcome: Outcome) -> str:
+    facts, case = outcome.facts, outcome.case
+    cost = " ".join(
+        f"{short} {facts[name]:.0f}"
+        for short, name in (("it", "newton_iterations"), ("fact", "factorisations"), ("cuts", "cuts"))
+        if name in facts
+    )
+    depth = f"{facts['depth_mm']:.1f} mm ({100 * case['depth_share']:.0f} %)" if facts else ""
+    tail = "; ".join(filter(None, [outcome.reason, *outcome.broken]))
+    head = f"{outcome.number:4d} {outcome.outcome:9s} {case['site']:12s} {case['tool']:14s} {depth:17s}"
+    return f"{head} {cost}  {outcome.seconds_cpu:.1f} s  {tail}".rstrip()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=int, default=200, help="how many cases (default 200)")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--seed", type=int, default=0, help="another seed is another set of cases")
+    parser.add_argument("--only", type=int, help="run this case alone")
+    parser.add_argument("--workers", type=int, default=1, help="processes side by side")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds until a case counts as hanging")
+    parser.add_argument("--json", type=Path, help="write every case and the summary here")
+    options = parser.parse_args()
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    numbers = list(range(options.first, options.first + options.cases))
+    outcomes: list[Outcome] = []
+    for outcome in run_all(
+        options.seed, numbers if options.only is None else [options.only], options.limit, options.workers
+    ):
+        outcomes.append(outcome)
+        print(_line(outcome), flush=True)
+        if options.json is not None:
+            content = {"seed": options.seed, "summary": summary(outcomes)}
+            options.json.write_text(json.dumps({**content, "cases": [asdict(o) for o in outcomes]}, indent=1))
+    _report(outcomes, options.seed)
+
+
+def _report(outcomes: list[Outcome], seed: int) -> None:
+    print(json.dumps(summary(outcomes), indent=1))
+    wrong = [o for o in outcomes if o.outcome != "completed" or o.broken]
+    for outcome in wrong:
+        why = "; ".join(filter(None, [outcome.reason, *outcome.broken]))
+        command = f"python benchmarks/robustness.py --seed {seed} --only {outcome.number}"
+        print(f"{outcome.outcome}: {why}\n    {command}")
+    sys.exit(0 if not wrong else 1)
+
+
+if __name__ == "__main__":
+    main()
