@@ -20,6 +20,7 @@ from .indenter import Indenter
 from .materials import VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from .problem import History, Problem, Support
 from .result import Result, State, Step
+from .rigid_surface import RigidSurface
 from .stepping import StepControl, iterate, solve
 from .system import System
 
@@ -35,6 +36,7 @@ __all__ = [
     "OgdenQLV",
     "Problem",
     "Result",
+    "RigidSurface",
     "State",
     "Step",
     "StepControl",

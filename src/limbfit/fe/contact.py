@@ -12,11 +12,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..errors import ProblemError
 from .assembly import scatter_upper
 from .elements import Element, face_quadrature
 from .indenter import Indenter, signed_distance
 
 Array = NDArray[np.float64]
+START_MM = 1e-6  # inside the tissue is a start that is deeper
 
 
 @dataclass(frozen=True)
@@ -79,18 +81,38 @@ class Touch:
 
 
 def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: float = 1e-9) -> float:
-    """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface."""
+    """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface.
+
+    From far outside it advances by the smallest distance, which cannot jump over the first touch, or by a
+    thousandth of its width where that is less; the last advance is then halved.
+    """
     at = np.einsum("qk,fki->fqi", surface.N, surface.points[surface.faces]).reshape(-1, 3)
     along = (at - np.asarray(indenter.centre)) @ indenter.frame[2]
-    span = np.ptp(along) + 2.0 * indenter.width
-    low, high = along.min() - span, along.max() + span
-    while high - low > tolerance:  # the gap of a body without far end only shrinks as it advances
+    low = high = float(along.min()) - indenter.width
+    end, least = float(along.max()) + indenter.length, 1e-3 * indenter.width
+
+    def gap(advance: float) -> float:
+        return float(indenter.moved(advance).signed_distance(at).min())
+
+    while high < end and (distance := gap(high)) > 0.0:
+        low, high = high, high + max(distance, least)
+    while high - low > tolerance:
         middle = 0.5 * (low + high)
-        if indenter.moved(middle).signed_distance(at).min() > 0.0:
-            low = middle
-        else:
-            high = middle
-    return float(low)
+        low, high = (middle, high) if gap(middle) > 0.0 else (low, middle)
+    return low
+
+
+def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
+    """Raise `ProblemError` where the indenter starts inside the undeformed body."""
+    gaps = surface.gaps(indenter)
+    face, point = np.unravel_index(gaps.argmin(), gaps.shape)
+    depth = -float(gaps[face, point])
+    if depth > START_MM:
+        where = ", ".join(f"{v:.2f}" for v in surface.N[point] @ surface.points[surface.faces[face]])
+        raise ProblemError(
+            f"the indenter starts {depth:.3g} mm inside the tissue, deepest at ({where}) mm",
+            remedy="move it out along its axis, or start it touching",
+        )
 
 
 @njit(cache=True)
@@ -121,7 +143,7 @@ def contact(  # type: ignore[no-untyped-def]
     reaction along the axis (N), largest
     penetration (mm), reference area in touch (mm^2).
     """
-    shape, half, radius = kernel
+    half = kernel[1]
     k = faces.shape[1]
     Ke = np.empty((3 * k, 3 * k))
     x, local, gl, g = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -141,7 +163,7 @@ def contact(  # type: ignore[no-untyped-def]
             gaps[f, q] = np.inf
             if local[2] > half or abs(local[0]) > reach or abs(local[1]) > reach:
                 continue
-            phi = signed_distance(shape, half, radius, local, gl, hl)
+            phi = signed_distance(kernel, local, gl, hl)
             for i in range(3):
                 g[i] = frame[0, i] * gl[0] + frame[1, i] * gl[1] + frame[2, i] * gl[2]
                 normals[f, q, i] = g[i]

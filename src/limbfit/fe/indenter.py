@@ -1,8 +1,8 @@
 """Rigid indenters as signed distances with gradient and curvature.
 
 The indenter's frame: origin at the middle of its foremost face (``centre``), coordinates ``(x, y, z)`` along
-``edge``, ``axis x edge`` and ``axis``; the body lies at ``z <= 0`` and has no far end (a sphere is the end of
-a round rod).
+``edge``, ``axis x edge`` and ``axis``; the body lies at ``z <= 0``.  Square, sphere and cylinder have no far
+end (a sphere is the end of a round rod); a triangle surface is the body that it encloses.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
+from .rigid_surface import NO_BODY, Body, RigidSurface, surface_distance
 
-SHAPES = {"square": 0, "sphere": 1, "cylinder": 2}
+SHAPES = {"square": 0, "sphere": 1, "cylinder": 2, "stl": 3}
+Kernel = tuple[int, float, float, Body]
 # No mesh resolves the singularity of a sharp edge; this rounding over the width stands for it.
 SHARP_EDGE = 0.01
 
@@ -28,13 +30,14 @@ class Indenter:
 
     Parameters
     ----------
-    shape : ``square`` (prism), ``sphere`` or ``cylinder`` (flat end).
-    width : edge length or diameter, mm, rounding included.
-    edge_radius : rounding of the edges of square and cylinder, mm.  Less than 1 % of the width (also 0, a
-        sharp edge) is taken as 1 % of the width.
+    shape : ``square`` (prism), ``sphere``, ``cylinder`` (flat end) or ``stl`` (the ``surface``).
+    width : edge length or diameter, mm, rounding included; with a surface it is measured.
+    edge_radius : rounding of the edges, mm.  Less than 1 % of the width (also 0, a sharp edge) is taken as
+        1 % of the width, with a surface as much of it as its details allow; a sphere has none.
     centre : (3,) the middle of the foremost face, mm.
     axis : (3,) into the tissue; any length.
     edge : (3,) direction of one edge of the square; by default the cross product of ``axis`` and z.
+    surface : triangles in the indenter's frame, for ``stl`` only.
     """
 
     shape: str = "square"
@@ -43,14 +46,21 @@ class Indenter:
     centre: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0)
     axis: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, -1.0)
     edge: Sequence[float] | NDArray[np.float64] | None = None
+    surface: RigidSurface | None = None
 
     def __post_init__(self) -> None:
         if self.shape not in SHAPES:
             raise ProblemError(f"unknown indenter shape {self.shape!r}; use one of {sorted(SHAPES)}")
+        if (self.surface is not None) != (self.shape == "stl"):
+            raise ProblemError("an indenter of shape 'stl' needs a surface, and only such a one has it")
+        if self.surface is not None:
+            object.__setattr__(self, "width", self.surface.width)
         if not (math.isfinite(self.width) and self.width > 0):
             raise ProblemError(f"indenter width {self.width} mm is not positive")
         if not 0 <= self.edge_radius <= self.width / 2:
             raise ProblemError(f"edge radius {self.edge_radius} mm does not fit a width of {self.width} mm")
+        if self.surface is not None:
+            self.surface.rounded(*self._rounding)  # refuses a radius that does not fit
         for name in ("centre", "axis"):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (3,) or not np.isfinite(value).all():
@@ -78,9 +88,23 @@ class Indenter:
         return np.array([edge, np.cross(axis, edge), axis])
 
     @property
-    def kernel(self) -> tuple[int, float, float]:
-        """Code, half width and effective edge radius, as the compiled kernels read them."""
-        return SHAPES[self.shape], self.width / 2, max(self.edge_radius, SHARP_EDGE * self.width)
+    def _rounding(self) -> tuple[float, bool]:
+        """Edge radius, mm, and whether it was asked for."""
+        least = SHARP_EDGE * self.width
+        return max(self.edge_radius, least), self.edge_radius >= least
+
+    @property
+    def kernel(self) -> Kernel:
+        """Code, half width, effective edge radius and triangles, as the compiled kernels read them."""
+        radius, body = self._rounding[0], NO_BODY
+        if self.surface is not None:
+            radius, body = self.surface.rounded(*self._rounding)
+        return SHAPES[self.shape], self.width / 2, radius, body
+
+    @property
+    def length(self) -> float:
+        """From the foremost point to the far end of a surface; the width for shapes without one, mm."""
+        return self.width if self.surface is None else -float(self.surface.points[:, 2].min())
 
     def moved(self, distance: float) -> Indenter:
         """The indenter, advanced along its axis by ``distance`` mm."""
@@ -89,17 +113,20 @@ class Indenter:
     def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (n,) of points (n, 3), mm; negative inside."""
         local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
-        return signed_distances(np.ascontiguousarray(local), *self.kernel)
+        return signed_distances(np.ascontiguousarray(local), self.kernel)
 
 
 @njit(cache=True)
-def signed_distance(shape, half, radius, x, gradient, hessian):  # type: ignore[no-untyped-def]
+def signed_distance(kernel, x, gradient, hessian):  # type: ignore[no-untyped-def]
     """Distance of the local point ``x (3,)``; fills its gradient (3,) and hessian (3, 3).
 
     The prism is a box shrunk by its rounding, grown again (Quilez' rounded box).  Deeper than the rounding
     the way out is always through the foremost face: a point that a large step left inside must go back to
     where it came from, not sideways through the nearest wall.
     """
+    shape, half, radius, body = kernel
+    if shape == 3:
+        return surface_distance(body, radius, x, gradient, hessian)
     gradient[:] = 0.0
     hessian[:, :] = 0.0
     if shape == 1:
@@ -153,9 +180,9 @@ def _cylinder(x, p, up, r, gradient, hessian):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def signed_distances(local, shape, half, radius):  # type: ignore[no-untyped-def]
+def signed_distances(local, kernel):  # type: ignore[no-untyped-def]
     """`signed_distance` of many local points (n, 3), without derivatives."""
     out, gradient, hessian = np.empty(len(local)), np.empty(3), np.empty((3, 3))
     for i in range(len(local)):
-        out[i] = signed_distance(shape, half, radius, local[i], gradient, hessian)
+        out[i] = signed_distance(kernel, local[i], gradient, hessian)
     return out

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .assembly import assemble
-from .contact import ContactSurface, Touch, contact, touching_offset
+from .contact import ContactSurface, Touch, check_clear, contact, touching_offset
 from .elements import Element, reference_gradients
 from .indenter import Indenter
 from .laws import Laws
@@ -75,6 +75,7 @@ class System:
             self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
             if problem.start == "touching":
                 self.indenter = problem.indenter.moved(self._touching(problem.indenter))
+            check_clear(self.surface, self.indenter.moved(float(problem.history.at(0.0))))
 
     def _touching(self, indenter: Indenter) -> float:
         assert self.surface is not None

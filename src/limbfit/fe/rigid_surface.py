@@ -1,0 +1,255 @@
+"""A closed triangle surface as a rigid indenter: checks, rounding, and its signed distance.
+
+Like the other shapes it is taken as a smaller body grown by a rounding radius: the faces move inwards by
+the radius and the distance from them, less the radius, is the distance from the body with rounded edges.
+The flat faces stay where they are, and the gradient is continuous as deep as the radius.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from .closest_point import INSIDE, Tree, build_tree, closest_point
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+# Corners (m, 3, 3); unit normals (m, 3) of faces and (m, 3, 3) of their edges and corners; directions
+# (m, 3, 3) of the straight edge that a corner lies on (zero: a true corner); trees over all and front faces.
+Body = tuple[Array, Array, Array, Array, Array, Tree, Tree]
+
+SMALLEST_MM, LARGEST_MM = 0.5, 500.0  # of an indenter's width: beyond, the file is not in mm
+FRONT = 0.1  # faces whose unit normal leans at least so much towards the tissue
+STRAIGHT = 1e-8  # squared sine below which normals or edges count as parallel
+SPREAD = 2.5e-3  # squared sine of a spread of normals that a moved corner need not follow
+_NOTHING = np.zeros((0, 3, 3))
+_NO_TREE = (np.zeros((0, 6)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+NO_BODY: Body = (_NOTHING, np.zeros((0, 3)), _NOTHING, _NOTHING, _NOTHING, _NO_TREE, _NO_TREE)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidSurface:
+    """A closed surface in the indenter's frame: x and y across, z along the axis into the tissue; mm.
+
+    It is moved along z until its foremost point lies at z = 0; the axis x = y = 0 must pass through it.
+
+    Parameters
+    ----------
+    points : (n, 3) mm.
+    faces : (m, 3) corners, all counter-clockwise seen from outside (or all from inside).
+
+    Raises
+    ------
+    ProblemError
+        Where it is no closed triangle surface, encloses nothing, is not in mm or lies beside its axis.
+    """
+
+    points: Array
+    faces: Faces
+    _rounded: dict[float, tuple[float, Body]] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        points, faces = np.asarray(self.points, dtype=float), np.asarray(self.faces)
+        _check_arrays(points, faces)
+        faces = faces.astype(np.int64)
+        _check_closed(faces)
+        points = points - [0.0, 0.0, points[faces, 2].max()]
+        used = points[np.unique(faces)]
+        _check_size(used)
+        corners = points[faces] - used.mean(axis=0)
+        volume = float(np.linalg.det(corners).sum()) / 6.0
+        if abs(volume) < 1e-6 * np.ptp(used, axis=0).max() ** 3:
+            raise ProblemError("the indenter's surface is flat: it encloses no volume")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "faces", faces if volume > 0 else np.ascontiguousarray(faces[:, ::-1]))
+
+    @property
+    def width(self) -> float:
+        """Twice the largest distance from the axis along x or y, mm."""
+        return 2.0 * float(np.abs(self.points[self.faces][..., :2]).max())
+
+    def rounded(self, radius: float, exact: bool) -> tuple[float, Body]:
+        """The body whose edges are rounded by ``radius`` mm, as the kernels read it, and the radius.
+
+        Where the surface has details that such a radius would swallow, it is halved; or refused, with
+        ``exact``.
+        """
+        key = -radius if exact else radius
+        if key not in self._rounded:
+            self._rounded[key] = self._round(radius, 0 if exact else 12)
+        return self._rounded[key]
+
+    def _round(self, radius: float, halvings: int) -> tuple[float, Body]:
+        for k in range(halvings + 1):
+            r = radius / 2**k
+            moved = self._shrunk(r)
+            if moved is not None:
+                return r, _body(moved, self.faces)
+        raise ProblemError(
+            f"the indenter's surface has details that cannot be rounded by {radius:g} mm",
+            remedy="give a smaller edge radius or a coarser surface",
+        )
+
+    def _shrunk(self, radius: float) -> Array | None:
+        """Points (n, 3) of the surface whose faces moved in by ``radius``; None where a face turns over."""
+        normals, areas = _normals(self.points[self.faces])
+        spread, along = _spread(self.points, self.faces, normals)
+        values, axes = np.linalg.eigh(spread)
+        keep = values > SPREAD * values[:, -1:]
+        inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
+        moved = self.points - radius * np.einsum("nij,nj,nkj,nk->ni", axes, inverse, axes, along)
+        after, left = _normals(moved[self.faces])
+        solid = areas > 1e-12 * areas.max()
+        upright = (np.einsum("mi,mi->m", normals, after) > 0.5) & (left > 0.0)
+        return moved if upright[solid].all() else None
+
+
+def _check_arrays(points: Array, faces: NDArray) -> None:
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ProblemError("the indenter's surface has points that are not three finite numbers each")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise ProblemError("the indenter's surface is not made of triangles", remedy="triangulate it")
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
+        raise ProblemError("the faces of the indenter's surface refer to points that it does not have")
+
+
+def _check_closed(faces: Faces) -> None:
+    """Every edge belongs to two faces, that run along it in opposite directions."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    count = int(faces.max()) + 1
+    there, back = edges @ [count, 1], edges @ [1, count]
+    _, times = np.unique(there, return_counts=True)
+    single = ~np.isin(there, back)
+    if (edges[:, 0] == edges[:, 1]).any():
+        raise ProblemError("the indenter's surface has faces with a doubled corner", remedy="clean it")
+    if single.any() or times.max() > 1:
+        what = f"is open or not oriented: {int(single.sum())} edges have a face on one side only"
+        if not single.any():
+            what = "has edges with more than two faces"
+        raise ProblemError(f"the indenter's surface {what}", remedy="export a closed solid")
+
+
+def _check_size(points: Array) -> None:
+    low, high = points.min(axis=0), points.max(axis=0)
+    width = float((high - low)[:2].max())
+    if not SMALLEST_MM <= width <= LARGEST_MM:
+        raise ProblemError(f"the indenter's surface is {width:g} mm wide", remedy="give it in millimetres")
+    if (low[:2] > 0).any() or (high[:2] < 0).any():
+        raise ProblemError(
+            "the indenter's surface lies beside its axis",
+            remedy="give it in the indenter's frame: z along the axis, x = y = 0 in its middle",
+        )
+
+
+def _normals(corners: Array) -> tuple[Array, Array]:
+    """Unit normals (m, 3), zero for degenerate triangles, and areas (m,)."""
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(vectors, axis=1)
+    flat = length <= 1e-14 * length.max()
+    return np.where(flat[:, None], 0.0, vectors / np.where(flat, 1.0, length)[:, None]), 0.5 * length
+
+
+def _angles(corners: Array) -> Array:
+    """Angles (m, 3) of triangles at their corners."""
+    ahead = np.roll(corners, -1, axis=1) - corners
+    back = np.roll(corners, 1, axis=1) - corners
+    sine = np.linalg.norm(np.cross(ahead, back), axis=2)
+    return np.arctan2(sine, np.einsum("mij,mij->mi", ahead, back))
+
+
+def _spread(points: Array, faces: Faces, normals: Array) -> tuple[Array, Array]:
+    """Sums over the faces at each point, weighted by angle, of ``n n^T (n, 3, 3)`` and ``n (n, 3)``."""
+    weights = _angles(points[faces])
+    outer, sums = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    for corner in range(3):
+        w = weights[:, corner, None] * normals
+        np.add.at(outer, faces[:, corner], w[:, :, None] * normals[:, None, :])
+        np.add.at(sums, faces[:, corner], w)
+    return outer, sums
+
+
+def _body(points: Array, faces: Faces) -> Body:
+    """The arrays of the kernels; pseudo-normals after Baerentzen and Aanaes (2005)."""
+    corners = np.ascontiguousarray(points[faces])
+    normals, areas = _normals(corners)
+    spread, sums = _spread(points, faces, normals)
+    values, axes = np.linalg.eigh(spread)
+    on_edge = (values[:, 0] < STRAIGHT * values[:, 2]) & (values[:, 1] > STRAIGHT * values[:, 2])
+    along = np.where(on_edge[:, None], axes[:, :, 0], 0.0)
+    solid = np.flatnonzero(areas > 1e-12 * areas.max())
+    facing = normals[solid, 2] > min(FRONT, 0.5 * normals[solid, 2].max())
+    trees = build_tree(corners, solid), build_tree(corners, solid[facing])
+    return corners, normals, _edge_normals(faces, normals), sums[faces], along[faces], *trees
+
+
+def _edge_normals(faces: Faces, normals: Array) -> Array:
+    """Sum (m, 3, 3) of the normals of the two faces at the edge from each corner to the next."""
+    ahead = np.roll(faces, -1, axis=1)
+    count = int(faces.max()) + 1
+    there, back = (faces * count + ahead).ravel(), (ahead * count + faces).ravel()
+    order = np.argsort(there)
+    other = order[np.searchsorted(there[order], back)] // 3
+    return normals[:, None, :] + normals[other].reshape(*faces.shape, 3)
+
+
+@njit(cache=True)
+def surface_distance(body, radius, x, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Distance of ``x (3,)`` from the rounded surface; fills its gradient (3,) and hessian (3, 3).
+
+    Deeper than the rounding the way out is through the front faces, as for the other shapes.
+    """
+    corners, normals, edge_normals, corner_normals, along, tree, front = body
+    point, axis, outward = np.empty(3), np.zeros(3), np.empty(3)
+    face, feature, squared = closest_point(corners, tree, x, point)
+    _feature_normal(normals, edge_normals, corner_normals, face, feature, outward)
+    side = 0.0
+    for i in range(3):
+        side += (x[i] - point[i]) * outward[i]
+    sign = 1.0
+    if side < 0.0:
+        sign = -1.0
+        face, feature, squared = closest_point(corners, front, x, point)
+        _feature_normal(normals, edge_normals, corner_normals, face, feature, outward)
+    d = np.sqrt(squared)
+    hessian[:, :] = 0.0
+    if d <= 1e-9 * radius:
+        length = np.sqrt(outward[0] ** 2 + outward[1] ** 2 + outward[2] ** 2)
+        for i in range(3):
+            gradient[i] = outward[i] / length
+        return sign * d - radius
+    away = 0.0
+    for i in range(3):
+        gradient[i] = sign * (x[i] - point[i]) / d
+        away += (gradient[i] - normals[face, i]) ** 2
+    if feature == INSIDE or away < 1e-12:
+        return sign * d - radius
+    if feature < 4:
+        a, b = feature - 1, feature % 3
+        length = 0.0
+        for i in range(3):
+            axis[i] = corners[face, b, i] - corners[face, a, i]
+            length += axis[i] * axis[i]
+        for i in range(3):
+            axis[i] /= np.sqrt(length)
+    else:
+        for i in range(3):
+            axis[i] = along[face, feature - 4, i]
+    for i in range(3):
+        for j in range(3):
+            identity = 1.0 if i == j else 0.0
+            hessian[i, j] = sign * (identity - gradient[i] * gradient[j] - axis[i] * axis[j]) / d
+    return sign * d - radius
+
+
+@njit(cache=True)
+def _feature_normal(normals, edge_normals, corner_normals, face, feature, out):  # type: ignore[no-untyped-def]
+    if feature == INSIDE:
+        out[:] = normals[face]
+    elif feature < 4:
+        out[:] = edge_normals[face, feature - 1]
+    else:
+        out[:] = corner_normals[face, feature - 4]
