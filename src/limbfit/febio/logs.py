@@ -35,13 +35,13 @@ def read_log(path: str | Path) -> Log:
         Where the file is missing, holds no complete step, or a line that is no number.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise ProblemError(error.strerror or "cannot be read", file=path) from error
     times: list[float] = []
     steps: list[list[list[float]]] = []
     names: tuple[str, ...] = ()
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.split("\n")[:-1], 1):  # a line without end was cut short
         try:
             if line.startswith("*Time"):
                 times.append(float(line.partition("=")[2]))
@@ -51,8 +51,6 @@ def read_log(path: str | Path) -> Log:
             elif line.strip() and not line.startswith("*"):
                 steps[-1].append([float(value) for value in line.split(",")[1:]])
         except (ValueError, IndexError) as error:
-            if number == len(lines):  # killed while it wrote
-                break
             raise ProblemError(f"{line!r} is no line of a FEBio log", file=path, place=str(number)) from error
     items = len(steps[0]) if steps else 0
     whole = [[len(row) for row in step] == [len(names)] * items for step in steps]
