@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import pyvista as pv
@@ -103,7 +105,7 @@ def test_fine_ball_is_the_sphere():
 
 
 def test_surface_is_put_with_its_foremost_point_at_the_origin_and_outwards():
-    points, faces = box().points + [0, 0, 7.0], BOX_FACES[:, ::-1]
+    points, faces = box().points + np.array([0, 0, 7.0]), BOX_FACES[:, ::-1]
     surface = RigidSurface(points, faces)
     assert surface.points[:, 2].max() == 0.0
     values = evaluated(Indenter("stl", surface=surface), np.array([[0.0, 0, 1.0], [0, 0, -1.0]]))[0]
@@ -113,9 +115,7 @@ def test_surface_is_put_with_its_foremost_point_at_the_origin_and_outwards():
 @pytest.mark.parametrize("name", TOOLS)
 def test_starts_just_touching(name):
     tool = TOOLS[name]
-    far = Indenter(
-        tool.shape, 20.0, tool.edge_radius, (0.4, 0.3, 37.0), (0.02, 0.01, -1.0), surface=tool.surface
-    )
+    far = replace(tool, centre=(0.4, 0.3, 37.0), axis=(0.02, 0.01, -1.0))
     system = System(punch("tet10", 4, 1, indenter=far))
     assert abs(system.surface.gaps(system.indenter).min()) < 1e-6
     ahead = far.moved(0.9 * np.linalg.norm(system.indenter.centre - np.array(far.centre)))
@@ -160,7 +160,7 @@ def test_start_inside_the_tissue_is_refused():
         (box().points * np.nan, BOX_FACES, "finite"),
         (box().points * 1e-3, BOX_FACES, "0.02 mm wide.*millimetres"),
         (box().points * 1e3, BOX_FACES, "20000 mm wide"),
-        (box().points + [100, 0, 0], BOX_FACES, "beside its axis"),
+        (box().points + np.array([100, 0, 0]), BOX_FACES, "beside its axis"),
     ],
 )
 def test_unusable_surfaces_are_refused(points, faces, what):
