@@ -65,7 +65,7 @@ def levels(bottom: Array, top: Array, layer: float, count: int) -> Array:
 def slab(
     thickness: float, layer: float, inner: float, half: float, ridge: float, edge: float, count: int
 ) -> Body:
-    """A block; its held bottom rises by ``ridge`` mm beyond x = ``edge``, over 8 mm; the site is (0, 0, 0)."""
+    """A block; its held bottom rises by ``ridge`` mm beyond x = ``edge``, over 8 mm; site (0, 0, 0)."""
     lines = graded(inner, half, 4, 2)
     x, y = np.meshgrid(lines, lines, indexing="ij")
     rise = np.clip((x - edge) / 8.0 + 0.5, 0.0, 1.0)
