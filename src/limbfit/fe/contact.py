@@ -49,20 +49,26 @@ class ContactSurface:
 
     def gaps(self, indenter: Indenter, u: Array | None = None) -> Array:
         """Signed distances (f, q) at the quadrature points, mm."""
+        return indenter.local_distance(self.local(indenter, u))[0]
+
+    def local(self, indenter: Indenter, u: Array | None = None) -> Array:
+        """The quadrature points (f, q, 3) in the indenter's frame, mm."""
         x = self.points if u is None else self.points + u
         at = np.einsum("qk,fki->fqi", self.N, x[self.faces])
-        return indenter.signed_distance(at.reshape(-1, 3)).reshape(self.areas.shape)
+        return (at - np.asarray(indenter.centre)) @ indenter.frame.T
 
 
 @dataclass(frozen=True)
 class Touch:
     """Contact points (c,) as springs: gap (mm, infinite where far), unit normal (c, 3), stiffness
-    ``weights (c,)`` along it (N/mm), and the tangent ``blocks (c, 3, 3)`` where the gap is closed."""
+    ``weights (c,)`` along it (N/mm), and the tangent ``blocks (c, 3, 3)``; the part ``stick (c, 3, 3)`` of
+    the tangent is that of anchors, there whether the gap is closed or not."""
 
     gaps: Array
     normals: Array
     weights: Array
     blocks: Array
+    stick: Array
 
     @property
     def closed(self) -> NDArray[np.bool_]:
@@ -76,8 +82,10 @@ class Touch:
         change = closed.astype(float) - self.closed
         stiff = self.weights[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
         gaps = np.where(change != 0.0, self.gaps, 0.0)
-        blocks = np.where((change > 0)[:, None, None], stiff, self.blocks) * closed[:, None, None]
-        return blocks, (change * self.weights * gaps)[:, None] * self.normals
+        pushing = np.where((change > 0)[:, None, None], stiff, self.blocks - self.stick)
+        return self.stick + pushing * closed[:, None, None], (change * self.weights * gaps)[
+            :, None
+        ] * self.normals
 
 
 def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: float = 1e-9) -> float:
@@ -117,37 +125,22 @@ def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces,
-    N,
-    areas,
-    X,
-    u,
-    centre,
-    frame,
-    kernel,
-    penalty,
-    tangent,
-    positions,
-    residual,
-    data,
-    advance,
-    gaps,
-    normals,
-    blocks,
-):
+    faces, N, areas, X, u, centre, frame, kernel, penalty, anchors, tangent, positions, residual, data, advance,
+    gaps, normals, blocks,
+):  # fmt: skip
     """Add the contact energy's gradient to ``residual`` and its hessian to ``data``.
 
-    ``advance (n, 3)`` receives the mixed derivative with respect to displacement and indenter advance
-    (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals (f, q, 3)`` and ``blocks
-    (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point.  Returns energy,
-    reaction along the axis (N), largest
-    penetration (mm), reference area in touch (mm^2).
+    ``anchors``: which points stick (f, q), where (f, q, 3) and in which plane, as the normal (f, q, 3) to it,
+    in the indenter's frame.  ``advance (n, 3)`` receives the mixed derivative with respect to displacement
+    and indenter advance (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals
+    (f, q, 3)`` and ``blocks (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point.
+    Returns energy, reaction along the axis (N), largest penetration (mm), reference area in touch (mm^2).
     """
-    half = kernel[1]
-    k = faces.shape[1]
+    held, places, planes = anchors
+    half, k = kernel[1], faces.shape[1]
     Ke = np.empty((3 * k, 3 * k))
-    x, local, gl, g = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    hl, h = np.empty((3, 3)), np.empty((3, 3))
+    x, local, g, t = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    bend, h, H = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     energy = force = deepest = area = 0.0
     reach = 1.8 * half
     for f in range(faces.shape[0]):
@@ -160,42 +153,62 @@ def contact(  # type: ignore[no-untyped-def]
                     x[i] += N[q, a] * (X[faces[f, a], i] + u[faces[f, a], i])
             for i in range(3):
                 local[i] = frame[i, 0] * x[0] + frame[i, 1] * x[1] + frame[i, 2] * x[2]
-            gaps[f, q] = np.inf
-            if local[2] > half or abs(local[0]) > reach or abs(local[1]) > reach:
-                continue
-            phi = signed_distance(kernel, local, gl, hl)
-            for i in range(3):
-                g[i] = frame[0, i] * gl[0] + frame[1, i] * gl[1] + frame[2, i] * gl[2]
-                normals[f, q, i] = g[i]
+            phi, w = np.inf, penalty * areas[f, q]
+            t[:], h[:] = 0.0, 0.0
+            if local[2] <= half and abs(local[0]) <= reach and abs(local[1]) <= reach:
+                phi = signed_distance(kernel, local, g, bend)
+                for i in range(3):
+                    normals[f, q, i] = frame[0, i] * g[0] + frame[1, i] * g[1] + frame[2, i] * g[2]
             gaps[f, q] = phi
-            if phi >= 0.0:
+            if phi < 0.0:
+                energy += 0.5 * w * phi * phi
+                deepest = max(deepest, -phi)
+                area += areas[f, q]
+                for i in range(3):
+                    t[i] = w * phi * g[i]
+                    for j in range(3):
+                        h[i, j] = w * (g[i] * g[j] + phi * bend[i, j])
+            if held[f, q]:
+                energy += _stick(local, places[f, q], planes[f, q], w, t, h)
+            elif phi >= 0.0:
                 continue
             touched = True
-            w = penalty * areas[f, q]
-            energy += 0.5 * w * phi * phi
-            force -= w * phi * gl[2]
-            deepest = max(deepest, -phi)
-            area += areas[f, q]
-            for a in range(k):
-                for i in range(3):
-                    residual[faces[f, a], i] += w * phi * N[q, a] * g[i]
+            force -= t[2]
+            for i in range(3):
+                push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
+                for a in range(k):
+                    residual[faces[f, a], i] += N[q, a] * push
             if not tangent:
                 continue
             for i in range(3):
                 for j in range(3):
-                    value = 0.0
+                    H[i, j] = 0.0
                     for p in range(3):
                         for r in range(3):
-                            value += frame[p, i] * hl[p, r] * frame[r, j]
-                    h[i, j] = w * (g[i] * g[j] + phi * value)
-                    blocks[f, q, i, j] = h[i, j]
+                            H[i, j] += frame[p, i] * h[p, r] * frame[r, j]
+                    blocks[f, q, i, j] = H[i, j]
             for a in range(k):
                 for i in range(3):
-                    along = h[i, 0] * frame[2, 0] + h[i, 1] * frame[2, 1] + h[i, 2] * frame[2, 2]
+                    along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
                     advance[faces[f, a], i] += N[q, a] * along
                     for j in range(3):
                         for b in range(k):
-                            Ke[i * k + a, j * k + b] += h[i, j] * N[q, a] * N[q, b]
+                            Ke[i * k + a, j * k + b] += H[i, j] * N[q, a] * N[q, b]
         if tangent and touched:
             scatter_upper(Ke, positions[f], data)
     return energy, force, deepest, area
+
+
+@njit(cache=True)
+def _stick(local, place, normal, w, t, h):  # type: ignore[no-untyped-def]
+    """Add force and tangent of an anchor at the point ``local (3,)``; returns its energy."""
+    across = energy = 0.0
+    for i in range(3):
+        across += normal[i] * (local[i] - place[i])
+    for i in range(3):
+        slip = local[i] - place[i] - across * normal[i]
+        energy += 0.5 * w * slip * slip
+        t[i] += w * slip
+        for j in range(3):
+            h[i, j] += w * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
+    return energy

@@ -113,7 +113,16 @@ class Indenter:
     def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (n,) of points (n, 3), mm; negative inside."""
         local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
-        return signed_distances(np.ascontiguousarray(local), self.kernel)
+        return self.local_distance(local)[0]
+
+    def local_distance(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Distance (...), mm, its gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
+        shape = points.shape[:-1]
+        x = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
+        values, slopes, bends = signed_distances(x, self.kernel)
+        return values.reshape(shape), slopes.reshape(*shape, 3), bends.reshape(*shape, 3, 3)
 
 
 @njit(cache=True)
@@ -181,8 +190,9 @@ def _cylinder(x, p, up, r, gradient, hessian):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def signed_distances(local, kernel):  # type: ignore[no-untyped-def]
-    """`signed_distance` of many local points (n, 3), without derivatives."""
-    out, gradient, hessian = np.empty(len(local)), np.empty(3), np.empty((3, 3))
-    for i in range(len(local)):
-        out[i] = signed_distance(kernel, local[i], gradient, hessian)
-    return out
+    """`signed_distance` of many local points (n, 3) with its derivatives."""
+    n = len(local)
+    values, slopes, bends = np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3))
+    for i in range(n):
+        values[i] = signed_distance(kernel, local[i], slopes[i], bends[i])
+    return values, slopes, bends

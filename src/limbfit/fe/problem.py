@@ -78,6 +78,7 @@ class Problem:
     supports : single components held or moved.
     element : name in the element table; by default the mesh's cell type.
     contact_rule : where contact is enforced: ``nodes`` of the faces or their ``gauss`` points.
+    friction : ``frictionless``, or ``sticky``: what touches does not slip along the indenter.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     """
 
@@ -91,6 +92,7 @@ class Problem:
     element: str = ""
     start: str = "touching"
     contact_rule: str = "nodes"
+    friction: str = "frictionless"
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
@@ -151,6 +153,8 @@ def _check_choices(problem: Problem) -> None:
         raise ProblemError("the mesh has region indices without a name")
     if problem.contact_rule not in ("nodes", "gauss"):
         raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy="use 'nodes' or 'gauss'")
+    if problem.friction not in ("frictionless", "sticky"):
+        raise ProblemError(f"unknown friction {problem.friction!r}", remedy="use 'frictionless' or 'sticky'")
     if problem.start not in ("touching", "as-given"):
         raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
 

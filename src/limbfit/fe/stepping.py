@@ -14,13 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .contact import ContactSurface
 from .factor import Factor
 from .history import Memory
+from .indenter import Indenter
 from .laws import Laws
 from .newton import Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .problem import History, Problem
 from .result import Result, State, Step
 from .sensitivity import MemoryDerivative
+from .sticky import Anchors
 from .system import Evaluation, Increment, System
 
 Array = NDArray[np.float64]
@@ -86,6 +89,9 @@ class Simulation:
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
+        self.anchors: Anchors | None = None
+        if problem.friction == "sticky" and self.system.surface is not None:
+            self.anchors = Anchors.none(self.system.surface, self.laws.count if sensitivities else 0)
         self.warm = _warm_states(problem, warm_start)
         self.floor = 0.0
         width = problem.indenter.width if problem.indenter is not None else 1.0
@@ -123,18 +129,29 @@ class Simulation:
         stiffness, u = self.stiffness, self._predict(t, displacement)
         if warm is not None:  # the same penalty as then, or the force would jump between iterates
             stiffness = max(stiffness, warm.penalty)
+        anchors = self.anchors
         for _ in range(6):
             increment = self.memory.increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
             )
+            increment = replace(increment, anchors=anchors)
             found = self._equilibrate(increment, u)
             self.counts["newton_iterations"] += found.iterations
             if found.reason:
                 return found.reason
-            if found.at.penetration <= self.deepest:
+            kept, deep = anchors, found.at.penetration > self.deepest
+            if anchors is not None:
+                kept = anchors.let_go(*self._tool(increment), found.u)
+            if kept is anchors and not deep:
                 break
-            stiffness, u = 3.0 * stiffness, found.u
+            stiffness, anchors, u = (3.0 if deep else 1.0) * stiffness, kept, found.u
         return self._accept(found, increment, dt, stiffness)
+
+    def _tool(self, increment: Increment) -> tuple[ContactSurface, Indenter]:
+        """The contact surface and the indenter where it is in a step."""
+        assert self.system.surface is not None
+        assert self.system.indenter is not None
+        return self.system.surface, self.system.indenter.moved(increment.displacement)
 
     def _equilibrate(self, increment: Increment, guess: Array) -> Equilibrium:
         """From the predicted displacement; from the last one where that fails."""
@@ -177,6 +194,8 @@ class Simulation:
         if self.slope is not None:
             du, force_slope = self._differentiate(self.slope, found, increment, dt, stiffness)
             self.slope = self.slope.advanced(self.system, self.laws, self.memory, after, u, du, dt)
+        if increment.anchors is not None:
+            self.anchors = increment.anchors.after(*self._tool(increment), u, du)
         self.memory, self.stiffness = after, stiffness
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
         state = State(increment.time, increment.displacement, u, stiffness, du, after)
@@ -197,12 +216,16 @@ class Simulation:
         d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
         pushed = system.contact_force(u, increment)
         change += pushed[..., None] * d_penalty
+        d_reaction = np.zeros(laws.count)
+        if increment.anchors is not None:
+            forces, d_reaction = increment.anchors.explicit(*self._tool(increment), u, increment.penalty)
+            change += forces
         b = -change.reshape(-1, laws.count)[system.free]
         blocks = None if at.touch is None else at.touch.blocks
         du = np.zeros((u.size, laws.count))
         self.factor.factorise(at.data, blocks)  # dearer products of many columns would not pay
         du[system.free] = self.factor.apply(b)
-        d_force = at.force * d_penalty
+        d_force = at.force * d_penalty + d_reaction
         if at.advance is not None:
             d_force = d_force - at.advance.ravel() @ du
         return du.reshape(*u.shape, laws.count), d_force

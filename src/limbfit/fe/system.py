@@ -19,6 +19,7 @@ from .elements import Element, reference_gradients
 from .indenter import Indenter
 from .laws import Laws
 from .problem import Problem, ProblemError, check
+from .sticky import Anchors
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,8 @@ Array = NDArray[np.float64]
 class Increment:
     """What is constant while one step is solved.
 
-    ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm.
+    ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; ``anchors`` hold
+    the points that stick, where contact is sticky.
     """
 
     time: float
@@ -35,6 +37,7 @@ class Increment:
     scale: Array
     history: Array
     penalty: float
+    anchors: Anchors | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ class System:
         if problem.indenter is not None:
             faces = np.asarray(problem.contact_faces, dtype=np.int64)
             self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
+            self.free_to_slip = Anchors.none(self.surface)
             touching = self.surface.faces
             self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
             if problem.start == "touching":
@@ -150,7 +154,9 @@ class System:
         norm, touch = float(np.linalg.norm(pushed)), None
         if self.surface.nodal:
             weights = increment.penalty * self.surface.areas[:, 0]
-            touch = Touch(points[0][:, 0], points[1][:, 0], weights, points[2][:, 0])
+            anchors = increment.anchors or self.free_to_slip
+            stick = anchors.blocks(self.surface, self.indenter, increment.penalty)[:, 0]
+            touch = Touch(points[0][:, 0], points[1][:, 0], weights, points[2][:, 0], stick)
         energy += found
         return Evaluation(energy, residual + pushed, data, force, deepest, area, advance, norm, touch)
 
@@ -176,11 +182,12 @@ class System:
         assert self.surface is not None
         assert self.indenter is not None
         surface, frame = self.surface, self.indenter.frame
+        anchors = increment.anchors or self.free_to_slip
         centre = np.asarray(self.indenter.centre) + increment.displacement * frame[2]
         return contact(
             surface.faces, surface.N, surface.areas, self.points, u, centre, frame, self.indenter.kernel,
-            increment.penalty, tangent, self.face_positions, pushed, data, advance,
-            *points,
+            increment.penalty, (anchors.held, anchors.places, anchors.normals), tangent, self.face_positions,
+            pushed, data, advance, *points,
         )  # fmt: skip
 
     def with_springs(self, data: Array, blocks: Array) -> Array:
