@@ -15,7 +15,7 @@ FLOORS = [
     {"pipeline"},
     {"report", "phantom", "bench"},
     {"indentation"},
-    {"study", "febio"},
+    {"study", "febio", "fields"},
     {"identify", "execution", "traces", "anatomy", "fe"},
     {"mesh"},
     {"errors", "_version"},

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fe import History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
-from .fe.laws import Laws
-from .fe.observables import ElementFields, element_fields
-from .mesh import Mesh, read_vtu, write_vtu
+from .fields import Animation, write_fields
+from .mesh import Mesh, read_vtu
 from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable
 
 Parameters = dict[str, dict[str, float]]
@@ -179,42 +178,26 @@ def simulate(job: SimulationJob) -> Simulation:
     )
 
 
-def peak_fields(model: SiteModel, parameters: Parameters, file: Path) -> Result:
-    """Simulate an indentation and store its fields at the deepest point as VTU.
+def simulate_fields(
+    model: SiteModel, parameters: Parameters, file: Path, animation: Path | None = None
+) -> Result:
+    """Simulate an indentation and store its fields at the deepest point as VTU (see `fields`).
 
-    Point data ``displacement_mm``; cell data ``J``, ``von_mises_kPa`` (Cauchy), ``largest_stretch``,
-    ``smallest_stretch`` and ``energy_kPa`` (long-term elastic energy density). A simulation that fails in its
-    first step has no fields, and no file is written.
+    With ``animation`` (a ``.pvd``) the fields of every step are stored too.  A simulation that fails in its
+    first step has no fields at its deepest point, and ``file`` is not written.
     """
     problem = _problem(model, parameters)
-    warm_start = _last.get(model)
-    result = solve(problem, steps=_steps(model), warm_start=warm_start, store="peak")
-    if not result.states:
-        return result
-    fields = _element_fields(result)
-    cell_data = {
-        "J": fields.J,
-        "von_mises_kPa": von_mises(fields.cauchy) / KPA,
-        "largest_stretch": fields.stretches[:, 0],
-        "smallest_stretch": fields.stretches[:, 2],
-        "energy_kPa": fields.energy / KPA,
-    }
-    write_vtu(problem.mesh, file, point_data={"displacement_mm": result.states[0].u}, cell_data=cell_data)
+    frames = None if animation is None else Animation(problem, animation)
+    result = solve(
+        problem,
+        steps=_steps(model),
+        warm_start=_last.get(model),
+        on_step=None if frames is None else frames.add,
+        store="peak",
+    )
+    if result.states:
+        write_fields(result.system, problem, result.states[0], file)
     return result
-
-
-def _element_fields(result: Result) -> ElementFields:
-    """Fields of the one state that was stored."""
-    problem = result.problem
-    laws = Laws.build([problem.materials[region] for region in problem.mesh.region_names])
-    return element_fields(result.system, laws, result.states[0])
-
-
-def von_mises(cauchy: Array) -> Array:
-    """Equivalent stress (m,) of stresses (m, 6) in the order xx, yy, zz, xy, yz, zx."""
-    xx, yy, zz, xy, yz, zx = cauchy.T
-    normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
-    return np.sqrt(0.5 * normal + 3.0 * (xy**2 + yz**2 + zx**2))
 
 
 def _in_user_units(result: Result, times: Array) -> Array:

@@ -114,12 +114,19 @@ def simulate(
         str | None,
         typer.Option(help="c_kPa,m,gamma,tau_s of skin, then of muscle; default: identified, else the start"),
     ] = None,
+    animation: Annotated[
+        bool, typer.Option("--animation", help="also store the fields of every step, for ParaView")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
     with listening() as listener:
         found = limbfit.simulate_site(
-            limbfit.load_study(study), site, parameters=parse_parameters(parameters), listener=listener
+            limbfit.load_study(study),
+            site,
+            parameters=parse_parameters(parameters),
+            animation=animation,
+            listener=listener,
         )
     if as_json:
         print_json(found)

@@ -1,13 +1,15 @@
-"""Fields of one accepted step, at elements and contact faces."""
+"""Fields of one accepted step, at elements and nodes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
+from .elements import Element
 from .kinematics import (
     deformation_gradient,
     from_principal,
@@ -20,7 +22,7 @@ from .laws import Laws
 from .materials.ogden import ogden
 from .materials.volumetric import volumetric
 from .result import State
-from .system import System
+from .system import Increment, System
 
 Array = NDArray[np.float64]
 
@@ -55,13 +57,67 @@ def element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
 
 
-def contact_pressure(system: System, state: State, penalty: float) -> Array:
-    """Mean contact pressure (f,) on each contact face, MPa over the reference area; penalty in MPa/mm."""
-    if system.surface is None or system.indenter is None:
-        return np.zeros(0)
-    gaps = system.surface.gaps(system.indenter.moved(state.displacement), state.u)
-    areas = system.surface.areas
-    return penalty * (np.maximum(-gaps, 0.0) * areas).sum(axis=1) / areas.sum(axis=1)
+def contact_pressure(system: System, laws: Laws, state: State) -> Array:
+    """Contact pressure (n,) at the nodes, MPa over the deformed area; 0 where nothing is in touch.
+
+    The part of a node's contact force along the deformed skin's normal, over the node's share of the area.
+    On quadratic faces only mid-edge nodes have a share (the integral of a corner's shape function is zero):
+    a corner's force goes to the mid-edge nodes beside it, and it gets the mean of their pressures.
+    """
+    pressure = np.zeros(len(system.points))
+    if system.surface is None:
+        return pressure
+    nothing, penalty = np.zeros(0), state.penalty * laws.modulus
+    force = system.contact_force(
+        state.u, Increment(state.time, state.displacement, nothing, nothing, penalty)
+    )
+    faces = np.asarray(system.problem.contact_faces)
+    share = _nodal_areas(system.element, system.points + state.u, faces)
+    to_middles = _corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
+    if to_middles is not None:
+        force, share = (values + to_middles.T @ values for values in (force, share))
+    size = np.linalg.norm(share, axis=1)
+    bearing = size > 0.0
+    pressure[bearing] = np.maximum((force * share).sum(axis=1)[bearing], 0.0) / size[bearing] ** 2
+    if to_middles is not None:
+        corners = np.unique(faces[:, :3])
+        pressure[corners] = (to_middles @ pressure)[corners]
+    return pressure
+
+
+def _corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:
+    """Matrix (n, n): at the corners of quadratic faces (f, 6) the mean over the mid-edge nodes beside."""
+    corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
+    count = np.bincount(corners, minlength=n)
+    return sp.csr_matrix((1.0 / count[corners], (corners, beside)), shape=(n, n))
+
+
+def _nodal_areas(element: Element, points: Array, faces: NDArray[np.int64]) -> Array:
+    """Each node's share (n, 3) of the area of the faces (f, k), outward, mm^2."""
+    at, weights = element.face_rules["gauss"]
+    N, dN = element.face_shape(at)
+    tangents = np.einsum("fki,qkj->fqij", points[faces], dN)
+    normals = np.cross(tangents[..., 0], tangents[..., 1])
+    shares = np.einsum("fqi,q,qk->fki", normals, weights, N).reshape(-1, 3)
+    return np.stack([np.bincount(faces.ravel(), part, len(points)) for part in shares.T], axis=1)
+
+
+def nodal_average(system: System, values: Array) -> Array:
+    """Element values (m, c) at the nodes (n, c): the mean over the elements around, by their volume.
+
+    Where two tissues meet it is a mean over both.
+    """
+    volume = system.weights.sum(axis=1)
+    m, k = system.cells.shape
+    around = sp.csr_matrix((np.repeat(volume, k), (system.cells.ravel(), np.repeat(np.arange(m), k))))
+    return np.asarray((around @ values) / (around @ np.ones((m, 1))))
+
+
+def von_mises(cauchy: Array) -> Array:
+    """Equivalent stress (m,) of stresses (m, 6) in the order xx, yy, zz, xy, yz, zx."""
+    xx, yy, zz, xy, yz, zx = cauchy.T
+    normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
+    return np.asarray(np.sqrt(0.5 * normal + 3.0 * (xy**2 + yz**2 + zx**2)))
 
 
 @njit(cache=True)

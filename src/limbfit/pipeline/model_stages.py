@@ -22,7 +22,7 @@ from ..indentation import (
     Simulation,
     SimulationJob,
     SiteModel,
-    peak_fields,
+    simulate_fields,
     to_parameters,
     to_vector,
 )
@@ -289,7 +289,7 @@ class FieldJob:
 
 
 def store_fields(job: FieldJob) -> str:
-    peak_fields(job.model, to_parameters(np.array(job.parameters)), job.file)
+    simulate_fields(job.model, to_parameters(np.array(job.parameters)), job.file)
     return job.model.name
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..execution import SerialExecutor
-from ..indentation import Parameters, peak_fields
+from ..indentation import Parameters, simulate_fields
 from ..study import TISSUES, Study
 from .context import Context, Listener
 from .model_stages import write_curves
@@ -17,7 +17,12 @@ from .store import Store, write_json
 
 
 def simulate_site(
-    study: Study, name: str, *, parameters: Parameters | None, listener: Listener
+    study: Study,
+    name: str,
+    *,
+    parameters: Parameters | None = None,
+    animation: bool = False,
+    listener: Listener,
 ) -> dict[str, Any]:
     """Simulate one indentation: as recorded, or as the study plans it; meshes are made where missing.
 
@@ -26,6 +31,7 @@ def simulate_site(
     Parameters
     ----------
     parameters : per tissue; by default the identified ones, else the study's start.
+    animation : also the fields of every step, as a PVD collection.
 
     Raises
     ------
@@ -41,7 +47,8 @@ def simulate_site(
     folder = store["simulate"]
     folder.mkdir(exist_ok=True)
     context.tell("simulate", 0, 1, f"site {name}")
-    result = peak_fields(model, used, folder / f"{name}.vtu")
+    played = folder / f"{name}.pvd" if animation else None
+    result = simulate_fields(model, used, folder / f"{name}.vtu", played)
     context.tell("simulate", 1, 1, f"site {name}")
     times = np.linspace(0.0, model.knots_s[-1], CURVE_POINTS)
     curve = folder / f"{name}.csv"
@@ -64,6 +71,7 @@ def simulate_site(
         "unknowns": result.statistics["unknowns"],
         "curve": str(curve),
         "fields": str(folder / f"{name}.vtu") if result.states else None,
+        "animation": None if played is None else str(played),
     }
     write_json(folder / f"{name}.json", found)
     return found

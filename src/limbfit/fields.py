@@ -1,0 +1,79 @@
+"""Fields of a simulation as files for ParaView: one step as VTU, all steps as a PVD collection.
+
+Names and units are those of docs/fields.md; stress is Cauchy stress in the order xx, yy, zz, xy, yz, zx,
+which is also VTK's order of symmetric tensors.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .fe import Problem, State, Step, System
+from .fe.history import Memory
+from .fe.laws import Laws
+from .fe.observables import contact_pressure, element_fields, nodal_average, von_mises
+from .mesh import write_pvd, write_vtu
+
+KPA = 1e-3  # MPa
+
+
+def write_fields(system: System, problem: Problem, state: State, file: Path) -> None:
+    """Write the fields of a state that kept its memory as VTU.
+
+    Points are at rest; ``displacement_mm`` moves them.  The state is one of a `Step` that `iterate` yields,
+    or the one kept with ``store="peak"``.
+    """
+    laws = _laws(problem)
+    fields = element_fields(system, laws, state)
+    cauchy = fields.cauchy / KPA
+    point_data = {
+        "displacement_mm": state.u,
+        "contact_pressure_kPa": contact_pressure(system, laws, state) / KPA,
+        "cauchy_nodal_kPa": nodal_average(system, cauchy),
+    }
+    cell_data = {
+        "cauchy_kPa": cauchy,
+        "von_mises_kPa": von_mises(cauchy),
+        "largest_stretch": fields.stretches[:, 0],
+        "middle_stretch": fields.stretches[:, 1],
+        "smallest_stretch": fields.stretches[:, 2],
+        "J": fields.J,
+        "energy_density_kPa": fields.energy / KPA,
+    }
+    write_vtu(problem.mesh, file, point_data=point_data, cell_data=cell_data)
+
+
+class Animation:
+    """Fields of every step: ``<name>.pvd`` and, in a folder of the same name, ``step-0000.vtu`` (rest), ..
+
+    The collection is written anew after every step, so that what was reached can be played when a simulation
+    stops early.
+    """
+
+    def __init__(self, problem: Problem, file: Path) -> None:
+        self.problem, self.file = problem, file
+        self.system = System(problem)
+        self.folder = file.with_suffix("")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for old in self.folder.glob("step-*.vtu"):
+            old.unlink()
+        self.frames: list[tuple[float, Path]] = []
+        rest = np.zeros_like(problem.mesh.points)
+        memory = Memory.rest(self.system, _laws(problem))
+        self._write(State(0.0, float(problem.history.at(0.0)), rest, 0.0, memory=memory))
+
+    def add(self, step: Step) -> None:
+        """Write one step; give it to `solve` as ``on_step``."""
+        self._write(step.state)
+
+    def _write(self, state: State) -> None:
+        frame = self.folder / f"step-{len(self.frames):04d}.vtu"
+        write_fields(self.system, self.problem, state, frame)
+        self.frames.append((state.time, frame))
+        write_pvd(self.file, self.frames)
+
+
+def _laws(problem: Problem) -> Laws:
+    return Laws.build([problem.materials[region] for region in problem.mesh.region_names])
