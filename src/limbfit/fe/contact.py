@@ -125,8 +125,8 @@ def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, X, u, centre, frame, kernel, penalty, anchors, tangent, positions, residual, data, advance,
-    gaps, normals, blocks,
+    faces, N, areas, X, u, centre, frame, kernel, penalty, anchors, tangent, positions, residual, data,
+    advance, gaps, normals, blocks,
 ):  # fmt: skip
     """Add the contact energy's gradient to ``residual`` and its hessian to ``data``.
 

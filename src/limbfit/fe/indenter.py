@@ -118,7 +118,7 @@ class Indenter:
     def local_distance(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Distance (...), mm, its gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
+        """Distance (...), mm, gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
         shape = points.shape[:-1]
         x = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
         values, slopes, bends = signed_distances(x, self.kernel)

@@ -6,7 +6,12 @@ every entry of every element's upper triangle knows its place in it.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,14 +27,15 @@ from .problem import Problem, ProblemError, check
 from .sticky import Anchors
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Increment:
     """What is constant while one step is solved.
 
-    ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; ``anchors`` hold
-    the points that stick, where contact is sticky.
+    ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; ``anchors``
+    hold the points that stick, where contact is sticky.
     """
 
     time: float
@@ -56,10 +62,14 @@ class Evaluation:
 
 
 class System:
-    """A problem's discretisation; see the module docstring.  Valid for any materials and history."""
+    """A problem's discretisation; see the module docstring.  Valid for any materials and history.
 
-    def __init__(self, problem: Problem) -> None:
+    ``threads`` share the cells in every compiled pass.
+    """
+
+    def __init__(self, problem: Problem, threads: int = 1) -> None:
         check(problem)
+        self.threads = threads
         mesh = problem.mesh
         self.problem = problem
         self.element: Element = problem.formulation
@@ -77,9 +87,11 @@ class System:
             self.free_to_slip = Anchors.none(self.surface)
             touching = self.surface.faces
             self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
+            indenter = problem.indenter
             if problem.start == "touching":
-                self.indenter = problem.indenter.moved(self._touching(problem.indenter))
-            check_clear(self.surface, self.indenter.moved(float(problem.history.at(0.0))))
+                indenter = indenter.moved(self._touching(indenter))
+            check_clear(self.surface, indenter.moved(float(problem.history.at(0.0))))
+            self.indenter = indenter
 
     def _touching(self, indenter: Indenter) -> float:
         assert self.surface is not None
@@ -138,13 +150,30 @@ class System:
         """``u`` with the supported components at their values."""
         return np.where(self.supported, self.factors * displacement, u)
 
+    def over_cells(self, work: Callable[[slice], T]) -> list[T]:
+        """``work`` done on as many parts of the cells as there are threads, side by side."""
+        ends = np.linspace(0, len(self.cells), self.threads + 1).astype(int)
+        parts = [slice(a, b) for a, b in pairwise(ends)]
+        return [work(parts[0])] if len(parts) == 1 else list(_pool(self.threads).map(work, parts))
+
     def evaluate(self, u: Array, laws: Laws, increment: Increment) -> Evaluation:
         """Energy, residual (n, 3) and tangent entries at ``u (n, 3)``."""
-        residual, data = np.zeros_like(u), np.zeros(len(self.indices))
-        energy = assemble(
-            self.cells, self.gradients, self.weights, self.element.mean_dilatation, self.regions,
-            laws.tables, increment.scale, increment.history, u, True, self.cell_positions, residual, data,
-        )  # fmt: skip
+        mean = self.element.mean_dilatation
+
+        def part(cells: slice) -> tuple[float, Array, Array]:
+            residual, data = np.zeros_like(u), np.zeros(len(self.indices))
+            energy = assemble(
+                self.cells[cells], self.gradients[cells], self.weights[cells], mean, self.regions[cells],
+                laws.tables, increment.scale, increment.history[cells], u, True, self.cell_positions[cells],
+                residual, data,
+            )  # fmt: skip
+            return energy, residual, data
+
+        (energy, residual, data), *others = self.over_cells(part)
+        for more in others:
+            energy += more[0]
+            residual += more[1]
+            data += more[2]
         if not np.isfinite(energy) or self.surface is None or self.indenter is None:
             return Evaluation(energy, residual, data)
         advance, pushed = np.zeros_like(u), np.zeros_like(u)
@@ -211,6 +240,11 @@ class System:
         assert self.surface is not None
         numbers = self.numbers[self.surface.faces[:, 0]]
         return np.where((numbers >= 0).reshape(*numbers.shape, *[1] * (x.ndim - 1)), x[numbers], 0.0)
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
 
 
 @njit(cache=True)
