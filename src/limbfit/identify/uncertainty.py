@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import toeplitz
-from scipy.stats import t as student
+from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
 
 from .objective import Measured, SiteResponse
 from .parameters import Unknowns
@@ -124,7 +124,7 @@ def estimate_uncertainty(
     covariance = _sandwich(scaled, measured, noise, prior_sd)
     freedom = max(sum(n.effective_samples for n in noise) - len(parameters), 1.0)
     sd = np.sqrt(np.diag(covariance))
-    factor = np.exp(np.minimum(student.ppf(0.975, freedom) * sd, 50.0))
+    factor = np.exp(np.minimum(stdtrit(freedom, 0.975) * sd, 50.0))
     low, high = (
         np.maximum(parameters / factor, unknowns.lower),
         np.minimum(parameters * factor, unknowns.upper),
@@ -204,7 +204,7 @@ def _combinations(
     for value, weights in zip(values, vectors.T):
         weights = weights * np.sign(weights[np.argmax(np.abs(weights))])
         sd = float(np.sqrt(max(value, 0.0)))
-        factor = float(np.exp(min(student.ppf(0.975, freedom) * sd, 50.0)))
+        factor = float(np.exp(min(stdtrit(freedom, 0.975) * sd, 50.0)))
         share = sd / float(np.linalg.norm(weights * prior_sd))
         found.append(Combination(weights, sd, _product(weights, names), _verdict(factor, share)))
     return tuple(found)

@@ -1,21 +1,32 @@
-"""A study to stored artefacts, stage by stage: run, status, check, simulate, report, and the demo."""
+"""A study to stored artefacts, stage by stage: run, status, check, simulate, report, and the demo.
 
-from .check import check_study
+Names are loaded when first used: checking a study needs no solver, its status no graphics.
+"""
+
+from importlib import import_module
+from typing import Any
+
 from .context import Listener, Progress
-from .demo import make_phantom_study, run_demo
-from .run import STAGE_NAMES, report_study, run_study, study_status, summarise
-from .simulate import simulate_site
 
-__all__ = [
-    "STAGE_NAMES",
-    "Listener",
-    "Progress",
-    "check_study",
-    "make_phantom_study",
-    "report_study",
-    "run_demo",
-    "run_study",
-    "simulate_site",
-    "study_status",
-    "summarise",
-]
+_HOME = {
+    "STAGE_NAMES": "run",
+    "check_study": "check",
+    "make_phantom_study": "demo",
+    "report_study": "run",
+    "run_demo": "demo",
+    "run_study": "run",
+    "simulate_site": "simulate",
+    "study_status": "run",
+    "summarise": "run",
+}
+__all__ = ["Listener", "Progress", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

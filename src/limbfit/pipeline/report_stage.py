@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from ..report import build_report
+from .. import report
 from .context import Context
 
 
@@ -24,4 +24,4 @@ def run_report(context: Context, folder: Path) -> dict[str, Any]:
 
 
 def _draw(folders: tuple[Path, Path]) -> None:
-    build_report(*folders)
+    report.build_report(*folders)

@@ -47,7 +47,7 @@ STAGES = (
         ("name", "fitted", "edge"),
         _MECHANICS,
     ),
-    Stage("predict", run_predict, ("calibrate",), (), ("name", "edge"), _MECHANICS),
+    Stage("predict", run_predict, ("calibrate",), (), ("name", "edge"), (*_MECHANICS, "fields")),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region"), ("report", "pipeline")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
