@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .fe import History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
+from .anatomy.triangles import read_surface
+from .errors import ProblemError
+from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, StepControl, solve
 from .fields import Animation, write_fields
 from .mesh import Mesh, read_vtu
-from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable
+from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable, Vector
 
 Parameters = dict[str, dict[str, float]]
 Array = NDArray[np.float64]
@@ -47,7 +49,7 @@ class SiteModel:
     """One indentation but for the material: mesh file, indenter and displacement history.
 
     ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm`` are the piecewise linear
-    displacement since touch-down.
+    displacement since touch-down; ``indenter_digest`` is that of the indenter's file, where it has one.
     """
 
     name: str
@@ -59,6 +61,7 @@ class SiteModel:
     knots_mm: tuple[float, ...]
     edge: tuple[float, float, float] | None = None
     indenter: IndenterTable = field(default_factory=IndenterTable)
+    indenter_digest: str = ""
     kappa_ratio: float = 100.0
     steps: SolverTable = field(default_factory=SolverTable)
 
@@ -105,16 +108,9 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
 
     Only skin near the indenter enters the contact: what it cannot reach costs time for nothing.
     """
-    indenter = Indenter(
-        shape=model.indenter.shape,
-        width=model.indenter.width_mm,
-        edge_radius=model.indenter.edge_radius_mm,
-        centre=np.array(model.position),
-        axis=np.array(model.axis),
-        edge=None if model.edge is None else np.array(model.edge),
-    )
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     faces = mesh.face_sets["skin"]
-    reach = model.indenter.width_mm * 0.71 + max(model.knots_mm) + 8.0
+    reach = indenter.width * 0.71 + max(model.knots_mm) + 8.0
     near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
     return Problem(
         mesh=mesh,
@@ -123,6 +119,33 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         contact_faces=faces[near],
         indenter=indenter,
         history=History(np.array(model.knots_s), np.array(model.knots_mm)),
+        friction=model.indenter.friction,
+    )
+
+
+def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:
+    """The indenter at a site; reads the surface of shape ``stl``, whose path must be one of this machine.
+
+    Raises
+    ------
+    InputError
+        For a surface that cannot be read, or that is no indenter.
+    """
+    file, surface = table.file, None
+    if file is not None:
+        triangles = read_surface(file)
+        try:
+            surface = RigidSurface(triangles.points, triangles.faces)
+        except ProblemError as error:
+            raise ProblemError(error.what, file=file, remedy=error.remedy) from None
+    return Indenter(
+        shape=table.shape,
+        width=table.width_mm,
+        edge_radius=table.edge_radius_mm,
+        centre=np.array(position),
+        axis=np.array(axis),
+        edge=None if edge is None else np.array(edge),
+        surface=surface,
     )
 
 

@@ -98,14 +98,18 @@ class MeshTable(_Table):
 
 
 class IndenterTable(_Table):
-    """The rigid indenter; the paper's is a square of 20 mm."""
+    """The rigid indenter; the paper's is a square of 20 mm.  ``file`` is the surface of shape ``stl``."""
 
-    shape: Literal["square", "sphere", "cylinder"] = "square"
+    shape: Literal["square", "sphere", "cylinder", "stl"] = "square"
+    file: Path | None = None
     width_mm: Positive = 20.0
     edge_radius_mm: Annotated[float, Field(ge=0)] = 0.0
+    friction: Literal["frictionless", "sticky"] = "frictionless"
 
     @model_validator(mode="after")
     def _edge_fits(self) -> IndenterTable:
+        if (self.file is not None) != (self.shape == "stl"):
+            raise ValueError('shape = "stl" needs a file, and only that shape has one')
         if self.edge_radius_mm >= self.width_mm / 2:
             raise ValueError("edge_radius_mm must be smaller than half of width_mm")
         return self
@@ -306,6 +310,8 @@ def _check_paths(study: Study) -> None:
             named.append(("image.markers", study.image.markers))
     if study.segmentation.labels is not None:
         named.append(("segmentation.labels", study.segmentation.labels))
+    if study.indenter.file is not None:
+        named.append(("indenter.file", study.indenter.file))
     if study.surfaces is not None:
         named.append(("surfaces.skin", study.surfaces.skin))
         named += [(f"surfaces.bones.{name}", path) for name, path in study.surfaces.bones.items()]

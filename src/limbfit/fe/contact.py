@@ -83,9 +83,8 @@ class Touch:
         stiff = self.weights[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
         gaps = np.where(change != 0.0, self.gaps, 0.0)
         pushing = np.where((change > 0)[:, None, None], stiff, self.blocks - self.stick)
-        return self.stick + pushing * closed[:, None, None], (change * self.weights * gaps)[
-            :, None
-        ] * self.normals
+        forces = (change * self.weights * gaps)[:, None] * self.normals
+        return self.stick + pushing * closed[:, None, None], forces
 
 
 def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: float = 1e-9) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..anatomy.imaging import read_labels, read_volume
 from ..anatomy.surfaces import check_anatomy
+from ..indentation import read_indenter
 from ..study import Study
 from .context import Listener, Progress
 from .geometry_stages import given_anatomy, place_site
@@ -30,6 +31,10 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     facts: list[str] = []
     listener(Progress("check", 0, 2, "geometry"))
     facts += _image_facts(study) if study.image is not None else _surface_facts(study)
+    if study.indenter.file is not None:
+        table = study.indenter.model_copy(update={"file": study.path(study.indenter.file)})
+        width = read_indenter(table, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+        facts.append(f"indenter: {study.indenter.file}, {width:.1f} mm wide")
     listener(Progress("check", 1, 2, "records"))
     sites = {site.name: read_site_trace(study, site)[2] for site in study.sites if site.trace is not None}
     for name, record in sites.items():

@@ -75,5 +75,7 @@ def input_files(study: Study) -> dict[str, list[Path]]:
         files["segment"].append(study.segmentation.labels)
     if study.surfaces is not None:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
+    if study.indenter.file is not None:
+        files["calibrate"] = [study.indenter.file]
     files["traces"] += [site.trace for site in study.sites if site.trace is not None]
     return files

@@ -79,7 +79,8 @@ def _load(file: Path) -> Simulation:
 def job_digest(job: SimulationJob) -> str:
     """What decides a simulation, wherever its mesh file happens to lie."""
     model = {key: value for key, value in vars(job.model).items() if key != "mesh"}
-    model |= {"indenter": job.model.indenter.model_dump(), "steps": job.model.steps.model_dump()}
+    indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
+    model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
     return digest(model, job.parameters, job.times_s, job.sensitivities)
 
 
@@ -90,6 +91,7 @@ def site_model(
     study: Study = context.study
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
     mesh = context.store["mesh"] / f"{site.name}.vtu"
+    file = None if study.indenter.file is None else study.path(study.indenter.file)
     return SiteModel(
         name=site.name,
         mesh=mesh,
@@ -99,7 +101,8 @@ def site_model(
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
         edge=site.edge,
-        indenter=study.indenter,
+        indenter=study.indenter.model_copy(update={"file": file}),
+        indenter_digest="" if file is None else file_digest(file),
         kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
     )

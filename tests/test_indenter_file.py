@@ -1,0 +1,93 @@
+"""A study whose indenter is a surface file: read, checked, and part of what makes results stale."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from limbfit.errors import InputError, StudyError
+from limbfit.indentation import SiteModel, read_indenter
+from limbfit.pipeline.run import keys
+from limbfit.pipeline.simulations import SimulationJob, job_digest
+from limbfit.study import IndenterTable, Study, load_study
+
+TEXT = """
+[study]
+name = "one limb"
+[surfaces]
+skin = "skin.stl"
+[indenter]
+shape = "stl"
+file = "tool.stl"
+[[sites]]
+name = "1"
+fitted = true
+trace = "1.csv"
+position = [0.0, -50.0, 10.0]
+"""
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    for name in ("skin.stl", "1.csv"):
+        (tmp_path / name).touch()
+    pv.Sphere(radius=9.0).save(tmp_path / "tool.stl")
+    (tmp_path / "study.toml").write_text(TEXT, encoding="utf-8")
+    return load_study(tmp_path)
+
+
+def table(study: Study) -> IndenterTable:
+    return study.indenter.model_copy(update={"file": study.path(study.indenter.file)})
+
+
+def test_surface_is_read_into_the_frame_of_the_site(study):
+    tool = read_indenter(table(study), (1.0, 2.0, 3.0), (0.0, -1.0, 0.0), None)
+    assert tool.width == pytest.approx(18.0, abs=0.1)
+    gaps = tool.signed_distance(np.array([[1.0, 1.0, 3.0], [1.0, 3.0, 3.0], [1.0, 11.0, 14.0]]))
+    np.testing.assert_allclose(gaps, [1.0, -1.0, 2.0], atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("surface", "what"),
+    [
+        (pv.Plane(i_size=10.0, j_size=10.0), "is open"),
+        (pv.Sphere(radius=0.01), "0.0199.* mm wide; give it in millimetres"),
+        (pv.Sphere(radius=9.0, center=(50.0, 0.0, 0.0)), "beside its axis"),
+    ],
+)
+def test_unusable_files_are_named_in_one_line(study, surface, what):
+    surface.triangulate().save(table(study).file)
+    with pytest.raises(InputError, match=f"tool.stl: .*{what}") as caught:
+        read_indenter(table(study), (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_changed_file_makes_calibration_and_simulations_stale(study):
+    before = keys(study)
+    pv.Sphere(radius=8.0).save(table(study).file)
+    after = keys(study)
+    stale = {name for name in before if before[name] != after[name]}
+    assert stale == {"calibrate", "predict", "report"}
+    model = SiteModel("1", Path("1.vtu"), "", (0, 0, 0), (0, 0, -1), (0, 1), (0, 1), indenter=table(study))
+    other = SiteModel(**{**vars(model), "indenter_digest": "changed"})
+    moved = SiteModel(**{**vars(model), "indenter": study.indenter})
+    digests = [job_digest(SimulationJob(m, (1.0,), (0.0, 1.0))) for m in (model, other, moved)]
+    assert digests[0] != digests[1]
+    assert digests[0] == digests[2]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ('"tool.stl"', '"none.stl"', "indenter.file: none.stl does not exist"),
+        ('file = "tool.stl"\n', "", "needs a file"),
+        ('shape = "stl"\n', "", "needs a file"),
+    ],
+)
+def test_the_study_says_what_is_missing(study, old, new, what):
+    (study.folder / "study.toml").write_text(TEXT.replace(old, new), encoding="utf-8")
+    with pytest.raises(StudyError, match=what):
+        load_study(study.folder)
