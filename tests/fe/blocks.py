@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from limbfit.fe import History, Indenter, OgdenQLV, Problem
+from limbfit.fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, Support
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
 
 SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
@@ -100,3 +100,27 @@ def punch(
         "history": history,
     }
     return Problem(**{**values, **changes})
+
+
+def refined(lines: NDArray | list[float], n: int) -> NDArray:
+    """Grid lines with every interval cut into ``n`` equal parts."""
+    lines = np.asarray(lines, dtype=float)
+    return np.interp(np.arange(n * (len(lines) - 1) + 1) / n, np.arange(len(lines)), lines)
+
+
+def symmetry(mesh: Mesh) -> tuple[Support, Support]:
+    """The planes x = 0 and y = 0 of a quarter model."""
+    return tuple(Support(np.flatnonzero(np.abs(mesh.points[:, i]) < 1e-9), i) for i in (0, 1))
+
+
+def quarter_punch(element: str, refinement: int, depth: float = 6.0, speed: float = 0.96) -> Problem:
+    """A quarter of the block of `punch`, loaded only, by a punch of 2 mm edge radius; forces times 4."""
+    lines = refined([0.0, 7.0, 12.0, 30.0], refinement)
+    z = refined([-30.0, -11.0, -3.0, 0.0], refinement)
+    mesh = block(ELEMENTS[element].cell_type, lines, lines, z, layer=3.0)
+    history = History(np.array([0.0, depth / speed]), np.array([0.0, depth]))
+    tool = Indenter("square", 20.0, 2.0, axis=(0, 0, -1), centre=(0.0, 0.0, 1.0))
+    return Problem(
+        mesh, {"skin": SKIN, "muscle": MUSCLE}, mesh.node_sets["bottom"], mesh.face_sets["top"], tool,
+        history, supports=symmetry(mesh), element=element,
+    )  # fmt: skip
