@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from mapped_bodies import Array, Body, Indices, limb, slab
 
-from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, solve
+from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, solve
 from limbfit.mesh import node_jacobians
 from limbfit.study import PARAMETERS, TISSUES, MaterialTable
 
@@ -68,7 +68,22 @@ class Outcome:
     case: dict[str, Any] = field(default_factory=dict)
 
 
-# Indenters by name: width and edge radius to the fields of `Indenter`.
+def frustum(width: float, sides: int, slope_mm: float) -> RigidSurface:
+    """A regular prism of triangles, ``width`` mm across, 40 mm long, wider by ``slope_mm`` at its far end."""
+    turn = 2.0 * np.pi * np.arange(sides) / sides
+    ring = np.column_stack([np.cos(turn), np.sin(turn)])
+    front = np.column_stack([0.5 * width * ring, np.zeros(sides)])
+    back = np.column_stack([(0.5 * width + slope_mm) * ring, np.full(sides, -40.0)])
+    i, after = np.arange(1, sides - 1), np.roll(np.arange(sides), -1)
+    fan = np.column_stack([np.zeros_like(i), i, i + 1])
+    side = np.arange(sides)
+    walls = np.vstack(
+        [np.column_stack([side, side + sides, after]), np.column_stack([after, side + sides, after + sides])]
+    )
+    return RigidSurface(np.vstack([front, back]), np.vstack([fan, fan[:, ::-1] + sides, walls]))
+
+
+# Indenters by name: width and a generator to the fields of `Indenter`.
 TOOLS: dict[str, Callable[[float, np.random.Generator], dict[str, Any]]] = {
     "square-sharp": lambda width, rng: {"shape": "square", "width": width},
     "square-rounded": lambda width, rng: {
@@ -77,6 +92,10 @@ TOOLS: dict[str, Callable[[float, np.random.Generator], dict[str, Any]]] = {
     "sphere": lambda width, rng: {"shape": "sphere", "width": width},
     "cylinder": lambda width, rng: {
         "shape": "cylinder", "width": width, "edge_radius": width * rng.choice([0.0, 0.1]),
+    },
+    "surface": lambda width, rng: {
+        "shape": "stl", "surface": frustum(width, int(rng.integers(3, 9)), rng.uniform(0.0, 3.0)),
+        "edge_radius": rng.choice([0.0, 0.05]) * width,
     },
 }  # fmt: skip
 
@@ -147,7 +166,7 @@ def problem_of(case: Case, seed: int) -> Problem:
     """The case as a problem: loading to the drawn depth and unloading at the same speed."""
     body = body_of(case)
     rng = np.random.default_rng([seed, case.number, 1])
-    centre, axis = body.site - 2.0 * body.inward, _tilted(body.inward, *case.tilt)
+    centre, axis = body.site - 10.0 * body.inward, _tilted(body.inward, *case.tilt)
     tool = Indenter(centre=centre, axis=axis, **TOOLS[case.tool](case.width, rng))
     points = body.mesh.points
     faces = body.mesh.face_sets["skin"]
@@ -179,15 +198,20 @@ def _tilted(axis: Array, angle: float, about: float) -> Array:
     return np.cos(angle) * axis + np.sin(angle) * towards
 
 
-def advance(tool: Indenter, points: Array) -> float:
-    """How far the indenter can go along its axis until it touches one of the points, mm."""
-    low, high = -50.0, 150.0
-    while high - low > 1e-6:
-        middle = 0.5 * (low + high)
-        if tool.moved(middle).signed_distance(points).min() > 0.0:
-            low = middle
-        else:
-            high = middle
+def advance(tool: Indenter, points: Array, farthest: float = 60.0) -> float:
+    """How far the indenter can go along its axis, from clear of the points, until it touches one, mm."""
+    across = (points - tool.centre) @ tool.frame[:2].T
+    ahead = points[np.linalg.norm(across, axis=1) < tool.width]
+
+    def clear(distance: float) -> bool:
+        return not len(ahead) or float(tool.moved(distance).signed_distance(ahead).min()) > 0.0
+
+    low, step = 0.0, 4.0
+    while low < farthest and clear(low + step):
+        low += step
+    while step > 1e-6:
+        step *= 0.5
+        low += step if clear(low + step) else 0.0
     return low
 
 
