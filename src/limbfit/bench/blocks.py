@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
 from ..mesh import Mesh, boundary_faces, to_tet10
 
@@ -58,7 +59,15 @@ def _through(divisions: int) -> tuple[int, int]:
 
 
 def divisions_for(element: str, unknowns: int) -> int:
-    """Fewest cells along the side that give a block that many unknowns."""
+    """Fewest cells along the side that give a block that many unknowns.
+
+    Raises
+    ------
+    ProblemError
+        For an element that is not in the table.
+    """
+    if element not in ELEMENTS:
+        raise ProblemError(f"no element {element!r}", remedy=f"use one of {', '.join(ELEMENTS)}")
     order = 2 if ELEMENTS[element].cell_type == "tet10" else 1
     divisions = 2
     while 3 * (order * divisions + 1) ** 2 * order * sum(_through(divisions)) < unknowns:

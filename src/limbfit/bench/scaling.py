@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from .blocks import divisions_for, punched_block
 from .measuring import in_fresh_process, timed_solve
 from .reference import Tell
 
-UNKNOWNS, LARGE_UNKNOWNS = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
+UNKNOWNS = (20_000, 45_000, 80_000)
 # The paper's model of one site: about 150,000 linear tetrahedra.
 PAPER_ELEMENT, PAPER_DIVISIONS = "tet4", 37
 CONTROL = StepControl()
@@ -29,8 +30,9 @@ class BlockJob:
 
 def bench_scaling(
     element: str = "tet10",
-    large: bool = False,
+    unknowns: Sequence[int] = UNKNOWNS,
     threads: int = 1,
+    paper_divisions: int = PAPER_DIVISIONS,
     *,
     tell: Tell,
     control: StepControl = CONTROL,
@@ -39,11 +41,17 @@ def bench_scaling(
 
     Parameters
     ----------
-    large : also the sizes above 100,000 unknowns.
+    element : name in the element table.
+    unknowns : about how many, two sizes or more.
+    paper_divisions : cells along the side of the model of the paper's size.
+
+    Raises
+    ------
+    InputError
+        For an element that is not in the table.
     """
-    sizes = UNKNOWNS + (LARGE_UNKNOWNS if large else ())
-    jobs = [BlockJob(element, divisions_for(element, size), control) for size in sizes]
-    jobs.append(BlockJob(PAPER_ELEMENT, PAPER_DIVISIONS, control))
+    jobs = [BlockJob(element, divisions_for(element, size), control) for size in unknowns]
+    jobs.append(BlockJob(PAPER_ELEMENT, paper_divisions, control))
     rows = []
     for i, job in enumerate(jobs):
         tell(i, len(jobs), f"{job.element}, {job.divisions} cells along 60 mm")

@@ -11,7 +11,7 @@ import typer
 from .. import __version__
 from ..errors import InputError, LimbfitError
 from . import bench, commands
-from .console import STDOUT, fail
+from .console import INTERRUPTED, STDOUT, fail
 
 app = typer.Typer(
     name="limbfit",
@@ -44,7 +44,7 @@ def main() -> None:
     except LimbfitError as error:
         fail(str(error), 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt:
-        fail("interrupted; run the same command again to go on", 130)
+        fail(INTERRUPTED, 130)
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:

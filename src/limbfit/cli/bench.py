@@ -22,6 +22,7 @@ Reference = Annotated[
 ]
 Threads = Annotated[int, typer.Option(min=1, help="of the linear algebra; default: all cores")]
 CORES = usable_cores()
+UNKNOWNS, LARGE = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
 
 
 @app.command()
@@ -72,7 +73,9 @@ def scaling(
 ) -> None:
     """Time and memory over the number of unknowns, and of a model of the paper's size."""
     with listening() as listener:
-        found = limbfit.bench_scaling(element, large, threads, tell=teller(listener, "scaling"))
+        found = limbfit.bench_scaling(
+            element, UNKNOWNS + (LARGE if large else ()), threads, tell=teller(listener, "scaling")
+        )
     if as_json:
         print_json(found)
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from time import perf_counter
 from typing import Annotated, Any
 
@@ -22,6 +22,7 @@ from rich.progress import (
 
 import limbfit
 
+INTERRUPTED = "interrupted; run the same command again to go on"
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
@@ -33,10 +34,19 @@ def print_json(content: Any) -> None:
 
 @contextmanager
 def listening() -> Iterator[Callable[[limbfit.Progress], None]]:
-    """A listener that draws bars on a terminal and prints plain lines elsewhere, on standard error."""
-    if not STDERR.is_terminal:
-        yield plain_listener()
-        return
+    """A listener that draws bars on a terminal and prints plain lines elsewhere, on standard error.
+
+    An interrupt ends here: typer would turn it into an exit without a word.
+    """
+    try:
+        with bars() if STDERR.is_terminal else nullcontext(plain_listener()) as listener:
+            yield listener
+    except KeyboardInterrupt:
+        fail(INTERRUPTED, 130)
+
+
+@contextmanager
+def bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:<10}"),
@@ -45,13 +55,13 @@ def listening() -> Iterator[Callable[[limbfit.Progress], None]]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=STDERR) as bars:
+    with Progress(*columns, console=STDERR) as shown:
         tasks: dict[str, Any] = {}
 
         def listen(event: limbfit.Progress) -> None:
             if event.stage not in tasks:
-                tasks[event.stage] = bars.add_task(event.stage, text="", total=None)
-            bars.update(tasks[event.stage], completed=event.done, total=event.total or None, text=event.text)
+                tasks[event.stage] = shown.add_task(event.stage, text="", total=None)
+            shown.update(tasks[event.stage], completed=event.done, total=event.total or None, text=event.text)
 
         yield listen
 
