@@ -5,7 +5,7 @@ in by 6 mm in 6.25 s by a 20 mm square punch with an edge radius of 2 mm.  All e
 a level: linear cells are half as large as quadratic ones.  The reference is the Richardson limit of tet10 on
 its three finest levels, the last of which (``--finest``) only tet10 solves.
 
-    python benchmarks/locking.py [--levels 1 2 3] [--finest 4] [--output folder]
+    python benchmarks/locking.py [--levels 1 2] [--finest 3] [--output folder]
 
 writes locking.json and locking.png into the folder; without one it prints the table only.
 """
@@ -108,8 +108,8 @@ def draw(found: dict, path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--levels", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--finest", type=int, default=4)
+    parser.add_argument("--levels", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--finest", type=int, default=3)
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
     found = run(options.levels, options.finest)

@@ -115,8 +115,8 @@ def symmetry(mesh: Mesh) -> tuple[Support, Support]:
 
 def quarter_punch(element: str, refinement: int, depth: float = 6.0, speed: float = 0.96) -> Problem:
     """A quarter of the block of `punch`, loaded only, by a punch of 2 mm edge radius; forces times 4."""
-    lines = refined([0.0, 7.0, 12.0, 30.0], refinement)
-    z = refined([-30.0, -11.0, -3.0, 0.0], refinement)
+    lines = refined([0.0, 6.0, 9.5, 13.0, 30.0], refinement)
+    z = refined([-30.0, -16.0, -7.5, -3.0, 0.0], refinement)
     mesh = block(ELEMENTS[element].cell_type, lines, lines, z, layer=3.0)
     history = History(np.array([0.0, depth / speed]), np.array([0.0, depth]))
     tool = Indenter("square", 20.0, 2.0, axis=(0, 0, -1), centre=(0.0, 0.0, 1.0))

@@ -260,14 +260,14 @@ def bonded(element: str, n: int, kappa_ratio: float) -> float:
     return 4 * float(-at.residual[top, 2].sum())
 
 
-# tet10 with n = 5 (26,000 unknowns), by kappa/mu; some 3 % above its limit: the bonded edges are singular.
-BONDED_N = {1e2: 4 * 1.2591, 1e3: 4 * 1.28661, 1e4: 4 * 1.2939}
+# tet10 with n = 4 (13,000 unknowns), by kappa/mu; some 3 % above its limit: the bonded edges are singular.
+BONDED_N = {1e2: 4 * 1.26589, 1e3: 4 * 1.29414, 1e4: 4 * 1.30172}
 
 
 def test_default_element_does_not_lock():
     """Bonded blocks from kappa/mu = 1e2 to 1e4: a coarse tet10 stays near the fine one, tet4 does not."""
     same_nodes = [("tet10", 2), ("tet4", 4)]
     excess = np.array([[bonded(e, n, k) / BONDED_N[k] - 1 for k in BONDED_N] for e, n in same_nodes])
-    assert (np.abs(excess[0]) < 0.05).all(), excess
-    assert np.ptp(excess[0]) < 0.015, excess
+    assert (np.abs(excess[0]) < 0.035).all(), excess
+    assert np.ptp(excess[0]) < 0.01, excess
     assert (excess[1] > [0.15, 0.8, 4.0]).all(), excess
