@@ -319,12 +319,12 @@ class Worker:
 
     def run(self, number: int) -> Outcome:
         case = asdict(draw(self.seed, number))
-        self.pipe.send(number)
         try:
+            self.pipe.send(number)
             if self.pipe.poll(self.limit_s):
                 return self.pipe.recv()
             found = Outcome(number, "hang", f"not done after {self.limit_s:g} s", case=case)
-        except EOFError:
+        except (EOFError, OSError):  # the other end is gone
             self.process.join()
             found = Outcome(number, "crash", f"the process died (exit {self.process.exitcode})", case=case)
         self.stop()

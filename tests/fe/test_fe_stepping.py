@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from blocks import punch
 
+from limbfit.errors import ProblemError
 from limbfit.fe import History, StepControl, iterate, solve
 from limbfit.fe.stepping import schedule
 
@@ -79,3 +80,19 @@ def test_linear_solvers_give_the_same_simulation(problem, result):
     other = solve(problem, StepControl(linear_solver="superlu"))
     np.testing.assert_allclose(other.force, result.force, atol=1e-4 * result.peak_force)
     assert other.statistics["linear_solver"] == "superlu"
+
+
+@pytest.mark.parametrize(
+    ("times", "displacement", "what"),
+    [
+        ([0.0, 1.0, 1.0], [0.0, 1.0, 2.0], "backwards in time"),
+        ([0.5, 1.0], [0.0, 1.0], "starts at 0.5 s"),
+        ([0.0, np.nan], [0.0, 1.0], "not finite"),
+        ([0.0, 1.0], [0.0, np.inf], "not finite"),
+        ([0.0, 1.0], [0.0, 1.0, 0.0], "as many displacements"),
+        ([0.0], [0.0], "two or more times"),
+    ],
+)
+def test_histories_that_make_no_sense_are_refused(times, displacement, what):
+    with pytest.raises(ProblemError, match=what):
+        History(times, displacement)

@@ -1,0 +1,185 @@
+"""Hard indentations, results of what cannot be solved, and the benchmark that counts them."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blocks import SKIN, punch
+
+from limbfit.errors import ProblemError
+from limbfit.fe import OgdenQLV, Problem, Result, StepControl, Support, solve
+from limbfit.study import PARAMETERS, MaterialTable
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+SOFT, STIFF = OgdenQLV(47e-6, 2.0, 0.01, 10.0), OgdenQLV(0.047, 20.0, 10.0, 0.01)
+
+
+@pytest.fixture(scope="module")
+def robustness():
+    """The benchmark as a module, on the path for the worker processes that it starts."""
+    sys.path.insert(0, str(BENCHMARKS))
+    yield importlib.import_module("robustness")
+    sys.path.remove(str(BENCHMARKS))
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return solve(punch("tet10", 2, 1, depth=3.0), store="all")
+
+
+def test_cases_follow_from_seed_and_number_alone(robustness):
+    assert robustness.draw(0, 17) == robustness.draw(0, 17)
+    assert robustness.draw(0, 17) != robustness.draw(1, 17)
+    assert robustness.problem_of(robustness.draw(0, 4), 0).history.displacement.max() > 0
+
+
+def test_cases_span_the_bounds_of_the_calibration(robustness):
+    bounds = MaterialTable()
+    cases = [robustness.draw(0, number) for number in range(400)]
+    for name in PARAMETERS:
+        low, high = getattr(bounds.lower, name), getattr(bounds.upper, name)
+        share = [np.log(case.parameters["skin"][name] / low) / np.log(high / low) for case in cases]
+        assert -1e-9 < min(share) < 0.03
+        assert 0.97 < max(share) < 1 + 1e-9
+    assert {case.site for case in cases} == set(robustness.SITES)
+    assert {case.tool for case in cases} == set(robustness.TOOLS)
+    assert max(case.depth_share for case in cases) <= 0.6
+
+
+@pytest.mark.parametrize("site", ["slab-mid", "ridge-edge", "limb-thin", "twin-between"])
+def test_travel_ends_at_the_bone(robustness, site):
+    """Driven by the whole of the drawn way the indenter just touches a bone node."""
+    number = robustness.SITES.index(site)
+    case = replace(robustness.draw(0, number), depth_share=1.0, tool="sphere")
+    body, problem = robustness.body_of(case), robustness.problem_of(case, 0)
+    skin = np.unique(body.mesh.face_sets["skin"])
+    depth = float(problem.history.displacement.max())
+    bottom = problem.indenter.moved(robustness.advance(problem.indenter, body.mesh.points[skin]) + depth)
+    gap = bottom.signed_distance(body.mesh.points[body.bone]).min()
+    assert gap >= -1e-4
+    assert gap < 1e-4 or depth == pytest.approx(robustness.FARTHEST_MM)
+
+
+@pytest.mark.parametrize(("skin", "muscle", "depth"), [(SOFT, STIFF, 1.5), (STIFF, SOFT, 4.0)])
+def test_opposite_corners_of_the_bounds(skin, muscle, depth):
+    """A thousandfold contrast of the moduli; soft skin gives way by half of its thickness."""
+    result = solve(punch("tet10", 2, 1, depth=depth, materials={"skin": skin, "muscle": muscle}))
+    assert result.completed, result.reason
+    assert result.penetration.max() <= 0.01 * depth
+    assert (result.force >= 0).all()
+    assert result.force[-1] < 1e-3 * result.peak_force
+
+
+@pytest.mark.parametrize("number", [4, 13])
+def test_drawn_cases_complete_and_keep_to_the_laws(robustness, number):
+    outcome = robustness.run_case(0, number)
+    assert (outcome.outcome, outcome.broken) == ("completed", []), outcome.reason
+
+
+def test_what_is_not_reached_is_said(robustness):
+    """One iteration and no cut: rest alone is a result, with its reason and no peak."""
+    result = solve(punch("tet10", 2, 1), StepControl(max_iterations=1, max_cuts=0), store="all")
+    assert not result.completed
+    assert result.reason.startswith("stopped at 0 s of 12.5 s: ")
+    assert len(result.times) == 1 + len(result.states) < 3
+    assert np.isfinite(result.force_at(np.linspace(0.0, 12.5, 5))).all()
+
+
+def changed(result: Result, **arrays: Callable) -> Result:
+    return replace(result, **{name: change(getattr(result, name)) for name, change in arrays.items()})
+
+
+def moved(result: Result, where: tuple[float, float, float], by: tuple[float, float, float]) -> Result:
+    """The result with the node nearest to ``where`` displaced further in all states."""
+    mesh = result.problem.mesh
+    corners = np.unique(mesh.corners)
+    node = corners[np.linalg.norm(mesh.points[corners] - where, axis=1).argmin()]
+    push = np.zeros_like(mesh.points)
+    push[node] = by
+    return replace(result, states=tuple(replace(s, u=s.u + push) for s in result.states))
+
+
+@pytest.mark.parametrize(
+    ("tamper", "law"),
+    [
+        (lambda r: changed(r, force=lambda f: np.where(np.arange(len(f)) == 3, np.nan, f)), "not finite"),
+        (lambda r: changed(r, force=lambda f: np.where(np.arange(len(f)) == 3, -0.1, f)), "negative"),
+        (lambda r: changed(r, force=lambda f: f + 0.1), "after unloading"),
+        (lambda r: changed(r, penetration=lambda p: p + 0.031), "penetration"),
+        (lambda r: moved(r, (0, 0, 0), (0, 0, -40.0)), "folded"),
+        (lambda r: moved(r, (30, 30, -30), (-24.0, -22.0, 18.0)), "tissue inside"),
+    ],
+)
+def test_no_law_is_broken_silently(robustness, result, tamper, law):
+    assert result.completed
+    assert robustness.broken_laws(result) == []
+    assert any(law in broken for broken in robustness.broken_laws(tamper(result)))
+
+
+def test_a_simulation_that_raises_is_a_crash_with_its_reason(robustness, monkeypatch):
+    monkeypatch.setitem(robustness.TOOLS, "sphere", lambda width, rng: {"shape": "sphere", "width": -width})
+    numbers = [n for n in range(30) if robustness.draw(0, n).tool == "sphere"]
+    outcome = robustness.run_case(0, numbers[0])
+    assert outcome.outcome == "crash"
+    assert "is not positive" in outcome.reason
+
+
+@pytest.mark.slow
+def test_worker_outlives_cases_that_hang_or_kill_it(robustness):
+    worker = robustness.Worker(0, limit_s=0.05)
+    try:
+        late = worker.run(4)
+        assert (late.outcome, late.number) == ("hang", 4)
+        worker.limit_s = 600.0
+        os.kill(worker.process.pid, 9)
+        dead = worker.run(13)
+        assert dead.outcome == "crash"
+        assert "exit -9" in dead.reason
+        assert worker.run(13).outcome == "completed"
+    finally:
+        worker.stop()
+
+
+def test_summary_counts_what_happened(robustness):
+    made = [
+        robustness.Outcome(0, "completed", seconds_cpu=1.0, facts={"cuts": 0.0}),
+        robustness.Outcome(1, "completed", broken=["folded element"], seconds_cpu=2.0, facts={"cuts": 4.0}),
+        robustness.Outcome(2, "partial", "stopped at 1 s", seconds_cpu=3.0, facts={"cuts": 8.0}),
+        robustness.Outcome(3, "hang", "not done after 300 s"),
+    ]
+    found = robustness.summary(made)
+    assert found["outcomes"] == {"completed": 2, "partial": 1, "hang": 1}
+    assert found["completed_percent"] == 50.0
+    assert found["completed_and_lawful_percent"] == 25.0
+    assert found["broken"] == {"folded element": 1}
+    assert found["costs"]["cuts"]["max"] == 8.0
+
+
+BAD: list[tuple[Callable[[Problem], dict], str]] = [
+    (lambda p: {"fixed": np.array([len(p.mesh.points)])}, "fixed nodes refer to nodes"),
+    (lambda p: {"contact_faces": p.contact_faces + len(p.mesh.points)}, "contact faces refer to nodes"),
+    (lambda p: {"supports": (Support(np.array([-1]), 0),)}, "support nodes refer to nodes"),
+    (lambda p: {"contact_faces": p.contact_faces[:, :3]}, "contact faces have shape"),
+    (lambda p: {"fixed": np.arange(len(p.mesh.points))}, "nothing is left to solve"),
+    (lambda p: {"start": "anywhere"}, "unknown start"),
+    (lambda p: {"contact_rule": "faces"}, "unknown contact rule"),
+    (lambda p: {"mesh": replace(p.mesh, regions=p.mesh.regions + 1)}, "region indices without a name"),
+    (lambda p: {"mesh": p.mesh.with_points(np.vstack([p.mesh.points, [[0, 0, 9]]]))}, "belong to no cell"),
+    (lambda p: {"mesh": p.mesh.with_points(np.where(p.mesh.points > 29, np.nan, p.mesh.points))}, "finite"),
+    (lambda p: {"mesh": p.mesh.with_points(p.mesh.points * [1, 1, 0])}, "inverted or flat"),
+    (lambda p: {"materials": {"muscle": SKIN}}, "region 'skin' has no material"),
+]
+
+
+@pytest.mark.parametrize(("change", "what"), BAD)
+def test_bad_input_is_refused_before_anything_is_solved(change, what):
+    problem = punch("tet10", 2, 1)
+    with pytest.raises(ProblemError, match=what):
+        solve(replace(problem, **change(problem)), on_step=lambda step: pytest.fail("a step was solved"))
