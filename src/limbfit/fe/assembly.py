@@ -65,7 +65,8 @@ def spatial_moduli(beta, slope, quotient, c2, n, scale, v, D):  # type: ignore[n
 def _add_stiffness(D, tau, g, weight, DB, Ke, geometric):  # type: ignore[no-untyped-def]
     """Material and geometric stiffness of one quadrature point: ``Ke (3, k, 3 k)``, ``DB (6, 3, k)``.
 
-    Loops run from 0 over whole contiguous rows so that the compiler can vectorise them.
+    Only the blocks on and above the diagonal, by component.  Loops run over whole contiguous rows so that the
+    compiler can vectorise them.
     """
     k = g.shape[1]
     rows = DB.reshape(6, 3 * k)
@@ -78,7 +79,7 @@ def _add_stiffness(D, tau, g, weight, DB, Ke, geometric):  # type: ignore[no-unt
         p, q, r = _VOIGT[i][0], _VOIGT[i][1], _VOIGT[i][2]
         for a in range(k):
             x, y, z = g[0, a], g[1, a], g[2, a]
-            for c in range(3 * k):
+            for c in range(i * k, 3 * k):
                 Ke[i, a, c] += x * rows[p, c] + y * rows[q, c] + z * rows[r, c]
     for a in range(k):
         x = weight * (tau[0] * g[0, a] + tau[3] * g[1, a] + tau[5] * g[2, a])
@@ -100,7 +101,7 @@ def scatter_upper(Ke, positions, data):  # type: ignore[no-untyped-def]
             at += 1
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def assemble(  # type: ignore[no-untyped-def]
     cells, grads, weights, mean, regions, tables, scale, history, u, tangent, positions, residual, data
 ):
@@ -200,7 +201,7 @@ def assemble(  # type: ignore[no-untyped-def]
                 volume = weights[el].sum()
                 factor = (UU - JU) / (ratio * ratio * volume)
                 for r in range(3 * k):
-                    for c in range(3 * k):
+                    for c in range(r, 3 * k):
                         square[r, c] += factor * flat[r] * flat[c]
             for i in range(3):
                 for a in range(k):

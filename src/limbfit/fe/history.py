@@ -46,7 +46,14 @@ class Memory:
         decay, ramp, *_ = prony_factors(dt, laws.prony[..., 1])
         of = system.regions
         elastic = np.empty_like(self.elastic)
-        elastic_stress(system.cells, system.gradients, system.regions, laws.terms, u, elastic)
+
+        def part(cells: slice) -> None:
+            elastic_stress(
+                system.cells[cells], system.gradients[cells], system.regions[cells], laws.terms, u,
+                elastic[cells],
+            )  # fmt: skip
+
+        system.over_cells(part)
         prony = np.empty_like(self.prony)
         for l in range(len(prony)):
             change = ramp[of, l][:, None, None] * (elastic - self.elastic)
@@ -54,7 +61,7 @@ class Memory:
         return Memory(elastic, prony)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def elastic_stress(cells, grads, regions, terms, u, out):  # type: ignore[no-untyped-def]
     """Deviatoric second Piola-Kirchhoff stress ``Se (m, q, 6)`` of the elastic law at ``u (n, 3)``."""
     m, k = cells.shape

@@ -11,6 +11,7 @@ import ctypes
 import functools
 import importlib
 import weakref
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,8 +20,15 @@ import scipy.sparse.linalg as spla
 from numba import njit
 from numpy.typing import NDArray
 
+from .threads import quiet_openmp, thread_pool
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
+
+
+# Dense operations of a factorisation run about this many times faster than those of a solution, which waits
+# for memory (measured with PARDISO on matrices of 10,000 to 200,000 unknowns).
+OPERATIONS_PER_ENTRY = 45.0
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -28,9 +36,14 @@ class NotPositiveDefiniteError(ArithmeticError):
 
 
 class LinearSolver(Protocol):
-    """Analyse once, factorise often, solve oftener."""
+    """Analyse once, factorise often, solve oftener.
+
+    ``worth``: the cost of a factorisation over that of one solution and one product with the matrix,
+    estimated from the factor's operations and entries (not timed: a run must be repeatable).
+    """
 
     name: str
+    worth: float
 
     def factorise(self, data: Array) -> None:
         """Factorise the matrix with these entries; raises `NotPositiveDefiniteError`."""
@@ -40,44 +53,53 @@ class LinearSolver(Protocol):
 
 
 class Pardiso:
-    """Cholesky by Intel MKL's PARDISO, one thread (sites run side by side, one process each)."""
+    """Cholesky by Intel MKL's PARDISO, in double or single precision.
+
+    A factor in single precision takes half the time and half the memory; it is meant as a preconditioner.
+    """
 
     name = "pardiso"
 
-    def __init__(self, indptr: Index, indices: Index) -> None:
+    def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
         self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)
         self._indices = np.ascontiguousarray(indices, dtype=np.int32)
         self._n = ctypes.c_int32(len(indptr) - 1)
-        self._data = np.empty(0)
+        self._type: Any = np.float32 if single else np.float64
+        self._threads = threads
+        self._data = np.ones(len(indices), dtype=self._type)
         self._handle = np.zeros(64, dtype=np.int64)
         self._parameters = np.zeros(64, dtype=np.int32)
-        for position, value in {0: 1, 1: 2, 9: 13, 17: -1, 20: 1, 34: 1}.items():
-            self._parameters[position] = value  # no defaults, METIS, zero-based rows
+        # no defaults, METIS, count entries and operations, single precision, zero-based rows
+        for position, value in {0: 1, 1: 2, 9: 13, 17: -1, 18: -1, 20: 1, 27: int(single), 34: 1}.items():
+            self._parameters[position] = value
         self._mkl = _mkl()
-        self._analysed = False
         # The factor lives outside Python's memory.
         self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
+        self._checked(self._call(11, np.zeros(1), np.zeros(1), 1))
+        quiet_openmp()  # loaded by the first call
+        entries, operations = float(self._parameters[17]), 1e6 * float(self._parameters[18])
+        self.worth = max(operations / max(entries, 1.0) / OPERATIONS_PER_ENTRY, 2.0)
 
     def factorise(self, data: Array) -> None:
-        self._data = np.array(data)
-        phase = 22 if self._analysed else 12
-        code = self._call(phase, np.zeros(1), np.zeros(1), 1)
+        self._data = np.array(data, dtype=self._type)
+        code = self._call(22, np.zeros(1), np.zeros(1), 1)
         if code == -4:
-            self._analysed = True
             raise NotPositiveDefiniteError
-        if code:
-            raise MemoryError(f"PARDISO failed with code {code}")
-        self._analysed = True
+        self._checked(code)
 
     def solve(self, b: Array) -> Array:
-        right = np.asfortranarray(b)
+        right = np.asfortranarray(b, dtype=self._type)
         x = np.zeros_like(right, order="F")
-        code = self._call(33, right, x, 1 if b.ndim == 1 else b.shape[1])
+        self._checked(self._call(33, right, x, 1 if b.ndim == 1 else b.shape[1]))
+        return x.astype(np.float64)
+
+    @staticmethod
+    def _checked(code: int) -> None:
         if code:
             raise MemoryError(f"PARDISO failed with code {code}")
-        return x
 
     def _call(self, phase: int, b: Array, x: Array, count: int) -> int:
+        self._mkl.MKL_Set_Num_Threads(self._threads)
         return _pardiso(
             self._mkl, self._handle, self._parameters, self._n, phase,
             self._data, self._indptr, self._indices, b, x, count,
@@ -86,10 +108,8 @@ class Pardiso:
 
 @functools.cache
 def _mkl() -> Any:
-    """MKL, found by pypardiso (which searches the disk for it), on one thread."""
-    library = importlib.import_module("pypardiso").PyPardisoSolver().libmkl
-    library.MKL_Set_Num_Threads(1)
-    return library
+    """MKL, found by pypardiso (which searches the disk for it)."""
+    return importlib.import_module("pypardiso").PyPardisoSolver().libmkl
 
 
 def _pardiso(
@@ -98,7 +118,7 @@ def _pardiso(
     parameters: Index,
     n: ctypes.c_int32,
     phase: int,
-    data: Array,
+    data: NDArray,
     indptr: Index,
     indices: Index,
     b: Array,
@@ -130,8 +150,9 @@ class Cholmod:
     """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
 
     name = "cholmod"
+    worth = 20.0
 
-    def __init__(self, indptr: Index, indices: Index) -> None:
+    def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
         self._cholmod = importlib.import_module("sksparse.cholmod")
         self._pattern = (np.asarray(indices), np.asarray(indptr))
         self._factor = self._cholmod.analyze(self._lower(np.ones(len(indices))), mode="supernodal")
@@ -154,8 +175,9 @@ class SuperLU:
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
+    worth = 40.0
 
-    def __init__(self, indptr: Index, indices: Index) -> None:
+    def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
         self._pattern = (np.asarray(indices), np.asarray(indptr))
         self._factor: Any = None
 
@@ -176,22 +198,39 @@ class SuperLU:
 SOLVERS: dict[str, type] = {solver.name: solver for solver in (Pardiso, Cholmod, SuperLU)}
 
 
-def linear_solver(indptr: Index, indices: Index, name: str = "auto") -> LinearSolver:
-    """The named solver of `SOLVERS`, or the first that works on this machine."""
+def linear_solver(
+    indptr: Index, indices: Index, name: str = "auto", threads: int = 1, single: bool = False
+) -> LinearSolver:
+    """The named solver of `SOLVERS`, or the first that works on this machine.
+
+    ``single``: a factor in single precision will do; only PARDISO makes use of that, and of ``threads``.
+    """
     for candidate in SOLVERS if name == "auto" else (name,):
         try:
-            return SOLVERS[candidate](indptr, indices)
+            return SOLVERS[candidate](indptr, indices, threads, single)
         except (ImportError, OSError, AttributeError):
             if candidate == name:
                 raise
     raise ImportError("no sparse solver works here")
 
 
-@njit(cache=True)
-def symmetric_product(indptr, indices, data, x):  # type: ignore[no-untyped-def]
+def symmetric_product(indptr: Index, indices: Index, data: Array, x: Array, threads: int = 1) -> Array:
     """``A x`` (n, r) of a symmetric matrix given by its upper triangle."""
+    if threads == 1:
+        return _rows_product(indptr, indices, data, x, 0, len(indptr) - 1)
+    shares = np.linspace(0, len(data), threads + 1)
+    ends = np.searchsorted(indptr, shares).astype(int)
+    parts = thread_pool(threads).map(
+        lambda rows: _rows_product(indptr, indices, data, x, *rows), list(pairwise(ends))
+    )
+    return np.asarray(sum(parts))
+
+
+@njit(cache=True, nogil=True)
+def _rows_product(indptr, indices, data, x, start, stop):  # type: ignore[no-untyped-def]
+    """What rows ``start`` to ``stop`` of the triangle add to the product."""
     y = np.zeros_like(x)
-    for i in range(len(indptr) - 1):
+    for i in range(start, stop):
         for r in range(x.shape[1]):
             y[i, r] += data[indptr[i]] * x[i, r]
         for p in range(indptr[i] + 1, indptr[i + 1]):

@@ -9,22 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .direction import newton_direction
 from .factor import Factor
 from .laws import Laws
 from .system import Evaluation, Increment, System
 
 Array = NDArray[np.float64]
-ACTIVE_SET_SWEEPS = 6
 
 
 @dataclass(frozen=True)
 class NewtonControl:
     """Tolerance of the residual relative to the reactions, and limits."""
 
-    tolerance: float = 1e-5
+    tolerance: float = 3e-5
     max_iterations: int = 30
     max_backtracks: int = 12
-    stale_products: int = 12
 
 
 @dataclass(frozen=True)
@@ -55,9 +54,8 @@ def equilibrate(
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
         if norm <= control.tolerance * scale or rounding:
             return Equilibrium(u, here, iteration)
-        forcing = min(0.1, max(0.1 * norm / scale, 0.3 * control.tolerance * scale / norm))
-        stale = control.stale_products if norm < 0.5 * last or iteration == 0 else 0
-        direction = _direction(system, here, factor, forcing, stale)
+        forcing = min(0.02, max(0.1 * norm / scale, 0.3 * control.tolerance * scale / norm))
+        direction = newton_direction(system, here, factor, forcing)
         last = norm
         found = _line_search(system, laws, increment, u, here, direction, control, seconds)
         if found is None:
@@ -86,34 +84,6 @@ def _evaluate(
     at = system.evaluate(u, laws, increment)
     seconds["assembly"] += time.perf_counter() - started
     return at
-
-
-def _direction(system: System, at: Evaluation, factor: Factor, forcing: float, stale: int) -> Array:
-    """Newton direction (n, 3) with the contact points that it closes and opens foreseen.
-
-    The set of closed points is iterated on the linear model (a primal-dual active set, Hintermueller, Ito and
-    Kunisch 2003), which costs a few products; each missed point would cost an assembly of all elements.
-    """
-    factor.fresh = False
-    b = -at.residual.ravel()[system.free][:, None]
-    x, touch = np.zeros_like(b), at.touch
-    if touch is None:
-        x = factor.solve(at.data, b, None, forcing, stale, x)
-    else:
-        closed = touch.closed
-        for _ in range(ACTIVE_SET_SWEEPS):
-            blocks, change = touch.under(closed)
-            data = system.with_springs(at.data, blocks - touch.blocks)
-            right = b - system.at_springs(change)[:, None]
-            x = factor.solve(data, right, blocks, forcing, stale, x)
-            moved = np.einsum("ci,ci->c", touch.normals, system.springs_of(x[:, 0]))
-            foreseen = touch.gaps + moved < 0.0
-            if (foreseen == closed).all():
-                break
-            closed = foreseen
-    direction = np.zeros(at.residual.size)
-    direction[system.free] = x[:, 0]
-    return direction.reshape(at.residual.shape)
 
 
 def _line_search(

@@ -40,23 +40,34 @@ class MemoryDerivative:
         self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
     ) -> Array:
         """Derivative (n, 3, p) of the internal forces at fixed displacement ``u``; no contact in it."""
-        out = np.zeros((*u.shape, laws.count))
-        explicit_forces(
-            system.cells, system.gradients, system.weights, system.element.mean_dilatation, system.regions,
-            laws.tables, (laws.d_terms, laws.d_kappa, laws.parameter_index), increment.scale,
-            _step_coefficients(laws, dt), memory.elastic, memory.prony, self.elastic, self.prony, u, out,
-        )  # fmt: skip
-        return out
+        derivatives = laws.d_terms, laws.d_kappa, laws.parameter_index
+        coefficients = _step_coefficients(laws, dt)
+
+        def part(cells: slice) -> Array:
+            out = np.zeros((*u.shape, laws.count))
+            explicit_forces(
+                system.cells[cells], system.gradients[cells], system.weights[cells],
+                system.element.mean_dilatation, system.regions[cells], laws.tables, derivatives,
+                increment.scale, coefficients, memory.elastic[cells], memory.prony[:, cells],
+                self.elastic[cells], self.prony[:, cells], u, out,
+            )  # fmt: skip
+            return out
+
+        return np.asarray(sum(system.over_cells(part)))
 
     def advanced(
         self, system: System, laws: Laws, before: Memory, after: Memory, u: Array, du: Array, dt: float
     ) -> MemoryDerivative:
         """The derivative of the memory after the step, given ``du (n, 3, p)``."""
         elastic = np.empty_like(self.elastic)
-        elastic_stress_derivative(
-            system.cells, system.gradients, system.regions, laws.terms, laws.d_terms, laws.parameter_index,
-            u, du, elastic,
-        )  # fmt: skip
+
+        def part(cells: slice) -> None:
+            elastic_stress_derivative(
+                system.cells[cells], system.gradients[cells], system.regions[cells], laws.terms,
+                laws.d_terms, laws.parameter_index, u, du, elastic[cells],
+            )  # fmt: skip
+
+        system.over_cells(part)
         decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
         of, prony = system.regions, np.empty_like(self.prony)
         for l in range(len(prony)):
@@ -82,7 +93,7 @@ def _step_coefficients(laws: Laws, dt: float) -> tuple[Array, ...]:
     return on_prony, on_elastic, d_on_prony, d_scale
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def explicit_forces(  # type: ignore[no-untyped-def]
     cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u, out
 ):
@@ -156,7 +167,7 @@ def explicit_forces(  # type: ignore[no-untyped-def]
                     out[cells[el, a], i, p] += fe[a, i, p]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, du, out):  # type: ignore[no-untyped-def]
     """Total derivative (m, q, 6, p) of Se: explicit in the parameters, and through ``du (n, 3, p)``."""
     m, k = cells.shape

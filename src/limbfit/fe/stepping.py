@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import ContactSurface
+from .direction import renew, solve_at
 from .factor import Factor
 from .history import Memory
 from .indenter import Indenter
@@ -25,8 +26,11 @@ from .result import Result, State, Step
 from .sensitivity import MemoryDerivative
 from .sticky import Anchors
 from .system import Evaluation, Increment, System
+from .threads import single_threaded_numpy
 
 Array = NDArray[np.float64]
+# Residual of the sensitivities' linear systems, relative to their right-hand sides.
+SENSITIVITY_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -42,17 +46,19 @@ class StepControl:
     penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
     penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
     linear_solver : name in the solver table, or auto.
+    threads : of assembly and linear algebra.
     """
 
     load_steps: int = 10
     unload_steps: int = 8
     times: tuple[float, ...] | None = None
-    tolerance: float = 1e-5
+    tolerance: float = 3e-5
     max_iterations: int = 30
     max_cuts: int = 8
     penetration: float = 0.01
     penalty: float | None = None
     linear_solver: str = "auto"
+    threads: int = 1
 
     @property
     def newton(self) -> NewtonControl:
@@ -82,10 +88,10 @@ class Simulation:
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
-        self.system = _system(problem, warm_start)
+        self.system = _system(problem, warm_start, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self.factor = Factor(self.system, control.linear_solver)
+        self.factor = Factor(self.system, control.linear_solver, control.threads)
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
@@ -98,7 +104,8 @@ class Simulation:
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
         self.deepest = control.penetration * float(np.abs(problem.history.displacement).max())
         rest = np.zeros_like(self.system.points)
-        self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness)]
+        still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
+        self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness, still)]
         self.reason = ""
         self.seconds["setup"] = time.perf_counter() - started
 
@@ -108,7 +115,8 @@ class Simulation:
         cuts = 0
         while targets:
             now = self.states[-1].time
-            found = self._attempt(targets[0])
+            with single_threaded_numpy():
+                found = self._attempt(targets[0])
             if not isinstance(found, str):
                 cuts = max(cuts - 1, 0)
                 targets.pop(0)
@@ -176,20 +184,16 @@ class Simulation:
         warm = self.warm.get(round(t, 9))
         if warm is not None:
             return warm.u
-        now = self.states[-1]
-        if len(self.states) < 2:
-            return now.u
-        last = self.states[-2]
-        moved = now.displacement - last.displacement
-        if moved == 0.0:
-            return now.u
-        ratio = np.clip((displacement - now.displacement) / moved, -2.0, 2.0)
-        return now.u + ratio * (now.u - last.u)
+        weights = extrapolation(self.states, displacement)
+        return np.asarray(sum(w * state.u for w, state in zip(weights, self.states)))
 
     def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
         started = time.perf_counter()
         u, at = found.u, found.at
         after = self.memory.advanced(self.system, self.laws, u, dt)
+        if self.factor.worn():
+            renew(at, self.factor)
+        self.factor.next_step()
         du = force_slope = None
         if self.slope is not None:
             du, force_slope = self._differentiate(self.slope, found, increment, dt, stiffness)
@@ -199,7 +203,7 @@ class Simulation:
         self.memory, self.stiffness = after, stiffness
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
         state = State(increment.time, increment.displacement, u, stiffness, du, after)
-        self.states = [*self.states[-1:], state]
+        self.states = [*self.states[-2:], state]
         self.counts["steps"] += 1
         self.seconds["accept"] += time.perf_counter() - started
         return Step(
@@ -221,20 +225,41 @@ class Simulation:
             forces, d_reaction = increment.anchors.explicit(*self._tool(increment), u, increment.penalty)
             change += forces
         b = -change.reshape(-1, laws.count)[system.free]
-        blocks = None if at.touch is None else at.touch.blocks
+        weights = extrapolation(self.states, increment.displacement)
+        guess = sum(w * s.sensitivity for w, s in zip(weights, self.states) if s.sensitivity is not None)
+        x = np.asarray(guess).reshape(-1, laws.count)[system.free]
         du = np.zeros((u.size, laws.count))
-        self.factor.factorise(at.data, blocks)  # dearer products of many columns would not pay
-        du[system.free] = self.factor.apply(b)
+        du[system.free] = solve_at(at, self.factor, b, x, SENSITIVITY_TOLERANCE)
         d_force = at.force * d_penalty + d_reaction
         if at.advance is not None:
             d_force = d_force - at.advance.ravel() @ du
         return du.reshape(*u.shape, laws.count), d_force
 
 
-def _system(problem: Problem, warm_start: Result | None) -> System:
+def extrapolation(states: Sequence[State], displacement: float) -> Array:
+    """Weights (k,) of the last states' fields that foresee the field at an advance of the indenter.
+
+    Quadratic in the advance while it goes on steadily; linear where it has just turned or leaps.
+    """
+    weights = np.zeros(len(states))
+    weights[-1] = 1.0
+    d = np.array([state.displacement for state in states])
+    moved = np.diff(d)
+    if len(states) < 2 or moved[-1] == 0.0:
+        return weights
+    slope = float(np.clip((displacement - d[-1]) / moved[-1], -2.0, 8.0))
+    step = slope * moved[-1]
+    weights[-2:] += -slope, slope
+    if len(states) > 2 and 0.0 < slope <= 2.0 and moved[0] * moved[1] > 0.0:
+        bend = step * (step + moved[1]) / (d[2] - d[0])
+        weights += bend * np.array([1.0 / moved[0], -1.0 / moved[0] - 1.0 / moved[1], 1.0 / moved[1]])
+    return weights
+
+
+def _system(problem: Problem, warm_start: Result | None, threads: int) -> System:
     if warm_start is not None and warm_start.system is not None and warm_start.system.fits(problem):
         return warm_start.system
-    return System(problem)
+    return System(problem, threads)
 
 
 def _warm_states(problem: Problem, warm_start: Result | None) -> dict[float, State]:

@@ -6,9 +6,7 @@ every entry of every element's upper triangle knows its place in it.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
@@ -25,6 +23,7 @@ from .indenter import Indenter
 from .laws import Laws
 from .problem import Problem, ProblemError, check
 from .sticky import Anchors
+from .threads import thread_pool
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -154,7 +153,7 @@ class System:
         """``work`` done on as many parts of the cells as there are threads, side by side."""
         ends = np.linspace(0, len(self.cells), self.threads + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(ends)]
-        return [work(parts[0])] if len(parts) == 1 else list(_pool(self.threads).map(work, parts))
+        return [work(parts[0])] if len(parts) == 1 else list(thread_pool(self.threads).map(work, parts))
 
     def evaluate(self, u: Array, laws: Laws, increment: Increment) -> Evaluation:
         """Energy, residual (n, 3) and tangent entries at ``u (n, 3)``."""
@@ -240,11 +239,6 @@ class System:
         assert self.surface is not None
         numbers = self.numbers[self.surface.faces[:, 0]]
         return np.where((numbers >= 0).reshape(*numbers.shape, *[1] * (x.ndim - 1)), x[numbers], 0.0)
-
-
-@functools.cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads)
 
 
 @njit(cache=True)

@@ -1,0 +1,124 @@
+"""Newton's direction with the contact points that it closes and opens foreseen.
+
+The set of closed points is iterated on the linear model (a primal-dual active set, Hintermueller, Ito and
+Kunisch 2003).  Each missed point would cost an assembly of all elements; here it costs a small dense
+solution.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contact import Touch
+from .factor import Factor, Solution
+from .springs import SpringChange
+from .system import Evaluation, System
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+SWEEPS, ROUNDS = 12, 4
+
+
+def newton_direction(system: System, at: Evaluation, factor: Factor, tolerance: float) -> Array:
+    """Direction (n, 3) that solves the linear model within ``tolerance``, relative to the residual.
+
+    Where the model is not convex it is only a direction of descent.
+    """
+    b = -at.residual.ravel()[system.free][:, None]
+    if not factor.ready:
+        renew(at, factor)
+    if at.touch is None:
+        found = factor.solve(at.data, b, None, tolerance)
+        if not found.converged and found.convex:
+            factor.factorise(at.data)
+            found = factor.solve(at.data, b, None, tolerance)
+    else:
+        found = _with_contact(system, at, at.touch, factor, b, tolerance)
+        if float(b[:, 0] @ found.x[:, 0]) <= 0.0:
+            found = _plain(at, at.touch, factor, b, tolerance)
+    direction = np.zeros(at.residual.size)
+    direction[system.free] = found.x[:, 0]
+    return direction.reshape(at.residual.shape)
+
+
+def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> SpringChange | None:
+    """How the springs of a set of closed points differ from the factor's; None where too many close or open.
+
+    Where those of the present set already differ too much, there is a new factor.
+    """
+    still = np.zeros_like(touch.closed)
+    if factor.springs(still, touch.normals, touch.blocks) is None:
+        factor.factorise(at.data, touch.blocks)
+    return factor.springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
+
+
+def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> Solution:
+    """Without foresight: the closed points stay closed."""
+    return factor.solve(at.data, b, _change(factor, at, touch, touch.closed), tolerance)
+
+
+def _with_contact(
+    system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float
+) -> Solution:
+    found, closed = Solution(np.zeros_like(b), True, True), touch.closed
+    for _ in range(ROUNDS):
+        guess, closed = _foresee(system, at, touch, factor, b, found.x, closed)
+        springs = _change(factor, at, touch, closed)
+        blocks, change = touch.under(closed)
+        data = system.with_springs(at.data, blocks - touch.blocks)
+        right = b - system.at_springs(change)[:, None]
+        found = factor.solve(data, right, springs, tolerance, guess)
+        if not found.converged and found.convex:
+            factor.factorise(at.data, touch.blocks)
+            found = factor.solve(data, right, _change(factor, at, touch, closed), tolerance, found.x)
+        foreseen = _closed(touch, system.springs_of(found.x[:, 0]))
+        if (foreseen == closed).all() or springs is None or not found.convex:
+            break
+        closed = foreseen
+    return found
+
+
+def _closed(touch: Touch, moved: Array) -> Bools:
+    return touch.gaps + np.einsum("ci,ci->c", touch.normals, moved) < 0.0
+
+
+def _foresee(
+    system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, x: Array, closed: Bools
+) -> tuple[Array, Bools]:
+    """Displacement (n, 1) and closed points by the factor's model, from ``x (n, 1)`` on."""
+    springs = _change(factor, at, touch, closed)
+    if springs is None:
+        return x, touch.closed
+    before = system.springs_of(x[:, 0])
+    y = factor.apply(b - factor.product(at.data, x) if x.any() else b)
+    moved = system.springs_of(y[:, 0])
+    part = None
+    for _ in range(SWEEPS):
+        blocks, change = touch.under(closed)
+        springs = factor.springs(closed != touch.closed, touch.normals, blocks)
+        if springs is None:
+            break
+        forces = -change - np.einsum("cij,cj->ci", blocks - touch.blocks, before)
+        part, kept = springs.coefficients(moved, forces), closed
+        closed = _closed(touch, before + moved + springs.at_points(part))
+        if (closed == kept).all():
+            break
+    if part is None:
+        return x, touch.closed
+    return x + y + factor.columns.Z[:, : len(part)] @ part[:, None], kept
+
+
+def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
+    """Solution (n, r) of the tangent at an equilibrium for ``b (n, r)``, from the guess ``x``."""
+    springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
+    found = factor.solve(at.data, b, springs, tolerance, x)
+    if not found.converged:
+        renew(at, factor)
+        found = factor.solve(at.data, b, None, tolerance, found.x, limit=10 * factor.limit)
+    return found.x
+
+
+def renew(at: Evaluation, factor: Factor) -> None:
+    """Factorise the tangent of an equilibrium: there it is positive definite."""
+    factor.factorise(at.data, None if at.touch is None else at.touch.blocks)

@@ -1,0 +1,108 @@
+"""Contact springs that changed since a factorisation, taken into its solutions exactly.
+
+With ``F`` the factored matrix, ``N`` unit forces at the changed springs and ``D`` the change of their
+stiffness, ``(F + N D N^T)^-1 = F^-1 - Z D (I + S D)^-1 N^T F^-1``, ``Z = F^-1 N``, ``S = N^T Z``
+(Sherman, Morrison and Woodbury).  All that contact does to a solution thus happens in a small dense space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .system import System
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+# Smaller changes, relative to the stiffest spring, are left to the iteration.
+NOTABLE = 0.03
+
+
+class SpringColumns:
+    """Solutions of a factor for unit forces at contact points, made when first needed and kept.
+
+    ``apply (n, r) -> (n, r)`` is the factor's solution.
+    """
+
+    def __init__(self, system: System, apply: Callable[[Array], Array]) -> None:
+        self._system, self._apply = system, apply
+        self.clear(None)
+
+    def clear(self, blocks: Array | None) -> None:
+        """Forget the columns: there is a new factor, whose springs are ``blocks (c, 3, 3)``."""
+        self.blocks = blocks
+        self.keys: dict[tuple[int, int], int] = {}
+        self.Z = np.empty((self._system.unknowns, 0), order="F")
+        count = 0 if blocks is None else len(blocks)
+        self.at_points = np.empty((count, 3, 0))
+
+    def change(self, touched: Bools, normals: Array, blocks: Array, most: int) -> SpringChange | None:
+        """The change to ``blocks``; None where it needs more than ``most`` columns.
+
+        ``touched (c,)``: springs to be pushed along ``normals (c, 3)`` although they may not differ.
+        """
+        if self.blocks is None or self._system.indenter is None:
+            return None
+        frame = self._system.indenter.frame  # on a flat face only its last axis is stiff
+        change = frame @ (blocks - self.blocks) @ frame.T
+        typical = max(float(np.abs(blocks).max()), float(np.abs(self.blocks).max()), 1e-300)
+        wanted = np.abs(change).max(axis=2) > NOTABLE * typical
+        wanted |= touched[:, None] & (np.abs(normals @ frame.T) > 0.2)
+        if not self._complete(wanted, frame, most):
+            return None
+        points, axes = np.array(list(self.keys), dtype=int).reshape(-1, 2).T
+        together = points[:, None] == points
+        D = np.where(together, change[points[:, None], axes[:, None], axes], 0.0)
+        return SpringChange(self, points, frame[axes], D)
+
+    def _complete(self, wanted: Bools, frame: Array, most: int) -> bool:
+        """Make the columns that are missing, unless they would be too many in all."""
+        new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
+        if len(self.keys) + len(new) > most:
+            return False
+        if new:
+            self.keys.update({key: len(self.keys) + i for i, key in enumerate(new)})
+            points, axes = np.array(new).T
+            unit = np.zeros((len(wanted), 3, len(new)))
+            unit[points, :, np.arange(len(new))] = frame[axes]
+            Z = self._apply(self._system.at_springs(unit))
+            self.Z = np.asfortranarray(np.hstack([self.Z, Z]))
+            self.at_points = np.concatenate([self.at_points, self._system.springs_of(Z)], axis=2)
+        return True
+
+
+class SpringChange:
+    """One set of changed springs: ``points (k,)``, ``directions (k, 3)`` and ``D (k, k)``."""
+
+    def __init__(
+        self, columns: SpringColumns, points: NDArray[np.int64], directions: Array, D: Array
+    ) -> None:
+        self._columns, self._points, self._directions, self._D = columns, points, directions, D
+        self._S = np.einsum("ki,kil->kl", directions, columns.at_points[points])
+        self._inverse = np.linalg.inv(np.eye(len(D)) + self._S @ D)
+
+    def project(self, values: Array) -> Array:
+        """Components (k, ...) along the springs of vectors (c, 3, ...) at the contact points."""
+        return np.einsum("ki,ki...->k...", self._directions, values[self._points])
+
+    def correct(self, y: Array) -> Array:
+        """Solutions (n, r) of the changed matrix from solutions ``y (n, r)`` of the factor."""
+        if not len(self._points):
+            return y
+        moved = self._inverse @ self.project(self._columns._system.springs_of(y))
+        return y - self._columns.Z @ (self._D @ moved)
+
+    def coefficients(self, moved: Array, forces: Array) -> Array:
+        """What to add (k,) of each column, for displacements of the factor's solution and forces (c, 3)."""
+        f = self.project(forces)
+        return f - self._D @ (self._inverse @ (self.project(moved) + self._S @ f))
+
+    def everywhere(self, coefficients: Array) -> Array:
+        """The combination of columns at all unknowns (n,)."""
+        return self._columns.Z @ coefficients
+
+    def at_points(self, coefficients: Array) -> Array:
+        """The combination of columns at the contact points (c, 3)."""
+        return self._columns.at_points @ coefficients

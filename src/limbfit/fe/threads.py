@@ -1,0 +1,31 @@
+"""Threads that share one simulation, kept out of each other's way."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+
+from threadpoolctl import threadpool_info, threadpool_limits
+
+
+@functools.cache
+def thread_pool(threads: int) -> ThreadPoolExecutor:
+    """Workers for compiled kernels that let go of the interpreter; kept for the life of the process."""
+    return ThreadPoolExecutor(threads)
+
+
+def single_threaded_numpy() -> AbstractContextManager[object]:
+    """While this lasts, NumPy's own linear algebra runs on one thread.
+
+    Its arrays are small here, and its idle threads would spin on the cores that the solver works on.
+    """
+    return threadpool_limits({"libopenblas": 1, "libscipy_openblas": 1})
+
+
+def quiet_openmp() -> None:
+    """Let Intel's OpenMP threads sleep at once between factorisations instead of spinning for 0.2 s."""
+    for library in threadpool_info():
+        if library["prefix"] == "libiomp":
+            ctypes.CDLL(library["filepath"]).kmp_set_blocktime(0)
