@@ -48,6 +48,7 @@ TOOLS = {
     "cylinder": Indenter("cylinder"),
     "rounded cylinder": Indenter("cylinder", 20.0, 2.0),
     "box": Indenter("stl", edge_radius=2.0, surface=box()),
+    "plate": Indenter("stl", surface=box(height=1.0)),
     "ball": Indenter("stl", surface=ball(3)),
     "tent": Indenter("stl", edge_radius=1.0, surface=tent()),
 }

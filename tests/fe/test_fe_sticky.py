@@ -51,6 +51,8 @@ def test_anchors_neither_push_nor_pull_along_the_normal():
     at = system.evaluate(u, laws, Increment(0.0, -0.5, np.zeros(2), rest, 0.5, anchors))
     assert anchors.held.any()
     assert at.force == 0.0
+    assert np.abs(at.touch.blocks).max() > 0.0
+    np.testing.assert_allclose(at.touch.stick, at.touch.blocks, atol=1e-12)
     np.testing.assert_allclose(at.residual, 0.0, atol=1e-12)
 
 
