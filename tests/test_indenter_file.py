@@ -65,6 +65,12 @@ def test_unusable_files_are_named_in_one_line(study, surface, what):
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_that_is_no_stl_is_named(study):
+    table(study).file.write_text("no triangles here\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"tool.stl: holds no triangles; export"):
+        read_indenter(table(study), (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
+
+
 def test_a_changed_file_makes_calibration_and_simulations_stale(study):
     before = keys(study)
     pv.Sphere(radius=8.0).save(table(study).file)

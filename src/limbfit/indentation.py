@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkCommand
+from vtkmodules.vtkIOGeometry import vtkSTLReader
 
-from .anatomy.triangles import read_surface
-from .errors import ProblemError
+from .errors import ProblemError, SurfaceError
 from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, StepControl, solve
 from .fields import Animation, write_fields
 from .mesh import Mesh, read_vtu
@@ -133,9 +135,9 @@ def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Ve
     """
     file, surface = table.file, None
     if file is not None:
-        triangles = read_surface(file)
+        points, faces = _read_stl(file)
         try:
-            surface = RigidSurface(triangles.points, triangles.faces)
+            surface = RigidSurface(points, faces)
         except ProblemError as error:
             raise ProblemError(error.what, file=file, remedy=error.remedy) from None
     return Indenter(
@@ -147,6 +149,23 @@ def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Ve
         edge=None if edge is None else np.array(edge),
         surface=surface,
     )
+
+
+def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Points (n, 3) and faces (m, 3) of an STL file, coincident points merged.
+
+    The reader of `anatomy` would load images and graphics into every worker that only solves.
+    """
+    reader = vtkSTLReader()
+    reader.SetFileName(str(file))
+    reader.AddObserver(vtkCommand.ErrorEvent, lambda *_: None)  # the error below says it
+    reader.Update()
+    found = reader.GetOutput()
+    if not found.GetNumberOfPolys():
+        raise SurfaceError("holds no triangles", file=file, remedy="export the surface as STL again")
+    faces = vtk_to_numpy(found.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    a, b, c = faces.T
+    return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]
 
 
 _KEPT = 9  # problems and last results that a worker keeps: its share of the sites of one study
