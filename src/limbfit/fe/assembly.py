@@ -63,24 +63,23 @@ def spatial_moduli(beta, slope, quotient, c2, n, scale, v, D):  # type: ignore[n
 
 @njit(cache=True, fastmath={"contract"})
 def _add_stiffness(D, tau, g, weight, DB, Ke, geometric):  # type: ignore[no-untyped-def]
-    """Material and geometric stiffness of one quadrature point: ``Ke (3, k, 3 k)``, ``DB (6, 3, k)``.
+    """Material and geometric stiffness of one quadrature point: ``Ke (3 k, w)``, ``DB (6, w)``, ``w >= 3 k``.
 
-    Only the blocks on and above the diagonal, by component.  Loops run over whole contiguous rows so that the
-    compiler can vectorise them.
+    Rows are padded to whole vectors and loops run over all of a row: no remainder is left to the compiler.
     """
     k = g.shape[1]
-    rows = DB.reshape(6, 3 * k)
     for s in range(6):
         for i in range(3):
             p, q, r = weight * D[s, _VOIGT[i][0]], weight * D[s, _VOIGT[i][1]], weight * D[s, _VOIGT[i][2]]
             for b in range(k):
-                DB[s, i, b] = p * g[0, b] + q * g[1, b] + r * g[2, b]
-    for i in range(3):
-        p, q, r = _VOIGT[i][0], _VOIGT[i][1], _VOIGT[i][2]
-        for a in range(k):
-            x, y, z = g[0, a], g[1, a], g[2, a]
-            for c in range(i * k, 3 * k):
-                Ke[i, a, c] += x * rows[p, c] + y * rows[q, c] + z * rows[r, c]
+                DB[s, i * k + b] = p * g[0, b] + q * g[1, b] + r * g[2, b]
+    for a in range(k):
+        x, y, z = g[0, a], g[1, a], g[2, a]
+        for c in range(DB.shape[1]):
+            p, q, r = DB[3, c], DB[4, c], DB[5, c]
+            Ke[a, c] += x * DB[0, c] + y * p + z * r
+            Ke[k + a, c] += x * p + y * DB[1, c] + z * q
+            Ke[2 * k + a, c] += x * r + y * q + z * DB[2, c]
     for a in range(k):
         x = weight * (tau[0] * g[0, a] + tau[3] * g[1, a] + tau[5] * g[2, a])
         y = weight * (tau[3] * g[0, a] + tau[1] * g[1, a] + tau[4] * g[2, a])
@@ -122,9 +121,10 @@ def assemble(  # type: ignore[no-untyped-def]
     m, k = cells.shape
     ue, matrix, vector = np.empty((3, k)), np.empty((5, 3, 3)), np.empty((5, 3))
     F, G, A, N, n = matrix[0], matrix[1], matrix[2], matrix[3], matrix[4]
-    g, bar, DB = np.empty((3, k)), np.empty((3, k)), np.empty((6, 3, k))
-    Ke, geometric, fe = np.empty((3, k, 3 * k)), np.empty((k, k)), np.empty((3, k))
-    square, flat = Ke.reshape(3 * k, 3 * k), bar.reshape(3 * k)
+    row = 8 * ((3 * k + 7) // 8)
+    g, bar, DB = np.empty((3, k)), np.empty((3, k)), np.zeros((6, row))
+    Ke, geometric, fe = np.empty((3 * k, row)), np.empty((k, k)), np.empty((3, k))
+    flat = bar.reshape(3 * k)
     c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
     tau, D, v = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     energy = 0.0
@@ -202,10 +202,10 @@ def assemble(  # type: ignore[no-untyped-def]
                 factor = (UU - JU) / (ratio * ratio * volume)
                 for r in range(3 * k):
                     for c in range(r, 3 * k):
-                        square[r, c] += factor * flat[r] * flat[c]
+                        Ke[r, c] += factor * flat[r] * flat[c]
             for i in range(3):
                 for a in range(k):
                     for b in range(k):
-                        Ke[i, a, i * k + b] += geometric[a, b]
-            scatter_upper(square, positions[el], data)
+                        Ke[i * k + a, i * k + b] += geometric[a, b]
+            scatter_upper(Ke, positions[el], data)
     return energy

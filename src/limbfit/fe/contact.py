@@ -127,7 +127,7 @@ def contact(  # type: ignore[no-untyped-def]
     faces, N, areas, X, u, centre, frame, kernel, penalty, anchors, tangent, positions, residual, data,
     advance, gaps, normals, blocks,
 ):  # fmt: skip
-    """Add the contact energy's gradient to ``residual`` and its hessian to ``data``.
+    """Add the contact energy's gradient to ``residual`` and, with ``tangent``, its hessian to ``data``.
 
     ``anchors``: which points stick (f, q), where (f, q, 3) and in which plane, as the normal (f, q, 3) to it,
     in the indenter's frame.  ``advance (n, 3)`` receives the mixed derivative with respect to displacement
@@ -177,8 +177,6 @@ def contact(  # type: ignore[no-untyped-def]
                 push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
                 for a in range(k):
                     residual[faces[f, a], i] += N[q, a] * push
-            if not tangent:
-                continue
             for i in range(3):
                 for j in range(3):
                     H[i, j] = 0.0
@@ -190,7 +188,7 @@ def contact(  # type: ignore[no-untyped-def]
                 for i in range(3):
                     along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
                     advance[faces[f, a], i] += N[q, a] * along
-                    for j in range(3):
+                    for j in range(3 if tangent else 0):
                         for b in range(k):
                             Ke[i * k + a, j * k + b] += H[i, j] * N[q, a] * N[q, b]
         if tangent and touched:

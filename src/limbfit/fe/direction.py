@@ -29,10 +29,10 @@ def newton_direction(system: System, at: Evaluation, factor: Factor, tolerance: 
     if not factor.ready:
         renew(at, factor)
     if at.touch is None:
-        found = factor.solve(at.data, b, None, tolerance)
+        found = factor.solve(at.tangent, b, None, tolerance)
         if not found.converged and found.convex:
-            factor.factorise(at.data)
-            found = factor.solve(at.data, b, None, tolerance)
+            factor.factorise(at.tangent)
+            found = factor.solve(at.tangent, b, None, tolerance)
     else:
         found = _with_contact(system, at, at.touch, factor, b, tolerance)
         if float(b[:, 0] @ found.x[:, 0]) <= 0.0:
@@ -49,13 +49,13 @@ def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> Spri
     """
     still = np.zeros_like(touch.closed)
     if factor.springs(still, touch.normals, touch.blocks) is None:
-        factor.factorise(at.data, touch.blocks)
+        factor.factorise(at.tangent, touch.blocks)
     return factor.springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
 
 
 def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> Solution:
     """Without foresight: the closed points stay closed."""
-    return factor.solve(at.data, b, _change(factor, at, touch, touch.closed), tolerance)
+    return factor.solve(at.tangent, b, _change(factor, at, touch, touch.closed), tolerance)
 
 
 def _with_contact(
@@ -66,11 +66,11 @@ def _with_contact(
         guess, closed = _foresee(system, at, touch, factor, b, found.x, closed)
         springs = _change(factor, at, touch, closed)
         blocks, change = touch.under(closed)
-        data = system.with_springs(at.data, blocks - touch.blocks)
+        data = system.with_springs(at.tangent, blocks - touch.blocks)
         right = b - system.at_springs(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
-            factor.factorise(at.data, touch.blocks)
+            factor.factorise(at.tangent, touch.blocks)
             found = factor.solve(data, right, _change(factor, at, touch, closed), tolerance, found.x)
         foreseen = _closed(touch, system.springs_of(found.x[:, 0]))
         if (foreseen == closed).all() or springs is None or not found.convex:
@@ -91,7 +91,7 @@ def _foresee(
     if springs is None:
         return x, touch.closed
     before = system.springs_of(x[:, 0])
-    y = factor.apply(b - factor.product(at.data, x) if x.any() else b)
+    y = factor.apply(b - factor.product(at.tangent, x) if x.any() else b)
     moved = system.springs_of(y[:, 0])
     part = None
     for _ in range(SWEEPS):
@@ -112,13 +112,13 @@ def _foresee(
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
     """Solution (n, r) of the tangent at an equilibrium for ``b (n, r)``, from the guess ``x``."""
     springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
-    found = factor.solve(at.data, b, springs, tolerance, x)
+    found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:
         renew(at, factor)
-        found = factor.solve(at.data, b, None, tolerance, found.x, limit=10 * factor.limit)
+        found = factor.solve(at.tangent, b, None, tolerance, found.x, limit=10 * factor.limit)
     return found.x
 
 
 def renew(at: Evaluation, factor: Factor) -> None:
     """Factorise the tangent of an equilibrium: there it is positive definite."""
-    factor.factorise(at.data, None if at.touch is None else at.touch.blocks)
+    factor.factorise(at.tangent, None if at.touch is None else at.touch.blocks)

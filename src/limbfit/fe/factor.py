@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 MOST_REFINEMENTS = 12
 # Smallest shift of a tangent that is not positive definite, relative to each entry of its diagonal: tissues
 # differ in stiffness by up to a hundredfold, and a common shift would freeze the softest.
-FIRST_SHIFT = 1e-2
+FIRST_SHIFT, LARGEST_SHIFT = 1e-2, 1e6
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,8 @@ class Factor:
     def factorise(self, data: Array, blocks: Array | None = None) -> None:
         """Factorise; a tangent that is not positive definite is shifted until it is.
 
+        Raises `NotPositiveDefiniteError` where no shift helps: there are entries that are not finite.
+
         ``blocks (c, 3, 3)``: the contact springs that are in ``data``.
         """
         if not self.ready:
@@ -94,6 +96,8 @@ class Factor:
         shift = 0.1 * self._shift if self._shift > FIRST_SHIFT else 0.0
         while not self._factorised(data, shift):
             shift = max(10.0 * shift, FIRST_SHIFT)
+            if shift > LARGEST_SHIFT:
+                raise NotPositiveDefiniteError
         self._shift = shift
         self.ready = True
         self.columns.clear(blocks)

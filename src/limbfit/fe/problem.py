@@ -132,6 +132,8 @@ def check(problem: Problem) -> None:
     indices += [("support nodes", support.nodes) for support in problem.supports]
     for name, value in indices:
         value = np.asarray(value)
+        if value.dtype == bool:
+            raise ProblemError(f"the {name} are a mask", remedy="give node numbers: numpy.flatnonzero(mask)")
         if value.size and (value.min() < 0 or value.max() >= n):
             raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
     _check_cells(problem)

@@ -21,7 +21,7 @@ from .history import Memory
 from .indenter import Indenter
 from .laws import Laws
 from .newton import Equilibrium, NewtonControl, equilibrate, reaction_scale
-from .problem import History, Problem
+from .problem import History, Problem, ProblemError
 from .result import Result, State, Step
 from .sensitivity import MemoryDerivative
 from .sticky import Anchors
@@ -42,6 +42,7 @@ class StepControl:
     load_steps, unload_steps : steps up to the peak and after it, before any is cut.
     times : (k,) s, instead of the two numbers: exactly these steps (rest at 0 left out).
     tolerance : residual over reactions at equilibrium.
+    max_iterations, most_iterations : of Newton's method in a step, and in all.
     max_cuts : how often a step may be halved.
     penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
     penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
@@ -54,11 +55,23 @@ class StepControl:
     times: tuple[float, ...] | None = None
     tolerance: float = 3e-5
     max_iterations: int = 30
+    most_iterations: int = 1500
     max_cuts: int = 8
     penetration: float = 0.01
     penalty: float | None = None
     linear_solver: str = "auto"
     threads: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("load_steps", "unload_steps", "max_iterations", "most_iterations", "threads"):
+            if getattr(self, name) < 1:
+                raise ProblemError(f"{name} = {getattr(self, name)} is less than one")
+        for name in ("tolerance", "penetration"):
+            if not getattr(self, name) > 0.0:
+                raise ProblemError(f"{name} = {getattr(self, name)} is not positive")
+        times = np.asarray(self.times if self.times is not None else (1.0,), dtype=float)
+        if not (len(times) and np.isfinite(times).all() and (np.diff([0.0, *times]) > 0.0).all()):
+            raise ProblemError("the times of the steps do not grow from 0")
 
     @property
     def newton(self) -> NewtonControl:
@@ -68,6 +81,10 @@ class StepControl:
 def schedule(history: History, control: StepControl) -> Array:
     """Times (k,) of the steps: even in loading; in unloading dense after the peak, where force drops fast."""
     if control.times is not None:
+        if control.times[-1] > history.times[-1] * (1.0 + 1e-9):
+            raise ProblemError(
+                f"a step at {control.times[-1]} s lies beyond the history's end at {history.times[-1]} s"
+            )
         return np.asarray(control.times, dtype=float)
     peak, end = history.peak, float(history.times[-1])
     parts = [history.knots[1:]]
@@ -124,6 +141,9 @@ class Simulation:
                 continue
             self.counts["cuts"] += 1
             cuts += 1
+            if self.counts["newton_iterations"] > self.control.most_iterations:
+                found = f"{found}; no more than {self.control.most_iterations} Newton iterations were allowed"
+                cuts = self.control.max_cuts + 1
             if cuts > self.control.max_cuts:
                 self.reason = f"stopped at {now:.4g} s of {targets[-1]:.4g} s: {found}"
                 return
@@ -144,7 +164,6 @@ class Simulation:
             )
             increment = replace(increment, anchors=anchors)
             found = self._equilibrate(increment, u)
-            self.counts["newton_iterations"] += found.iterations
             if found.reason:
                 return found.reason
             kept, deep = anchors, found.at.penetration > self.deepest
@@ -162,21 +181,23 @@ class Simulation:
         return self.system.surface, self.system.indenter.moved(increment.displacement)
 
     def _equilibrate(self, increment: Increment, guess: Array) -> Equilibrium:
-        """From the predicted displacement; from the last one where that fails."""
+        """From the predicted displacement or the last one; from the last one where that fails."""
+        guesses = [self.system.impose(u, increment.displacement) for u in (guess, self.states[-1].u)]
         found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
-        for u in (guess, self.states[-1].u):
-            u = self.system.impose(u, increment.displacement)
+        for tried in (guesses, guesses[1:]):
             found = equilibrate(
                 self.system,
                 self.laws,
                 increment,
-                u,
+                tried,
                 self.factor,
                 self.control.newton,
                 self.floor,
+                self.deepest,
                 self.seconds,
             )
-            if not found.reason:
+            self.counts["newton_iterations"] += found.iterations
+            if not found.reason or self.counts["newton_iterations"] > self.control.most_iterations:
                 break
         return found
 
@@ -191,7 +212,11 @@ class Simulation:
         started = time.perf_counter()
         u, at = found.u, found.at
         after = self.memory.advanced(self.system, self.laws, u, dt)
-        if self.factor.worn():
+        worn = self.factor.worn()
+        if at.data is None and (worn or self.slope is not None):
+            at = self.system.evaluate(u, self.laws, increment)
+            found = replace(found, at=at)
+        if worn:
             renew(at, self.factor)
         self.factor.next_step()
         du = force_slope = None

@@ -47,17 +47,27 @@ class Increment:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The potential and its derivatives at one displacement field."""
+    """The potential and its derivatives at one displacement field.
+
+    ``data``: entries of the tangent; None where it was not asked for.
+    """
 
     energy: float
     residual: Array
-    data: Array
+    data: Array | None
     force: float = 0.0
     penetration: float = 0.0
     contact_area: float = 0.0
     advance: Array | None = None
     contact_norm: float = 0.0
     touch: Touch | None = None
+
+    @property
+    def tangent(self) -> Array:
+        """Entries of the tangent."""
+        if self.data is None:
+            raise ValueError("the tangent was not evaluated")
+        return self.data
 
 
 class System:
@@ -155,16 +165,17 @@ class System:
         parts = [slice(a, b) for a, b in pairwise(ends)]
         return [work(parts[0])] if len(parts) == 1 else list(thread_pool(self.threads).map(work, parts))
 
-    def evaluate(self, u: Array, laws: Laws, increment: Increment) -> Evaluation:
-        """Energy, residual (n, 3) and tangent entries at ``u (n, 3)``."""
+    def evaluate(self, u: Array, laws: Laws, increment: Increment, tangent: bool = True) -> Evaluation:
+        """Energy, residual (n, 3) and, if wanted, tangent entries at ``u (n, 3)``."""
+        size = len(self.indices) if tangent else 0
         mean = self.element.mean_dilatation
 
         def part(cells: slice) -> tuple[float, Array, Array]:
-            residual, data = np.zeros_like(u), np.zeros(len(self.indices))
+            residual, data = np.zeros_like(u), np.zeros(size)
             energy = assemble(
                 self.cells[cells], self.gradients[cells], self.weights[cells], mean, self.regions[cells],
-                laws.tables, increment.scale, increment.history[cells], u, True, self.cell_positions[cells],
-                residual, data,
+                laws.tables, increment.scale, increment.history[cells], u, tangent,
+                self.cell_positions[cells], residual, data,
             )  # fmt: skip
             return energy, residual, data
 
@@ -174,19 +185,21 @@ class System:
             residual += more[1]
             data += more[2]
         if not np.isfinite(energy) or self.surface is None or self.indenter is None:
-            return Evaluation(energy, residual, data)
+            return Evaluation(energy, residual, data if tangent else None)
         advance, pushed = np.zeros_like(u), np.zeros_like(u)
         shape = self.surface.areas.shape
         points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
-        found, force, deepest, area = self._contact(u, increment, True, pushed, data, advance, points)
+        found, force, deepest, area = self._contact(u, increment, tangent, pushed, data, advance, points)
         norm, touch = float(np.linalg.norm(pushed)), None
         if self.surface.nodal:
             weights = increment.penalty * self.surface.areas[:, 0]
             anchors = increment.anchors or self.free_to_slip
             stick = anchors.blocks(self.surface, self.indenter, increment.penalty)[:, 0]
             touch = Touch(points[0][:, 0], points[1][:, 0], weights, points[2][:, 0], stick)
-        energy += found
-        return Evaluation(energy, residual + pushed, data, force, deepest, area, advance, norm, touch)
+        return Evaluation(
+            energy + found, residual + pushed, data if tangent else None, force, deepest, area, advance, norm,
+            touch,
+        )  # fmt: skip
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
         """The contact part of the residual (n, 3), N."""
@@ -194,7 +207,7 @@ class System:
         if self.surface is not None:
             shape = self.surface.areas.shape
             points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
-            self._contact(u, increment, False, pushed, np.empty(0), np.empty((0, 3)), points)
+            self._contact(u, increment, False, pushed, np.empty(0), np.zeros_like(u), points)
         return pushed
 
     def _contact(
