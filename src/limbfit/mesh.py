@@ -366,8 +366,8 @@ def write_pvd(path: str | Path, frames: Sequence[tuple[float, Path]]) -> None:
     """Write a ParaView collection of (time in s, VTU file); the files are named relative to ``path``."""
     folder = Path(path).parent.resolve()
     lines = [
-        f'    <DataSet timestep="{float(time)!r}" part="0" file={quoteattr(relpath(Path(file).resolve(), folder))}/>'
-        for time, file in frames
+        f'    <DataSet timestep="{float(time)!r}" part="0" file={quoteattr(relpath(file, folder))}/>'
+        for time, file in ((time, Path(file).resolve()) for time, file in frames)
     ]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>'
     Path(path).write_text("\n".join([head, *lines, "  </Collection>\n</VTKFile>\n"]), encoding="utf-8")

@@ -24,7 +24,7 @@ def test_cube(case):
 
 
 # The tet4 limb is what is left to be explained: FEBio's curve is stiffer than with any contact of ours.
-LIMITS = {"residuum/posterior_tet4": 2.5}
+
 CASES = [pytest.param(case, id=case.name, marks=pytest.mark.slow) for case in PUNCHED]
 
 
@@ -32,4 +32,4 @@ CASES = [pytest.param(case, id=case.name, marks=pytest.mark.slow) for case in PU
 def test_indentation(case):
     row = compare_force(case, REFERENCE)
     assert row["max_difference_percent"] is not None, row["note"]
-    assert row["max_difference_percent"] < LIMITS.get(case.name, 1.0)
+    assert row["max_difference_percent"] < 1.0

@@ -53,38 +53,23 @@ CUBES = tuple(
 )
 
 # FEBio's automatic penalty is 3 times the modulus times A/V of each element: softer than limbfit's own, and
-# softer for hexahedra than for the smaller tetrahedra.  ``penalty`` (1/mm) matches it, and ``penetration``
+# softer for hexahedra than for the smaller tetrahedra.  ``penalty`` (1/mm) is its mean, and ``penetration``
 # lets the punch sink in as far as it then does.  FEBio's default tet10 has 8 quadrature points.
-_SOFT = {"penetration": 1.0}
+_NOTE = "penalty per element and over the current area in FEBio, uniform over the reference area here"
+
+
+def _punched(name: str, element: str, penalty: float, symmetry: int) -> ReferenceCase:
+    problem = {"contact_rule": "gauss", "element": "tet10g8" if element == "tet10" else element}
+    control = {"penalty": penalty, "penetration": 1.0}
+    return ReferenceCase(name, element, problem, control, symmetry, _NOTE)
+
+
 PUNCHED = (
-    ReferenceCase(
-        "block/block_hex8",
-        "hex8",
-        {"contact_rule": "gauss"},
-        {"penalty": 10.0, **_SOFT},
-        4,
-        "penalty per element in FEBio, uniform here",
-    ),
-    ReferenceCase(
-        "block/block_tet4",
-        "tet4",
-        {"contact_rule": "gauss"},
-        {"penalty": 30.0, **_SOFT},
-        4,
-        "penalty per element in FEBio, uniform here",
-    ),
-    ReferenceCase("block/block_tet10", "tet10", {"element": "tet10g8"}, {}, 4, "limbfit's own contact"),
-    ReferenceCase(
-        "residuum/posterior_tet4",
-        "tet4",
-        {"contact_rule": "gauss"},
-        {"penalty": 10.0, **_SOFT},
-        1,
-        "penalty per element in FEBio, uniform here",
-    ),
-    ReferenceCase(
-        "residuum/posterior_tet10", "tet10", {"element": "tet10g8"}, {}, 1, "limbfit's own contact"
-    ),
+    _punched("block/block_hex8", "hex8", 8.7, 4),
+    _punched("block/block_tet4", "tet4", 26.0, 4),
+    _punched("block/block_tet10", "tet10", 26.0, 4),
+    _punched("residuum/posterior_tet4", "tet4", 12.5, 1),
+    _punched("residuum/posterior_tet10", "tet10", 12.5, 1),
 )
 
 

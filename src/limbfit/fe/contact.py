@@ -209,3 +209,21 @@ def _stick(local, place, normal, w, t, h):  # type: ignore[no-untyped-def]
         for j in range(3):
             h[i, j] += w * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
     return energy
+
+
+@njit(cache=True)
+def add_springs(N, blocks, positions, data):  # type: ignore[no-untyped-def]
+    """Add stiffnesses ``blocks (f, q, 3, 3)`` at the contact points to the sparse ``data``."""
+    k = N.shape[1]
+    Ke = np.empty((3 * k, 3 * k))
+    for f in range(len(blocks)):
+        if not blocks[f].any():
+            continue
+        Ke[:] = 0.0
+        for q in range(N.shape[0]):
+            for i in range(3):
+                for j in range(3):
+                    for a in range(k):
+                        for b in range(k):
+                            Ke[i * k + a, j * k + b] += blocks[f, q, i, j] * N[q, a] * N[q, b]
+        scatter_upper(Ke, positions[f], data)

@@ -122,8 +122,8 @@ _TET_1 = (np.full((1, 3), 0.25), np.array([1.0 / 6.0]))
 _TET_4 = _orbit(((5.0 + 3.0 * np.sqrt(5.0)) / 20.0, 0.25), d=3)
 # Degree 3, eight points: the rule of FEBio's default tet10.
 _TET_8 = _orbit((0.0158359099, 0.138527967), (0.6791431780, 0.111472033), d=3)
-# Contact at nodes constrains as many points as there are nodes to give way.  Gauss points of a quadratic
-# face outnumber them threefold: stiff contact then opens at every other point and Newton's method chatters.
+# Contact at points constrains them all.  Seven Gauss points of a quadratic face outnumber the nodes that can
+# give way threefold: stiff contact then opens at every other point; three are as many as its nodal rule has.
 # The nodal rule of a quadratic triangle has its corners at zero weight (it is exact to degree 2).
 _TRI3 = {
     "nodes": (np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.full(3, 1.0 / 6.0)),
@@ -131,7 +131,7 @@ _TRI3 = {
 }
 _TRI6 = {
     "nodes": (np.array([[0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]), np.full(3, 1.0 / 6.0)),
-    "gauss": _triangle_7(),
+    "gauss": _orbit((2.0 / 3.0, 1.0 / 3.0), d=2),
 }
 _QUAD4 = {"nodes": (QUAD_CORNERS, np.ones(4)), "gauss": _gauss(2, 2)}
 _HEX = _gauss(3, 2)

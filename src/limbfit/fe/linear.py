@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib
+import importlib.metadata
 import weakref
 from itertools import pairwise
 from typing import Any, Protocol
@@ -108,7 +109,14 @@ class Pardiso:
 
 @functools.cache
 def _mkl() -> Any:
-    """MKL, found by pypardiso (which searches the disk for it)."""
+    """MKL's library: from the installed package, or as pypardiso finds it by searching the disk."""
+    try:
+        files = importlib.metadata.files("mkl") or []
+    except importlib.metadata.PackageNotFoundError:
+        files = []
+    for file in files:
+        if file.name.startswith("libmkl_rt."):
+            return ctypes.CDLL(str(file.locate()))
     return importlib.import_module("pypardiso").PyPardisoSolver().libmkl
 
 

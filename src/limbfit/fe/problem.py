@@ -91,7 +91,7 @@ class Problem:
     supports: tuple[Support, ...] = ()
     element: str = ""
     start: str = "touching"
-    contact_rule: str = "nodes"
+    contact_rule: str = "gauss"
     friction: str = "frictionless"
     name: str = field(default="", compare=False)
 

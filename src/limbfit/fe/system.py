@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .assembly import assemble
-from .contact import ContactSurface, Touch, check_clear, contact, touching_offset
+from .contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
 from .elements import Element, reference_gradients
 from .indenter import Indenter
 from .laws import Laws
@@ -94,6 +94,7 @@ class System:
             faces = np.asarray(problem.contact_faces, dtype=np.int64)
             self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
             self.free_to_slip = Anchors.none(self.surface)
+            self.spread = self._spread(self.surface)
             touching = self.surface.faces
             self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
             indenter = problem.indenter
@@ -191,11 +192,11 @@ class System:
         points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
         found, force, deepest, area = self._contact(u, increment, tangent, pushed, data, advance, points)
         norm, touch = float(np.linalg.norm(pushed)), None
-        if self.surface.nodal:
-            weights = increment.penalty * self.surface.areas[:, 0]
-            anchors = increment.anchors or self.free_to_slip
-            stick = anchors.blocks(self.surface, self.indenter, increment.penalty)[:, 0]
-            touch = Touch(points[0][:, 0], points[1][:, 0], weights, points[2][:, 0], stick)
+        anchors = increment.anchors or self.free_to_slip
+        stick = anchors.blocks(self.surface, self.indenter, increment.penalty).reshape(-1, 3, 3)
+        weights = increment.penalty * self.surface.areas.ravel()
+        gaps, normals, blocks = points
+        touch = Touch(gaps.ravel(), normals.reshape(-1, 3), weights, blocks.reshape(-1, 3, 3), stick)
         return Evaluation(
             energy + found, residual + pushed, data if tangent else None, force, deepest, area, advance, norm,
             touch,
@@ -232,26 +233,32 @@ class System:
         )  # fmt: skip
 
     def with_springs(self, data: Array, blocks: Array) -> Array:
-        """``data`` plus a block (c, 3, 3) on the diagonal of every (nodal) contact point."""
-        entries = blocks[:, *np.triu_indices(3)]
-        there = (self.face_positions >= 0) & (entries != 0.0)
+        """``data`` plus a stiffness (c, 3, 3) at every contact point."""
+        assert self.surface is not None
         data = data.copy()
-        data[self.face_positions[there]] += entries[there]
+        surface = self.surface
+        shape = *surface.areas.shape, 3, 3
+        add_springs(surface.N, np.ascontiguousarray(blocks).reshape(shape), self.face_positions, data)
         return data
 
     def at_springs(self, forces: Array) -> Array:
-        """Forces (c, 3, ...) at the (nodal) contact points as a vector (or matrix) of the unknowns."""
-        assert self.surface is not None
-        out = np.zeros((self.unknowns, *forces.shape[2:]))
-        numbers = self.numbers[self.surface.faces[:, 0]]
-        out[numbers[numbers >= 0]] = forces[numbers >= 0]
-        return out
+        """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns."""
+        return np.asarray(self.spread @ forces.reshape(-1, *forces.shape[2:]))
 
     def springs_of(self, x: Array) -> Array:
-        """Values (c, 3, ...) of a vector (or matrix) of the unknowns at the (nodal) contact points."""
-        assert self.surface is not None
-        numbers = self.numbers[self.surface.faces[:, 0]]
-        return np.where((numbers >= 0).reshape(*numbers.shape, *[1] * (x.ndim - 1)), x[numbers], 0.0)
+        """Values (c, 3, ...) of a vector (or matrix) of the unknowns at the contact points."""
+        return np.asarray(self.spread.T @ x).reshape(-1, 3, *x.shape[1:])
+
+    def _spread(self, surface: ContactSurface) -> sp.csr_matrix:
+        """Shares (unknowns, 3 c) of the unknowns in the position of every contact point."""
+        f, q = len(surface.faces), len(surface.N)
+        columns = np.arange(3 * f * q).reshape(f, q, 1, 3)
+        rows = self.numbers[surface.faces][:, None]
+        shares = surface.N[None, :, :, None]
+        rows, columns, shares = np.broadcast_arrays(rows, columns, shares)
+        held = rows < 0
+        entries = shares[~held], (rows[~held], columns[~held])
+        return sp.csr_matrix(entries, shape=(self.unknowns, 3 * f * q))
 
 
 @njit(cache=True)
