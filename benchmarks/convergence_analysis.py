@@ -1,0 +1,169 @@
+"""What the runs of ``convergence.py`` say: limits, errors, costs at equal error, tables and the figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.optimize import brentq
+
+DEFAULT, PAPER = "tet10", "tet4"
+LOAD_STEPS = 10
+WANTED_PERCENT = 2.0
+# FEBio 4.11 with two threads on two cores at 2.5 GHz: unknowns, seconds, steps.  The tet10 block took about
+# 80 s on one thread, beside another run.
+FEBIO = (
+    ("residuum tet10", 50_790, 144.8, 38),
+    ("residuum tet4", 6_348, 10.6, 38),
+    ("block hex8", 5_040, 12.0, 30),
+    ("block tet4", 5_040, 9.0, 30),
+    ("block tet10", 38_394, 80.0, 30),
+)
+Rows = list[dict[str, Any]]
+
+
+def analyse(rows: Rows) -> dict[str, Any]:
+    """Limits, errors (added to the rows), and costs of ``WANTED_PERCENT`` by site."""
+    factor, exponent = febio_cost()
+    found: dict[str, Any] = {"febio": {"factor": factor, "exponent": exponent}, "sites": {}, "rows": rows}
+    for site in sorted({row["site"] for row in rows}):
+        best = series(rows, site, DEFAULT)
+        limit = richardson(best)
+        for row in rows:
+            if row["site"] == site and limit is not None:
+                row["error_percent"] = 100.0 * (row["peak_force_N"] / limit["limit_N"] - 1.0)
+        found["sites"][site] = {**(limit or {}), "cost": limit and costs(rows, site, factor, exponent)}
+    return found
+
+
+def series(rows: Rows, site: str, element: str, splits: int = 0) -> Rows:
+    """One element's runs with the usual steps, coarse to fine."""
+    chosen = [
+        row
+        for row in rows
+        if (row["site"], row["element"], row["splits"]) == (site, element, splits)
+        and row["load_steps"] == LOAD_STEPS
+        and row["completed"]
+    ]
+    return sorted(chosen, key=lambda row: row["unknowns"])
+
+
+def richardson(best: Rows) -> dict[str, float] | None:
+    """Limit and order of ``F = F_0 + C h^p``, ``h = unknowns^(-1/3)``, through the three finest runs.
+
+    None where there are fewer, or where they do not converge monotonically.
+    """
+    if len(best) < 3:
+        return None
+    h = np.array([row["unknowns"] for row in best[-3:]], dtype=float) ** (-1.0 / 3.0)
+    force = np.array([row["peak_force_N"] for row in best[-3:]])
+    wanted = (force[0] - force[1]) / (force[1] - force[2])
+
+    def miss(p: float) -> float:
+        return float((h[0] ** p - h[1] ** p) / (h[1] ** p - h[2] ** p) - wanted)
+
+    if miss(0.3) * miss(8.0) > 0.0:
+        return None
+    order = brentq(miss, 0.3, 8.0)
+    slope = (force[1] - force[2]) / (h[1] ** order - h[2] ** order)
+    return {"limit_N": float(force[2] - slope * h[2] ** order), "order": float(order)}
+
+
+def febio_cost() -> tuple[float, float]:
+    """``seconds = factor * unknowns^exponent`` by least squares of the logarithms over FEBio's runs."""
+    unknowns, seconds = np.array([[case[1], case[2]] for case in FEBIO]).T
+    exponent, level = np.polyfit(np.log(unknowns), np.log(seconds), 1)
+    return float(np.exp(level)), float(exponent)
+
+
+def power_law(x: list[float], y: list[float]) -> tuple[float, float]:
+    """Factor and exponent of ``y = factor * x^exponent``."""
+    exponent, level = np.polyfit(np.log(x), np.log(y), 1)
+    return float(np.exp(level)), float(exponent)
+
+
+def unknowns_at(runs: Rows, percent: float) -> dict[str, Any]:
+    """Unknowns at which the power law of |error| over unknowns has that error, and whether it was reached."""
+    sizes = [float(row["unknowns"]) for row in runs]
+    errors = [abs(row["error_percent"]) for row in runs]
+    factor, exponent = power_law(sizes, errors)
+    needed = (percent / factor) ** (1.0 / exponent)
+    return {"unknowns": needed, "exponent": exponent, "extrapolated": not sizes[0] <= needed <= sizes[-1]}
+
+
+def costs(rows: Rows, site: str, factor: float, exponent: float) -> dict[str, Any]:
+    """Seconds for ``WANTED_PERCENT``: limbfit's default, and FEBio with that element and with tet4."""
+    best, paper = series(rows, site, DEFAULT), series(rows, site, PAPER)
+    if len(best) < 3 or len(paper) < 2:
+        return {}
+    needed, needed_tet4 = (unknowns_at(runs, WANTED_PERCENT) for runs in (best, paper))
+    own = power_law([row["unknowns"] for row in best], [row["cpu_seconds"] for row in best])
+    seconds = own[0] * needed["unknowns"] ** own[1]
+    tet10, tet4 = (factor * n["unknowns"] ** exponent for n in (needed, needed_tet4))
+    return {
+        "tet10": {**needed, "cpu_seconds": seconds, "cpu_exponent": own[1], "febio_seconds": tet10},
+        "tet4": {**needed_tet4, "febio_seconds": tet4},
+        "ratio_tet10": tet10 / seconds,
+        "ratio_tet4": tet4 / seconds,
+    }
+
+
+def tables(found: dict[str, Any]) -> str:
+    """The runs as Markdown, site by site."""
+    lines = []
+    for site, limit in found["sites"].items():
+        lines += ["", f"{site}: {limit}", ""]
+        lines += [
+            "| element | size mm | splits | steps | cells | unknowns | peak N | error % | CPU s | MiB |"
+        ]
+        lines += ["|---" * 10 + "|"]
+        lines += [_line(row) for row in sorted(found["rows"], key=_order) if row["site"] == site]
+    return "\n".join(lines)
+
+
+def _order(row: dict[str, Any]) -> tuple:
+    return row["element"], row["splits"], row["load_steps"], row["unknowns"]
+
+
+def _line(row: dict[str, Any]) -> str:
+    error = f"{row['error_percent']:+.1f}" if "error_percent" in row else ""
+    text = "{element} | {size_mm:g} | {splits} | {load_steps} | {cells} | {unknowns} | {peak_force_N:.3f}"
+    rest = " | {cpu_seconds:.1f} | {max_rss_MB:.0f} |"
+    return f"| {text.format(**row)} | {error}{rest.format(**row)}"
+
+
+def draw(found: dict[str, Any], path: Path) -> None:
+    """Peak force over unknowns with the limit, and error over processor seconds, at the first site."""
+    sites = [site for site, limit in found["sites"].items() if "limit_N" in limit]
+    figure, axes = plt.subplots(
+        max(len(sites), 1), 2, figsize=(10, 4 * max(len(sites), 1)), layout="constrained", squeeze=False
+    )
+    for site, (left, right) in zip(sites, axes):
+        _draw_site(found, site, left, right)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _draw_site(found: dict[str, Any], site: str, left: Any, right: Any) -> None:
+    rows, limit = found["rows"], found["sites"][site]["limit_N"]
+    for element, splits in sorted({(row["element"], row["splits"]) for row in rows if row["site"] == site}):
+        runs = series(rows, site, element, splits)
+        label = element + (", split" if splits else "")
+        sizes = [row["unknowns"] for row in runs]
+        errors = [abs(row["error_percent"]) for row in runs]
+        (line,) = left.semilogx(sizes, [row["peak_force_N"] for row in runs], "o-", label=label)
+        right.loglog([row["cpu_seconds"] for row in runs], errors, "o-", color=line.get_color(), label=label)
+        if element in (DEFAULT, PAPER) and not splits:
+            cost = found["febio"]["factor"] * np.array(sizes) ** found["febio"]["exponent"]
+            right.loglog(cost, errors, "s:", color=line.get_color(), label=f"FEBio {label}, cost estimated")
+    left.axhline(limit, color="0.4", lw=0.8, label=f"Richardson limit {limit:.3f} N")
+    left.set(xlabel="unknowns", ylabel="peak force, N", title=site)
+    right.axhline(WANTED_PERCENT, color="0.4", lw=0.8)
+    right.set(xlabel="processor seconds", ylabel="|error| of the peak force, %", title=site)
+    for axis in (left, right):
+        axis.legend(fontsize=7)
