@@ -39,7 +39,7 @@ def bench_forward(
     reference : folder of FEBio's results; None: ``shared/reference``, here or above.
     case : a case with an indenter in it.
     element : name in the element table; empty: that of the mesh.
-    threads : of the linear algebra.
+    threads : of assembly and linear algebra.
 
     Raises
     ------
@@ -49,7 +49,8 @@ def bench_forward(
     if case not in CASES:
         raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(CASES)}")
     folder = reference or find_reference(Path.cwd())
-    job = ForwardJob(replace(CASES[case], problem={"element": element}, control={}), folder, False)
+    named = replace(CASES[case], problem={"element": element}, control={"threads": threads})
+    job = ForwardJob(named, folder, False)
     tell(0, 2, f"{case}, plain")
     plain = in_fresh_process(run_forward, job, threads)
     tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,7 @@ def bench_scaling(
     InputError
         For an element that is not in the table.
     """
+    control = replace(control, threads=threads)
     jobs = [BlockJob(element, divisions_for(element, size), control) for size in unknowns]
     jobs.append(BlockJob(PAPER_ELEMENT, paper_divisions, control))
     rows = []

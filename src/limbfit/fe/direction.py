@@ -106,7 +106,7 @@ def _foresee(
             break
     if part is None:
         return x, touch.closed
-    return x + y + factor.columns.Z[:, : len(part)] @ part[:, None], kept
+    return x + y + factor.columns.Z[:, : len(part)] @ part[:, None].astype(np.float32), kept
 
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:

@@ -34,7 +34,8 @@ class SpringColumns:
         """Forget the columns: there is a new factor, whose springs are ``blocks (c, 3, 3)``."""
         self.blocks = blocks
         self.keys: dict[tuple[int, int], int] = {}
-        self.Z = np.empty((self._system.unknowns, 0), order="F")
+        # In single precision like the factor: they only precondition.
+        self.Z = np.empty((self._system.unknowns, 0), dtype=np.float32, order="F")
         count = 0 if blocks is None else len(blocks)
         self.at_points = np.empty((count, 3, 0))
 
@@ -68,7 +69,7 @@ class SpringColumns:
             unit = np.zeros((len(wanted), 3, len(new)))
             unit[points, :, np.arange(len(new))] = frame[axes]
             Z = self._apply(self._system.at_springs(unit))
-            self.Z = np.asfortranarray(np.hstack([self.Z, Z]))
+            self.Z = np.concatenate([self.Z.T, Z.T.astype(np.float32)]).T
             self.at_points = np.concatenate([self.at_points, self._system.springs_of(Z)], axis=2)
         return True
 
@@ -92,16 +93,12 @@ class SpringChange:
         if not len(self._points):
             return y
         moved = self._inverse @ self.project(self._columns._system.springs_of(y))
-        return y - self._columns.Z @ (self._D @ moved)
+        return y - self._columns.Z @ (self._D @ moved).astype(np.float32)
 
     def coefficients(self, moved: Array, forces: Array) -> Array:
         """What to add (k,) of each column, for displacements of the factor's solution and forces (c, 3)."""
         f = self.project(forces)
         return f - self._D @ (self._inverse @ (self.project(moved) + self._S @ f))
-
-    def everywhere(self, coefficients: Array) -> Array:
-        """The combination of columns at all unknowns (n,)."""
-        return self._columns.Z @ coefficients
 
     def at_points(self, coefficients: Array) -> Array:
         """The combination of columns at the contact points (c, 3)."""

@@ -7,7 +7,7 @@ import functools
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_info
 
 
 @functools.cache
@@ -21,7 +21,13 @@ def single_threaded_numpy() -> AbstractContextManager[object]:
 
     Its arrays are small here, and its idle threads would spin on the cores that the solver works on.
     """
-    return threadpool_limits({"libopenblas": 1, "libscipy_openblas": 1})
+    return _openblas().limit(limits=1)
+
+
+@functools.cache
+def _openblas() -> ThreadpoolController:
+    """OpenBLAS alone: a limit on all libraries, once lifted, would leave MKL with one thread."""
+    return ThreadpoolController().select(internal_api="openblas")
 
 
 def quiet_openmp() -> None:
