@@ -19,7 +19,7 @@ import argparse
 import json
 import multiprocessing
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +64,17 @@ REFERENCE = np.array(
 
 @dataclass(frozen=True)
 class Run:
-    """A simulation: size of its family in mm, how often each tetrahedron is split, steps of loading."""
+    """A simulation: size of its family in mm, how often each tetrahedron is split, steps of loading.
+
+    Without unloading it gives the peak force, but no cost.
+    """
 
     site: str
     element: str
     size_mm: float
     splits: int = 0
     load_steps: int = StepControl().load_steps
+    unloading: bool = True
 
     @property
     def mesh_name(self) -> str:
@@ -157,8 +161,8 @@ def problem_of(run: Run, study: Path, mesh: Mesh) -> Problem:
         mesh_digest="",
         position=tuple(site["position"]),
         axis=tuple(site["axis"]),
-        knots_s=(0.0, ramp, 2.0 * ramp),
-        knots_mm=(0.0, depth, 0.0),
+        knots_s=(0.0, ramp, 2.0 * ramp)[: 2 + run.unloading],
+        knots_mm=(0.0, depth, 0.0)[: 2 + run.unloading],
         indenter=PUNCH,
     )
     return replace(build_problem(model, mesh, content["truth"]), element=run.element)
@@ -197,9 +201,9 @@ def in_own_process(function: Any, *arguments: Any) -> Any:
 
 def complete(rows: list[dict], runs: list[Run], study: Path, folder: Path) -> None:
     """Do the runs that are not among the rows, and store each as soon as it is done."""
-    known = {tuple(row[key] for key in asdict(runs[0])) for row in rows} if runs else set()
+    known = [Run(**{field.name: row[field.name] for field in fields(Run)}) for row in rows]
     for run in runs:
-        if tuple(asdict(run).values()) in known:
+        if run in known:
             continue
         file = folder / run.mesh_name
         if not file.is_file():
@@ -224,6 +228,7 @@ def options() -> argparse.Namespace:
     parser.add_argument(
         "--reference", type=Path, help="folder of FEBio's results (default: shared/reference)"
     )
+    parser.add_argument("--loading-only", action="store_true", help="up to the peak: its force, not its cost")
     parser.add_argument("--json", action="store_true", help="print the analysis as JSON")
     return parser.parse_args()
 
@@ -235,7 +240,7 @@ def main() -> None:
     rows = json.loads(kept.read_text()) if kept.is_file() else []
     study = (chosen.reference or find_reference(Path.cwd())) / "openlimb-study"
     runs = [
-        Run(site, element, size, chosen.splits, chosen.load_steps)
+        Run(site, element, size, chosen.splits, chosen.load_steps, not chosen.loading_only)
         for size in chosen.sizes
         for site in chosen.site
         for element in chosen.element

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from scipy.optimize import brentq
 DEFAULT, PAPER = "tet10", "tet4"
 LOAD_STEPS = 10
 WANTED_PERCENT = 2.0
+LEAST_ORDER, THEORY_ORDER, MOST_ORDER = 0.8, 2.0, 6.0
 # FEBio 4.11 with two threads on two cores at 2.5 GHz: unknowns, seconds, steps.  The tet10 block took about
 # 80 s on one thread, beside another run.
 FEBIO = (
@@ -53,10 +55,16 @@ def series(rows: Rows, site: str, element: str, splits: int = 0) -> Rows:
     return sorted(chosen, key=lambda row: row["unknowns"])
 
 
-def richardson(best: Rows) -> dict[str, float] | None:
+def priced(runs: Rows) -> Rows:
+    """The runs that went in and out: those that say what a simulation costs."""
+    return [row for row in runs if row["unloading"]]
+
+
+def richardson(best: Rows) -> dict[str, Any] | None:
     """Limit and order of ``F = F_0 + C h^p``, ``h = unknowns^(-1/3)``, through the three finest runs.
 
-    None where there are fewer, or where they do not converge monotonically.
+    Where three runs have no such order, that of the element in theory is taken for the last two
+    (``assumed``); ``range_N`` has the limits of the last two for orders one and two.  None with fewer runs.
     """
     if len(best) < 3:
         return None
@@ -67,11 +75,14 @@ def richardson(best: Rows) -> dict[str, float] | None:
     def miss(p: float) -> float:
         return float((h[0] ** p - h[1] ** p) / (h[1] ** p - h[2] ** p) - wanted)
 
-    if miss(0.3) * miss(8.0) > 0.0:
-        return None
-    order = brentq(miss, 0.3, 8.0)
-    slope = (force[1] - force[2]) / (h[1] ** order - h[2] ** order)
-    return {"limit_N": float(force[2] - slope * h[2] ** order), "order": float(order)}
+    def limit(p: float) -> float:
+        slope = (force[1] - force[2]) / (h[1] ** p - h[2] ** p)
+        return float(force[2] - slope * h[2] ** p)
+
+    assumed = miss(LEAST_ORDER) * miss(MOST_ORDER) > 0.0
+    order = THEORY_ORDER if assumed else float(brentq(miss, LEAST_ORDER, MOST_ORDER))
+    bounds = [limit(1.0), limit(2.0)]
+    return {"limit_N": limit(order), "order": order, "assumed": bool(assumed), "range_N": bounds}
 
 
 def febio_cost() -> tuple[float, float]:
@@ -98,7 +109,7 @@ def unknowns_at(runs: Rows, percent: float) -> dict[str, Any]:
 
 def costs(rows: Rows, site: str, factor: float, exponent: float) -> dict[str, Any]:
     """Seconds for ``WANTED_PERCENT``: limbfit's default, and FEBio with that element and with tet4."""
-    best, paper = series(rows, site, DEFAULT), series(rows, site, PAPER)
+    best, paper = (priced(series(rows, site, element)) for element in (DEFAULT, PAPER))
     if len(best) < 3 or len(paper) < 2:
         return {}
     needed, needed_tet4 = (unknowns_at(runs, WANTED_PERCENT) for runs in (best, paper))
@@ -117,7 +128,7 @@ def tables(found: dict[str, Any]) -> str:
     """The runs as Markdown, site by site."""
     lines = []
     for site, limit in found["sites"].items():
-        lines += ["", f"{site}: {limit}", ""]
+        lines += ["", f"{site}: {json.dumps(limit, indent=1)}", ""]
         lines += [
             "| element | size mm | splits | steps | cells | unknowns | peak N | error % | CPU s | MiB |"
         ]
@@ -155,11 +166,15 @@ def _draw_site(found: dict[str, Any], site: str, left: Any, right: Any) -> None:
         runs = series(rows, site, element, splits)
         label = element + (", split" if splits else "")
         sizes = [row["unknowns"] for row in runs]
-        errors = [abs(row["error_percent"]) for row in runs]
         (line,) = left.semilogx(sizes, [row["peak_force_N"] for row in runs], "o-", label=label)
+        runs = priced(runs)
+        errors = [abs(row["error_percent"]) for row in runs]
         right.loglog([row["cpu_seconds"] for row in runs], errors, "o-", color=line.get_color(), label=label)
         if element in (DEFAULT, PAPER) and not splits:
-            cost = found["febio"]["factor"] * np.array(sizes) ** found["febio"]["exponent"]
+            cost = (
+                found["febio"]["factor"]
+                * np.array([float(row["unknowns"]) for row in runs]) ** found["febio"]["exponent"]
+            )
             right.loglog(cost, errors, "s:", color=line.get_color(), label=f"FEBio {label}, cost estimated")
     left.axhline(limit, color="0.4", lw=0.8, label=f"Richardson limit {limit:.3f} N")
     left.set(xlabel="unknowns", ylabel="peak force, N", title=site)
