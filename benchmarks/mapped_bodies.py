@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from limbfit.mesh import TET10_EDGES, Mesh, boundary_faces, node_jacobians, to_tet10
 
+FINE_MM = 3.5  # longest interval under the indenter: what limbfit's mesher makes there by default
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
@@ -54,6 +55,11 @@ def graded(inner: float, outer: float, near: int, far: int) -> Array:
     return np.concatenate([-rest[::-1], np.linspace(-inner, inner, near + 1), rest])
 
 
+def fine(inner: float) -> int:
+    """Number of intervals within +-inner mm."""
+    return int(np.ceil(2.0 * inner / FINE_MM))
+
+
 def levels(bottom: Array, top: Array, layer: float, count: int) -> Array:
     """Heights (..., count + 2): muscle in ``count`` levels and one skin layer, at most half of the tissue."""
     interface = top - np.minimum(layer, 0.5 * (top - bottom))
@@ -66,7 +72,7 @@ def slab(
     thickness: float, layer: float, inner: float, half: float, ridge: float, edge: float, count: int
 ) -> Body:
     """A block; its held bottom rises by ``ridge`` mm beyond x = ``edge``, over 8 mm; site (0, 0, 0)."""
-    lines = graded(inner, half, 4, 2)
+    lines = graded(inner, half, fine(inner), 2)
     x, y = np.meshgrid(lines, lines, indexing="ij")
     rise = np.clip((x - edge) / 8.0 + 0.5, 0.0, 1.0)
     bottom = -thickness + ridge * rise**2 * (3.0 - 2.0 * rise)
@@ -90,7 +96,7 @@ def limb(
     second : radius, distance from the first bone's axis (mm) and angle (rad) of a second bone.
     """
     offset = radius - bone - thin  # how far the skin's axis lies behind the bone's
-    z = graded(inner, 2.2 * inner, 4, 2)
+    z = graded(inner, 2.2 * inner, fine(inner), 2)
 
     def skin(theta: Array, height: Array) -> Array:
         shrunk = radius * (1.0 - taper * np.clip(-height / z[-1], 0.0, 1.0) ** 2)
@@ -99,7 +105,7 @@ def limb(
 
     reach = float(skin(np.array(angle), np.array(0.0)))
     near = min(inner / reach, 1.2)
-    far = graded(near, np.pi, 4, 4)[:-1]  # -pi and pi are the same line
+    far = graded(near, np.pi, fine(near * reach), 4)[:-1]  # -pi and pi are the same line
     theta, height = np.meshgrid(angle + far, z, indexing="ij")
     outer = np.maximum(skin(theta, height), bone + 0.6 * thin)
     r = levels(np.full_like(outer, bone), outer, layer, count)

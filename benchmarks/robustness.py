@@ -38,6 +38,7 @@ SITES = (
     "slab-mid", "slab-slanted", "slab-thin", "ridge-edge", "ridge-thin", "limb-mid", "limb-slanted",
     "limb-thin", "limb-edge", "twin-thin", "twin-between",
 )  # fmt: skip
+ELEMENT = "tet10v"  # sees elements fold in their corners, which deep indentations by sharp edges make them do
 FARTHEST_MM = 30.0  # travel to the bone that is taken where the indenter would pass it by
 
 
@@ -163,7 +164,7 @@ def body_of(case: Case) -> Body:
     return limb(*measures, inner, 3 if second else 2, second)
 
 
-def problem_of(case: Case, seed: int) -> Problem:
+def problem_of(case: Case, seed: int, element: str = ELEMENT) -> Problem:
     """The case as a problem: loading to the drawn depth and unloading at the same speed."""
     body = body_of(case)
     rng = np.random.default_rng([seed, case.number, 1])
@@ -183,6 +184,7 @@ def problem_of(case: Case, seed: int) -> Problem:
         contact_faces=faces[near],
         indenter=tool,
         history=History(np.array([0.0, duration, 2.0 * duration]), np.array([0.0, depth, 0.0])),
+        element=element,
         name=f"{case.number} {case.site} {case.tool}",
     )
 
@@ -266,12 +268,12 @@ def _self_penetrating(points: Array, corners: Indices, tolerance: float = 0.05) 
     return count
 
 
-def run_case(seed: int, number: int) -> Outcome:
+def run_case(seed: int, number: int, element: str = ELEMENT) -> Outcome:
     """Draw, build and solve one case; an exception is a crash with its last line as the reason."""
     started = time.process_time()
     case = draw(seed, number)
     try:
-        problem = problem_of(case, seed)
+        problem = problem_of(case, seed, element)
         result = solve(problem, store="all")
     except Exception:
         reason = traceback.format_exc().strip().splitlines()
@@ -310,14 +312,15 @@ class Worker:
     hang; ten times as long on the clock is the limit for a process that only waits.
     """
 
-    def __init__(self, seed: int, limit_s: float) -> None:
-        self.seed, self.limit_s = seed, limit_s
+    def __init__(self, seed: int, limit_s: float, element: str = ELEMENT) -> None:
+        self.seed, self.limit_s, self.element = seed, limit_s, element
         self._start()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, far = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far, self.seed, self.limit_s), daemon=True)
+        arguments = (far, self.seed, self.limit_s, self.element)
+        self.process = context.Process(target=_serve, args=arguments, daemon=True)
         self.process.start()
         far.close()
         self.pipe.recv()  # ready: kernels are compiled
@@ -345,7 +348,7 @@ class Worker:
         self.pipe.close()
 
 
-def _serve(pipe: Connection, seed: int, limit_s: float) -> None:
+def _serve(pipe: Connection, seed: int, limit_s: float, element: str) -> None:
     """Warm up, then run the cases that are asked for."""
     body = slab(10.0, 2.0, 5.0, 20.0, 0.0, 0.0, 1)
     tool = Indenter(centre=body.site, axis=body.inward, width=8.0)
@@ -356,14 +359,16 @@ def _serve(pipe: Connection, seed: int, limit_s: float) -> None:
     while True:
         number = pipe.recv()
         signal.setitimer(signal.ITIMER_PROF, limit_s)
-        outcome = run_case(seed, number)
+        outcome = run_case(seed, number, element)
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         pipe.send(outcome)
 
 
-def run_all(seed: int, numbers: list[int], limit_s: float, workers: int) -> Iterator[Outcome]:
+def run_all(
+    seed: int, numbers: list[int], limit_s: float, workers: int, element: str = ELEMENT
+) -> Iterator[Outcome]:
     """Outcomes as they come, in order, from a number of workers."""
-    made = [Worker(seed, limit_s) for _ in range(workers)]
+    made = [Worker(seed, limit_s, element) for _ in range(workers)]
     idle = list(made)
 
     def one(number: int) -> Outcome:
@@ -429,15 +434,16 @@ def main() -> None:
     parser.add_argument(
         "--limit", type=float, default=300.0, help="processor seconds until a case counts as hanging"
     )
+    parser.add_argument("--element", default=ELEMENT, help=f"name in the element table (default {ELEMENT})")
     parser.add_argument("--json", type=Path, help="write every case and the summary here")
     options = parser.parse_args()
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     numbers = list(range(options.first, options.first + options.cases))
     outcomes: list[Outcome] = []
-    for outcome in run_all(
-        options.seed, numbers if options.only is None else [options.only], options.limit, options.workers
-    ):
+    if options.only is not None:
+        numbers = [options.only]
+    for outcome in run_all(options.seed, numbers, options.limit, options.workers, options.element):
         outcomes.append(outcome)
         print(_line(outcome), flush=True)
         if options.json is not None:

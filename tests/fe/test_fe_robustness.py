@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blocks import SKIN, punch
+from blocks import SKIN, block, punch
 
 from limbfit.errors import ProblemError
-from limbfit.fe import OgdenQLV, Problem, Result, StepControl, Support, solve
+from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.study import PARAMETERS, MaterialTable
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -90,6 +90,21 @@ def test_what_is_not_reached_is_said(robustness):
     assert result.reason.startswith("stopped at 0 s of 12.5 s: ")
     assert len(result.times) == 1 + len(result.states) < 3
     assert np.isfinite(result.force_at(np.linspace(0.0, 12.5, 5))).all()
+
+
+@pytest.mark.parametrize(("element", "folded"), [("tet10", True), ("tet10v", False)])
+def test_elements_that_fold_in_their_corners_are_told(element, folded):
+    """One node of a cube's top pushed in by 6 of 10 mm: points inside the elements do not see them fold."""
+    lines = np.linspace(0.0, 10.0, 5)
+    mesh = block("tet10", lines, lines, lines, layer=4.0)
+    middle = np.flatnonzero(np.linalg.norm(mesh.points - [5.0, 5.0, 10.0], axis=1) < 1e-9)
+    problem = Problem(
+        mesh, {"skin": SKIN, "muscle": SKIN}, mesh.node_sets["bottom"], mesh.face_sets["top"], None,
+        History(np.array([0.0, 1.0]), np.array([0.0, 6.0])), (Support(middle, 2, -1.0),), element,
+    )  # fmt: skip
+    result = solve(problem)
+    assert result.completed, result.reason
+    assert [("elements are inside out" in warning) for warning in result.warnings] == [True] * folded
 
 
 def changed(result: Result, **arrays: Callable) -> Result:

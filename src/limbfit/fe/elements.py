@@ -122,6 +122,9 @@ _TET_1 = (np.full((1, 3), 0.25), np.array([1.0 / 6.0]))
 _TET_4 = _orbit(((5.0 + 3.0 * np.sqrt(5.0)) / 20.0, 0.25), d=3)
 # Degree 3, eight points: the rule of FEBio's default tet10.
 _TET_8 = _orbit((0.0158359099, 0.138527967), (0.6791431780, 0.111472033), d=3)
+# Degree 3, vertices and middles of the faces: an element cannot fold in a corner unseen, as it can between
+# the inner points of the other rules.
+_TET_8_VERTICES = _orbit((1.0, 1.0 / 40.0), (0.0, 9.0 / 40.0), d=3)
 # Contact at points constrains them all.  Seven Gauss points of a quadratic face outnumber the nodes that can
 # give way threefold: stiff contact then opens at every other point; three are as many as its nodal rule has.
 # The nodal rule of a quadratic triangle has its corners at zero weight (it is exact to degree 2).
@@ -142,6 +145,7 @@ ELEMENTS: dict[str, Element] = {
         Element("tet4", "tet4", linear_simplex, *_TET_1, False, linear_simplex, _TRI3),
         Element("tet10", "tet10", quadratic_simplex, *_TET_4, False, quadratic_simplex, _TRI6),
         Element("tet10g8", "tet10", quadratic_simplex, *_TET_8, False, quadratic_simplex, _TRI6),
+        Element("tet10v", "tet10", quadratic_simplex, *_TET_8_VERTICES, False, quadratic_simplex, _TRI6),
         Element("tet10p0", "tet10", quadratic_simplex, *_TET_4, True, quadratic_simplex, _TRI6),
         Element("hex8", "hex8", linear_hexahedron, *_HEX, True, linear_quadrilateral, _QUAD4),
     )

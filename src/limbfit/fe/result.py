@@ -56,6 +56,7 @@ class Result:
     penetration, contact_area : (n,) mm, mm^2 (reference).
     states : kept steps.
     completed, reason : False and why where the end of the history was not reached.
+    warnings : what is doubtful about the kept states.
     statistics : steps, newton_iterations, factorisations, linear_solver, element, unknowns, seconds by part.
     """
 
@@ -71,6 +72,7 @@ class Result:
     completed: bool
     reason: str
     statistics: Mapping[str, Any]
+    warnings: tuple[str, ...] = ()
     system: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

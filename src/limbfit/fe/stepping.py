@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import node_jacobians
 from .contact import ContactSurface
 from .direction import renew, solve_at
 from .factor import Factor
@@ -54,7 +55,7 @@ class StepControl:
     unload_steps: int = 8
     times: tuple[float, ...] | None = None
     tolerance: float = 3e-5
-    max_iterations: int = 30
+    max_iterations: int = 60
     most_iterations: int = 1500
     max_cuts: int = 8
     penetration: float = 0.01
@@ -382,8 +383,27 @@ def _result(
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
+        warnings=_folded(problem, kept),
         statistics=_statistics(run, seconds),
         system=run.system,
+    )
+
+
+def _folded(problem: Problem, states: Sequence[State]) -> tuple[str, ...]:
+    """A warning where elements are inside out at nodes of theirs at the deepest of the ``states``.
+
+    The quadrature of ``tet10`` lies inside and does not see it; the element has lost part of its stiffness.
+    """
+    if not states:
+        return ()
+    deepest = max(states, key=lambda state: state.displacement)
+    shape = problem.mesh.with_points(problem.mesh.points + deepest.u)
+    count = int((node_jacobians(shape) <= 0.0).any(axis=1).sum())
+    if not count:
+        return ()
+    return (
+        f"{count} elements are inside out at a node at {deepest.displacement:.3g} mm and the force may be "
+        "too small: use element tet10v, a rounded edge of the indenter or a finer mesh at its edge",
     )
 
 
