@@ -11,6 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 from scipy.optimize import brentq
 
 DEFAULT, PAPER = "tet10", "tet4"
@@ -31,15 +32,14 @@ Rows = list[dict[str, Any]]
 
 def analyse(rows: Rows) -> dict[str, Any]:
     """Limits, errors (added to the rows), and costs of ``WANTED_PERCENT`` by site."""
-    factor, exponent = febio_cost()
-    found: dict[str, Any] = {"febio": {"factor": factor, "exponent": exponent}, "sites": {}, "rows": rows}
+    found: dict[str, Any] = {"febio": febio_costs(), "sites": {}, "rows": rows}
     for site in sorted({row["site"] for row in rows}):
         best = series(rows, site, DEFAULT)
         limit = richardson(best)
         for row in rows:
             if row["site"] == site and limit is not None:
                 row["error_percent"] = 100.0 * (row["peak_force_N"] / limit["limit_N"] - 1.0)
-        found["sites"][site] = {**(limit or {}), "cost": limit and costs(rows, site, factor, exponent)}
+        found["sites"][site] = {**(limit or {}), "cost": limit and costs(rows, site)}
     return found
 
 
@@ -85,11 +85,13 @@ def richardson(best: Rows) -> dict[str, Any] | None:
     return {"limit_N": limit(order), "order": order, "assumed": bool(assumed), "range_N": bounds}
 
 
-def febio_cost() -> tuple[float, float]:
-    """``seconds = factor * unknowns^exponent`` by least squares of the logarithms over FEBio's runs."""
-    unknowns, seconds = np.array([[case[1], case[2]] for case in FEBIO]).T
-    exponent, level = np.polyfit(np.log(unknowns), np.log(seconds), 1)
-    return float(np.exp(level)), float(exponent)
+def febio_costs() -> dict[str, tuple[float, float]]:
+    """``seconds = factor * unknowns^exponent`` through FEBio's runs on the residuum, and through all five."""
+    fits = {"residuum": FEBIO[:2], "all": FEBIO}
+    return {
+        name: power_law([float(case[1]) for case in cases], [case[2] for case in cases])
+        for name, cases in fits.items()
+    }
 
 
 def power_law(x: list[float], y: list[float]) -> tuple[float, float]:
@@ -99,29 +101,29 @@ def power_law(x: list[float], y: list[float]) -> tuple[float, float]:
 
 
 def unknowns_at(runs: Rows, percent: float) -> dict[str, Any]:
-    """Unknowns at which the power law of |error| over unknowns has that error, and whether it was reached."""
-    sizes = [float(row["unknowns"]) for row in runs]
-    errors = [abs(row["error_percent"]) for row in runs]
-    factor, exponent = power_law(sizes, errors)
+    """Unknowns at which |error| is ``percent``, by the power law through the two finest runs."""
+    sizes = [float(row["unknowns"]) for row in runs[-2:]]
+    factor, exponent = power_law(sizes, [abs(row["error_percent"]) for row in runs[-2:]])
     needed = (percent / factor) ** (1.0 / exponent)
     return {"unknowns": needed, "exponent": exponent, "extrapolated": not sizes[0] <= needed <= sizes[-1]}
 
 
-def costs(rows: Rows, site: str, factor: float, exponent: float) -> dict[str, Any]:
-    """Seconds for ``WANTED_PERCENT``: limbfit's default, and FEBio with that element and with tet4."""
-    best, paper = (priced(series(rows, site, element)) for element in (DEFAULT, PAPER))
-    if len(best) < 3 or len(paper) < 2:
+def costs(rows: Rows, site: str) -> dict[str, Any]:
+    """Seconds for ``WANTED_PERCENT``: limbfit's default, and FEBio's with that element and with tet4."""
+    best, paper = series(rows, site, DEFAULT), series(rows, site, PAPER)
+    if len(priced(best)) < 2 or len(paper) < 2:
         return {}
-    needed, needed_tet4 = (unknowns_at(runs, WANTED_PERCENT) for runs in (best, paper))
-    own = power_law([row["unknowns"] for row in best], [row["cpu_seconds"] for row in best])
-    seconds = own[0] * needed["unknowns"] ** own[1]
-    tet10, tet4 = (factor * n["unknowns"] ** exponent for n in (needed, needed_tet4))
-    return {
-        "tet10": {**needed, "cpu_seconds": seconds, "cpu_exponent": own[1], "febio_seconds": tet10},
-        "tet4": {**needed_tet4, "febio_seconds": tet4},
-        "ratio_tet10": tet10 / seconds,
-        "ratio_tet4": tet4 / seconds,
+    own = power_law(*([float(row[key]) for row in priced(best)] for key in ("unknowns", "cpu_seconds")))
+    needed = {
+        element: unknowns_at(runs, WANTED_PERCENT) for element, runs in ((DEFAULT, best), (PAPER, paper))
     }
+    seconds = own[0] * needed[DEFAULT]["unknowns"] ** own[1]
+    found: dict[str, Any] = {"needed": needed, "cpu_seconds": seconds, "cpu_exponent": own[1]}
+    for name, (factor, exponent) in febio_costs().items():
+        times = {element: factor * n["unknowns"] ** exponent for element, n in needed.items()}
+        ratios = {element: time / seconds for element, time in times.items()}
+        found[f"febio by {name}"] = {"seconds": times, "ratio": ratios}
+    return found
 
 
 def tables(found: dict[str, Any]) -> str:
@@ -171,13 +173,12 @@ def _draw_site(found: dict[str, Any], site: str, left: Any, right: Any) -> None:
         errors = [abs(row["error_percent"]) for row in runs]
         right.loglog([row["cpu_seconds"] for row in runs], errors, "o-", color=line.get_color(), label=label)
         if element in (DEFAULT, PAPER) and not splits:
-            cost = (
-                found["febio"]["factor"]
-                * np.array([float(row["unknowns"]) for row in runs]) ** found["febio"]["exponent"]
-            )
+            factor, exponent = found["febio"]["residuum"]
+            cost = factor * np.array([float(row["unknowns"]) for row in runs]) ** exponent
             right.loglog(cost, errors, "s:", color=line.get_color(), label=f"FEBio {label}, cost estimated")
     left.axhline(limit, color="0.4", lw=0.8, label=f"Richardson limit {limit:.3f} N")
     left.set(xlabel="unknowns", ylabel="peak force, N", title=site)
+    left.xaxis.set_minor_formatter(NullFormatter())
     right.axhline(WANTED_PERCENT, color="0.4", lw=0.8)
     right.set(xlabel="processor seconds", ylabel="|error| of the peak force, %", title=site)
     for axis in (left, right):
