@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import sys
 import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -213,7 +214,8 @@ def complete(rows: list[dict], runs: list[Run], study: Path, folder: Path) -> No
         print(
             "{site} {element} {size_mm} {unknowns} {peak_force_N:.4f} N {cpu_seconds:.1f} s".format(
                 **rows[-1]
-            )
+            ),
+            file=sys.stderr,
         )
 
 
