@@ -31,8 +31,7 @@ def newton_direction(system: System, at: Evaluation, factor: Factor, tolerance: 
     if at.touch is None:
         found = factor.solve(at.tangent, b, None, tolerance)
         if not found.converged and found.convex:
-            factor.factorise(at.tangent)
-            found = factor.solve(at.tangent, b, None, tolerance)
+            found = factor.solve_anew(at.tangent, b, None, tolerance, found.x)
     else:
         found = _with_contact(system, at, at.touch, factor, b, tolerance)
         if float(b[:, 0] @ found.x[:, 0]) <= 0.0:
@@ -70,8 +69,7 @@ def _with_contact(
         right = b - system.at_springs(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
-            factor.factorise(at.tangent, touch.blocks)
-            found = factor.solve(data, right, _change(factor, at, touch, closed), tolerance, found.x)
+            found = factor.solve_anew(data, right, blocks, tolerance, found.x)
         foreseen = _closed(touch, system.springs_of(found.x[:, 0]))
         if (foreseen == closed).all() or springs is None or not found.convex:
             break
@@ -114,8 +112,8 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
     found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:
-        renew(at, factor)
-        found = factor.solve(at.tangent, b, None, tolerance, found.x, limit=10 * factor.limit)
+        blocks = None if at.touch is None else at.touch.blocks
+        found = factor.solve_anew(at.tangent, b, blocks, tolerance, found.x)
     return found.x
 
 

@@ -185,6 +185,20 @@ class Factor:
             r -= step * Ap
         return Solution(x, bool((np.linalg.norm(r, axis=0) <= target).all()), True)
 
+    def solve_anew(self, data: Array, b: Array, blocks: Array | None, tolerance: float, x: Array) -> Solution:
+        """`solve` with a factor of this very matrix, whose springs are ``blocks (c, 3, 3)``.
+
+        Where even that does not converge, single precision is too little for the matrix, and is given up.
+        """
+        self.factorise(data, blocks)
+        found = self.solve(data, b, None, tolerance, x)
+        if self._single and self._shift == 0.0 and found.convex and not found.converged:
+            self._use(single=False)
+            self.counts["double_precision"] = 1
+            self.factorise(data, blocks)
+            found = self.solve(data, b, None, tolerance, x, limit=10 * self.limit)
+        return found
+
     def precondition(self, r: Array, springs: SpringChange | None) -> Array:
         """The factor's solution (n, k) for ``r (n, k)``, corrected for the changed springs."""
         y = self.apply(r)
