@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from blocks import punch
 
+from limbfit.fe import System
+from limbfit.fe.factor import Factor
+from limbfit.fe.history import Memory
+from limbfit.fe.laws import Laws
 from limbfit.fe.linear import SOLVERS, NotPositiveDefiniteError, linear_solver, symmetric_product
 
 
@@ -52,3 +57,21 @@ def test_symmetric_product():
     A, b = system()
     U = upper(A)
     np.testing.assert_allclose(symmetric_product(U.indptr, U.indices, U.data, b), A @ b, rtol=1e-12)
+
+
+def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
+    """As at an unstable equilibrium, where conjugate gradients end early."""
+    problem = punch("tet10", 4, 1)
+    system = System(problem)
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    increment = Memory.rest(system, laws).increment(system, laws, 0.3, 0.3, 0.1, 100.0 * laws.modulus)
+    data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    factor = Factor(system)
+    factor.factorise(data)
+    data[system.indptr[:40]] *= -1.0
+    b = np.random.default_rng(0).standard_normal((system.unknowns, 2))
+    assert not factor.solve(data, b, None, 1e-6).convex
+    x = factor.solve_indefinite(data, b, 1e-6, np.zeros_like(b))
+    off = np.linalg.norm(b - factor.product(data, x), axis=0)
+    assert (off <= 1e-6 * np.linalg.norm(b, axis=0)).all()
+    assert factor.counts["inexact"] == 0

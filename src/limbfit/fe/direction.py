@@ -114,6 +114,8 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     if not found.converged:
         blocks = None if at.touch is None else at.touch.blocks
         found = factor.solve_anew(at.tangent, b, blocks, tolerance, found.x)
+    if not found.convex:
+        return factor.solve_indefinite(at.tangent, b, tolerance, x)
     return found.x
 
 

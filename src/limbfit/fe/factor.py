@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
@@ -22,6 +23,7 @@ from .system import System
 Array = NDArray[np.float64]
 # A factor in single precision that needs more iterations at its own matrix has too few digits.
 MOST_REFINEMENTS = 12
+MOST_MINRES, MOST_RESTARTS = 100, 8
 # Smallest shift of a tangent that is not positive definite, relative to each entry of its diagonal: tissues
 # differ in stiffness by up to a hundredfold, and a common shift would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 1e-2, 1e6
@@ -198,6 +200,26 @@ class Factor:
             self.factorise(data, blocks)
             found = self.solve(data, b, None, tolerance, x, limit=10 * self.limit)
         return found
+
+    def solve_indefinite(self, data: Array, b: Array, tolerance: float, x: Array) -> Array:
+        """Solve ``A x = b (n, r)`` where A has negative eigenvalues: MINRES, column by column.
+
+        Columns that do not get within ``tolerance`` are counted as ``inexact``.
+        """
+        shape = (len(b), len(b))
+        A = spla.LinearOperator(shape, matvec=lambda v: self.product(data, v.reshape(-1, 1)).ravel())
+        M = spla.LinearOperator(shape, matvec=lambda v: self.apply(v.ravel()))
+        out = x.copy()
+        for i in range(b.shape[1]):
+            target = tolerance * np.linalg.norm(b[:, i])
+            for _ in range(MOST_RESTARTS):  # MINRES judges the residual in the factor's norm
+                r = b[:, i] - A.matvec(out[:, i])
+                if np.linalg.norm(r) <= target:
+                    break
+                out[:, i] += spla.minres(A, r, rtol=tolerance, maxiter=MOST_MINRES, M=M)[0]
+            else:
+                self.counts["inexact"] += 1
+        return out
 
     def precondition(self, r: Array, springs: SpringChange | None) -> Array:
         """The factor's solution (n, k) for ``r (n, k)``, corrected for the changed springs."""

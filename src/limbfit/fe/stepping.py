@@ -383,10 +383,16 @@ def _result(
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
-        warnings=_folded(problem, kept),
+        warnings=(*_folded(problem, kept), *_inexact(run)),
         statistics=_statistics(run, seconds),
         system=run.system,
     )
+
+
+def _inexact(run: Simulation) -> tuple[str, ...]:
+    """A warning where sensitivities of an unstable equilibrium could not be solved for."""
+    count = run.factor.counts["inexact"]
+    return (f"{count} sensitivities at unstable equilibria are inexact",) if count else ()
 
 
 def _folded(problem: Problem, states: Sequence[State]) -> tuple[str, ...]:
