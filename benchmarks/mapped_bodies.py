@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from limbfit.bench.blocks import SIX_TETS
 from limbfit.mesh import TET10_EDGES, Mesh, boundary_faces, node_jacobians, to_tet10
 
 FINE_MM = 3.5  # longest interval under the indenter: what limbfit's mesher makes there by default
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from limbfit.bench.blocks import HEX, SIX_TETS, boxes, upright
 from limbfit.fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, Support
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
 
-SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 
 
@@ -27,26 +27,14 @@ def block(
 
     Node sets ``bottom``; face set ``top``.  ``jitter`` moves inner nodes at random (fixed seed), mm.
     """
-    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
-    points = grid.reshape(-1, 3).astype(float)
-    index = np.arange(len(points)).reshape(grid.shape[:3])
-    corner = [
-        index[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None]
-        for i in (0, 1)
-        for j in (0, 1)
-        for k in (0, 1)
-    ]
-    boxes = np.stack([c.ravel() for c in corner], axis=1)  # numbered 4 i + 2 j + k
+    points, corners = boxes(*(np.asarray(lines, dtype=float) for lines in (x, y, z)))
     low, high = points.min(axis=0), points.max(axis=0)
     inner = ((points > low) & (points < high)).all(axis=1)
     points[inner] += jitter * np.random.default_rng(1).uniform(-1, 1, (inner.sum(), 3))
     if cell_type == "hex8":
-        cells = boxes[:, [0, 4, 6, 2, 1, 5, 7, 3]]
+        cells = corners[:, HEX]
     else:
-        cells = boxes[:, SIX_TETS].reshape(-1, 4)
-        edges = points[cells[:, 1:]] - points[cells[:, :1]]
-        flip = np.linalg.det(edges) < 0
-        cells[flip] = cells[flip][:, [0, 2, 1, 3]]
+        cells = upright(points, corners[:, SIX_TETS].reshape(-1, 4))
     centres = points[cells].mean(axis=1)
     regions = (centres[:, 2] < high[2] - layer).astype(int)
     if cell_type == "tet10":

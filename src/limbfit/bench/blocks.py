@@ -38,8 +38,8 @@ def layered_block(cell_type: str, divisions: int) -> Mesh:
     side = np.linspace(-HALF, HALF, divisions + 1)
     n_below, n_above = _through(divisions)
     below, above = np.linspace(-DEPTH, -LAYER, n_below + 1), np.linspace(-LAYER, 0.0, n_above + 1)
-    points, boxes = _boxes(side, side, np.concatenate([below, above[1:]]))
-    cells = boxes[:, HEX] if cell_type == "hex8" else _upright(points, boxes[:, SIX_TETS].reshape(-1, 4))
+    points, corners = boxes(side, side, np.concatenate([below, above[1:]]))
+    cells = corners[:, HEX] if cell_type == "hex8" else upright(points, corners[:, SIX_TETS].reshape(-1, 4))
     skin = points[cells][:, :, 2].mean(axis=1) > -LAYER
     linear = "hex8" if cell_type == "hex8" else "tet4"
     mesh = Mesh(points, cells, linear, np.where(skin, 0, 1), ("skin", "muscle"))
@@ -75,7 +75,7 @@ def divisions_for(element: str, unknowns: int) -> int:
     return divisions
 
 
-def _boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
+def boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
     """Grid points (n, 3) and the corners (m, 8) of each box, numbered 4 i + 2 j + k."""
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
     index = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
@@ -84,7 +84,8 @@ def _boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
     return grid.reshape(-1, 3), np.stack(corners, axis=1)
 
 
-def _upright(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
+def upright(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The tetrahedra (m, 4) with those turned over that are inside out."""
     edges = points[tets[:, 1:]] - points[tets[:, :1]]
     flip = np.linalg.det(edges) < 0.0
     tets[flip] = tets[flip][:, [0, 2, 1, 3]]

@@ -42,11 +42,6 @@ class ContactSurface:
             return cls(nodes[:, None], np.ones((1, 1)), share[:, None], points)
         return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
 
-    @property
-    def nodal(self) -> bool:
-        """Whether every contact point is a node."""
-        return self.N.size == 1
-
     def gaps(self, indenter: Indenter, u: Array | None = None) -> Array:
         """Signed distances (f, q) at the quadrature points, mm."""
         return indenter.local_distance(self.local(indenter, u))[0]

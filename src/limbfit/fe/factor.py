@@ -62,6 +62,7 @@ class Factor:
             system.indptr, system.indices, self._choice, self._threads, single
         )
         self._single = single
+        self.counts["double_precision"] = int(not single)
         self.seconds["factor"] += time.perf_counter() - started
 
     @property
@@ -126,7 +127,6 @@ class Factor:
             if self.solve(data, b, None, 1e-8, limit=MOST_REFINEMENTS).converged:
                 return
         self._use(single=False)
-        self.counts["double_precision"] = 1
 
     def apply(self, b: Array) -> Array:
         """The factor's solution for ``b (n,)`` or ``(n, r)``."""
@@ -196,7 +196,6 @@ class Factor:
         found = self.solve(data, b, None, tolerance, x)
         if self._single and self._shift == 0.0 and found.convex and not found.converged:
             self._use(single=False)
-            self.counts["double_precision"] = 1
             self.factorise(data, blocks)
             found = self.solve(data, b, None, tolerance, x, limit=10 * self.limit)
         return found

@@ -191,7 +191,7 @@ class System:
         shape = self.surface.areas.shape
         points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
         found, force, deepest, area = self._contact(u, increment, tangent, pushed, data, advance, points)
-        norm, touch = float(np.linalg.norm(pushed)), None
+        norm = float(np.linalg.norm(pushed))
         anchors = increment.anchors or self.free_to_slip
         stick = anchors.blocks(self.surface, self.indenter, increment.penalty).reshape(-1, 3, 3)
         weights = increment.penalty * self.surface.areas.ravel()
