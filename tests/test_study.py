@@ -186,3 +186,33 @@ def test_missing_markers_and_labels(folder: Path) -> None:
     assert "image.markers: m does not exist" in refusal(write(folder, text))
     text = text.replace('markers = "m"', "") + '[segmentation]\nlabels = "l.seg.nrrd"\n'
     assert "segmentation.labels: l.seg.nrrd does not exist" in refusal(write(folder, text))
+
+
+LAYERS = (
+    '[geometry]\nlayers = [{ name = "skin", thickness_mm = 1.5 }, { name = "fat", thickness_mm = 4.0 }]\n'
+)
+
+
+def test_tissues_are_the_layers_and_the_core(folder: Path) -> None:
+    assert load_study(write(folder, GOOD)).tissues == ("skin", "muscle")
+    assert load_study(write(folder, GOOD + LAYERS)).tissues == ("skin", "fat", "muscle")
+    assert load_study(write(folder, GOOD + LAYERS + 'core = "soft"\n')).tissues == ("skin", "fat", "soft")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ("skin_layer_mm = 3.0", "either skin_layer_mm or layers"),
+        ('core = "fat"', "different names"),
+        ('core = "two words"', "geometry.core"),
+    ],
+)
+def test_layers_that_contradict_are_refused(folder: Path, change: str, what: str) -> None:
+    assert what in refusal(write(folder, GOOD + LAYERS + change + "\n"))
+
+
+def test_a_map_needs_an_image_and_one_thickness(folder: Path) -> None:
+    mapped = LAYERS.replace("thickness_mm = 4.0", 'thickness = "map"')
+    assert "needs the fat of an [image]" in refusal(write(folder, GOOD + mapped))
+    both = LAYERS.replace("thickness_mm = 4.0", 'thickness_mm = 4.0, thickness = "map"')
+    assert "either thickness_mm or thickness" in refusal(write(folder, GOOD + both))

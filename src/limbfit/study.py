@@ -19,6 +19,7 @@ Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
 TISSUES = ("skin", "muscle")
+TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
 class _Table(BaseModel):
@@ -73,16 +74,57 @@ class Plane(_Table):
     normal: Vector = (0.0, 0.0, 1.0)
 
 
+class Layer(_Table):
+    """A layer of tissue under the skin's surface, of one thickness or as thick as the segmented fat says.
+
+    With ``thickness = "map"`` its inner face is that of the image's fat, but at least ``min_thickness_mm``
+    below its outer face.
+    """
+
+    name: str = Field(pattern=TISSUE_NAME)
+    thickness_mm: Positive | None = None
+    thickness: Literal["map"] | None = None
+    min_thickness_mm: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _one_thickness(self) -> Layer:
+        if (self.thickness_mm is None) == (self.thickness is None):
+            raise ValueError('give either thickness_mm or thickness = "map"')
+        if self.thickness is None and "min_thickness_mm" in self.model_fields_set:
+            raise ValueError('min_thickness_mm belongs to thickness = "map"')
+        return self
+
+
 class GeometryTable(_Table):
-    """How surfaces become a model."""
+    """How surfaces become a model: one ``skin_layer_mm``, or ``layers`` (outermost first) over ``core``."""
 
     skin_layer_mm: Positive = 3.0
+    layers: tuple[Layer, ...] = ()
+    core: str = Field(default=TISSUES[-1], pattern=TISSUE_NAME)
     bone_policy: Literal["trim-bone"] = "trim-bone"
     bone_clearance_mm: Positive = 1.5
     proximal_cut: Plane | None = None
     amputation: Plane | None = None
     amputation_pad_mm: Positive = 15.0
     surface_edge_mm: Positive = 3.0
+
+    @model_validator(mode="after")
+    def _layers(self) -> GeometryTable:
+        if self.layers and "skin_layer_mm" in self.model_fields_set:
+            raise ValueError("give either skin_layer_mm or layers")
+        if not self.layers and "core" in self.model_fields_set:
+            raise ValueError("core belongs to layers; give layers too")
+        names = [layer.name for layer in self.layers] + [self.core]
+        if len(set(names)) < len(names):
+            raise ValueError(f"layers and core need different names, not {', '.join(names)}")
+        if sum(layer.thickness == "map" for layer in self.layers) > 1:
+            raise ValueError('only one layer can have thickness = "map": that of the fat')
+        return self
+
+    @property
+    def model_layers(self) -> tuple[Layer, ...]:
+        """The layers, outermost first; the one of ``skin_layer_mm`` where none are given."""
+        return self.layers or (Layer(name=TISSUES[0], thickness_mm=self.skin_layer_mm),)
 
 
 class MeshTable(_Table):
@@ -223,6 +265,11 @@ class Study(_Table):
     def fitted(self) -> tuple[Site, ...]:
         return tuple(site for site in self.sites if site.fitted)
 
+    @property
+    def tissues(self) -> tuple[str, ...]:
+        """Names of the materials and of the mesh's regions: the layers, outermost first, and the core."""
+        return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
+
     def path(self, relative: Path) -> Path:
         """A path of the study file as a path of this machine."""
         return self.folder / relative
@@ -253,6 +300,8 @@ class Study(_Table):
     def _one_door(self) -> Study:
         if (self.image is None) == (self.surfaces is None):
             raise ValueError("give either [image] or [surfaces]: geometry enters by one door")
+        if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
+            raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
         if self.surfaces is not None or (self.image is not None and self.image.markers is None):
             blind = [site.name for site in self.sites if site.position is None]
             if blind:
