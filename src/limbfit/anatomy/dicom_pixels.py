@@ -1,0 +1,66 @@
+"""The voxels of DICOM slices: single images by GDCM, frames of enhanced files by pydicom."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pydicom
+import SimpleITK as sitk  # noqa: N813
+from numpy.typing import NDArray
+from pydicom.uid import UID
+
+from ..errors import ImageError
+from .dicom_headers import SliceHeader, quiet
+
+
+def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+    """``[k, j, i]`` rescaled grey values of slices in their order.
+
+    Raises
+    ------
+    ImageError
+        For pixels that are cut short, cannot be decoded or do not match the headers.
+    """
+    with quiet():
+        try:
+            array = _of_files(slices) if slices[0].frame is None else _of_frames(slices)
+        except ImageError:
+            raise
+        except Exception:  # its text may hold file names and tag values
+            raise _undecoded(slices[0].syntax) from None
+    if array.shape != (len(slices), slices[0].rows, slices[0].columns):
+        raise ImageError("the pixels do not match the headers", remedy="export the series again")
+    return array
+
+
+def _of_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+    """GDCM applies each image's own slope and intercept."""
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(one.path) for one in slices])
+    reader.SetOutputPixelType(sitk.sitkFloat32)
+    return sitk.GetArrayFromImage(reader.Execute())
+
+
+def _of_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+    files = {one.path: pydicom.dcmread(one.path).pixel_array for one in slices}
+    planes = []
+    for one in slices:
+        stored = files[one.path]
+        plane = stored if stored.ndim == 2 else stored[one.frame]
+        slope, intercept = one.rescale
+        planes.append(plane.astype(np.float32) * np.float32(slope) + np.float32(intercept))
+    return np.stack(planes)
+
+
+def _undecoded(syntax: str) -> ImageError:
+    """What is wrong with pixels that no decoder took."""
+    uid = UID(syntax)
+    if uid.is_valid and not uid.is_private and uid.is_transfer_syntax and uid.is_compressed:
+        return ImageError(
+            f"the pixels, compressed as {uid.name}, cannot be decoded",
+            remedy="export the series uncompressed, and again if it was",
+        )
+    return ImageError(
+        "the pixels are cut short or cannot be decoded", remedy="export the series again, uncompressed"
+    )
