@@ -196,7 +196,7 @@ def test_bad_usage(limbfit, study):
         assert "Traceback" not in err
     code, _, err = limbfit("simulate", study, "--site", "1", "--parameters", "1,2")
     assert code == 2
-    assert "eight numbers" in err
+    assert "is not 8 numbers; give c_kPa,m,gamma,tau_s of skin, then of muscle, separated" in err
     code, _, err = limbfit("simulate", study, "--site", "99")
     assert code == 2
     assert "no site is named '99'" in err

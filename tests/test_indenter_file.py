@@ -80,7 +80,9 @@ def test_a_changed_file_makes_calibration_and_simulations_stale(study):
     model = SiteModel("1", Path("1.vtu"), "", (0, 0, 0), (0, 0, -1), (0, 1), (0, 1), indenter=table(study))
     other = SiteModel(**{**vars(model), "indenter_digest": "changed"})
     moved = SiteModel(**{**vars(model), "indenter": study.indenter})
-    digests = [job_digest(SimulationJob(m, (1.0,), (0.0, 1.0))) for m in (model, other, moved)]
+    digests = [
+        job_digest(SimulationJob(m, ("skin", "muscle"), (1.0,), (0.0, 1.0))) for m in (model, other, moved)
+    ]
     assert digests[0] != digests[1]
     assert digests[0] == digests[2]
 

@@ -7,6 +7,7 @@ and numbers. ``simulate`` is the one function that every stage, executor and pha
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,27 +22,29 @@ from .errors import ProblemError, SurfaceError
 from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, StepControl, solve
 from .fields import Animation, write_fields
 from .mesh import Mesh, read_vtu
-from .study import PARAMETERS, TISSUES, IndenterTable, SolverTable, Vector
+from .study import PARAMETERS, IndenterTable, SolverTable, Vector
 
 Parameters = dict[str, dict[str, float]]
 Array = NDArray[np.float64]
 
 KPA = 1e-3  # MPa
 _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
-# Flat order of the eight parameters, and the scale from the solver's units to the user's.
-FLAT = tuple((tissue, name) for tissue in TISSUES for name in PARAMETERS)
-_SCALE = np.array([KPA if name == "c_kPa" else 1.0 for _, name in FLAT])
 
 
-def to_vector(parameters: Parameters) -> Array:
-    """The eight numbers in flat order (c in kPa)."""
-    return np.array([parameters[tissue][name] for tissue, name in FLAT])
+def flat_names(tissues: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """(tissue, parameter) in the order of every flat vector: the first tissue's four, then the next one's."""
+    return tuple((tissue, name) for tissue in tissues for name in PARAMETERS)
 
 
-def to_parameters(vector: Array) -> Parameters:
-    """The flat vector as ``{tissue: {name: value}}``."""
-    result: Parameters = {tissue: {} for tissue in TISSUES}
-    for (tissue, name), value in zip(FLAT, vector, strict=True):
+def to_vector(parameters: Parameters, tissues: Sequence[str]) -> Array:
+    """The 4 numbers of each tissue in flat order (c in kPa)."""
+    return np.array([parameters[tissue][name] for tissue, name in flat_names(tissues)])
+
+
+def to_parameters(vector: Array, tissues: Sequence[str]) -> Parameters:
+    """The flat vector as ``{tissue: {name: value}}``, tissues in their order."""
+    result: Parameters = {tissue: {} for tissue in tissues}
+    for (tissue, name), value in zip(flat_names(tissues), vector, strict=True):
         result[tissue][name] = float(value)
     return result
 
@@ -70,9 +73,10 @@ class SiteModel:
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """A simulation to be done: parameters (flat, kPa), the times at which the force is wanted."""
+    """A simulation to be done: parameters (flat over ``tissues``, kPa), the times of the wanted force."""
 
     model: SiteModel
+    tissues: tuple[str, ...]
     parameters: tuple[float, ...]
     times_s: tuple[float, ...]
     sensitivities: bool = True
@@ -80,7 +84,10 @@ class SimulationJob:
 
 @dataclass(frozen=True)
 class Simulation:
-    """What came back: force (n,) N and its derivatives (n, 8) per kPa, -, -, s at the job's times."""
+    """What came back: force (n,) N and its derivatives (n, 4 x tissues) at the job's times.
+
+    Derivatives are in flat order, per kPa, -, -, s.
+    """
 
     site: str
     force_N: Array
@@ -92,7 +99,7 @@ class Simulation:
 
 
 def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
-    """The two tissues for the solver, in MPa."""
+    """The tissues for the solver, in MPa."""
     return {
         tissue: OgdenQLV(
             c=values["c_kPa"] * KPA,
@@ -200,7 +207,7 @@ def simulate(job: SimulationJob) -> Simulation:
     """
     model = job.model
     result = solve(
-        _problem(model, to_parameters(np.array(job.parameters))),
+        _problem(model, to_parameters(np.array(job.parameters), job.tissues)),
         steps=_steps(model),
         sensitivities=job.sensitivities,
         warm_start=_last.get(model),
@@ -212,7 +219,7 @@ def simulate(job: SimulationJob) -> Simulation:
     return Simulation(
         site=model.name,
         force_N=result.force_at(times),
-        jacobian=_in_user_units(result, times) if job.sensitivities else None,
+        jacobian=_in_user_units(result, job.tissues, times) if job.sensitivities else None,
         completed=result.completed,
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
@@ -242,8 +249,16 @@ def simulate_fields(
     return result
 
 
-def _in_user_units(result: Result, times: Array) -> Array:
-    """Sensitivities in flat order, per kPa where the parameter is a modulus."""
+def _in_user_units(result: Result, tissues: Sequence[str], times: Array) -> Array:
+    """Sensitivities in flat order, per kPa where the parameter is a modulus.
+
+    A tissue that does not reach the site is no region of its mesh: the force does not depend on it.
+    """
     order = {name: i for i, name in enumerate(result.parameter_names)}
-    columns = [order[(tissue, _FE_NAME[name])] for tissue, name in FLAT]
-    return result.sensitivity_at(times)[:, columns] * _SCALE
+    found = result.sensitivity_at(times)
+    columns = np.zeros((len(times), len(PARAMETERS) * len(tissues)))
+    for i, (tissue, name) in enumerate(flat_names(tissues)):
+        j = order.get((tissue, _FE_NAME[name]))
+        if j is not None:
+            columns[:, i] = found[:, j] * (KPA if name == "c_kPa" else 1.0)
+    return columns

@@ -18,7 +18,7 @@ from .errors import StudyError
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
-TISSUES = ("skin", "muscle")
+ParameterName = Literal["c_kPa", "m", "gamma", "tau_s"]
 TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
@@ -100,7 +100,7 @@ class GeometryTable(_Table):
 
     skin_layer_mm: Positive = 3.0
     layers: tuple[Layer, ...] = ()
-    core: str = Field(default=TISSUES[-1], pattern=TISSUE_NAME)
+    core: str = Field(default="muscle", pattern=TISSUE_NAME)
     bone_policy: Literal["trim-bone"] = "trim-bone"
     bone_clearance_mm: Positive = 1.5
     proximal_cut: Plane | None = None
@@ -124,7 +124,7 @@ class GeometryTable(_Table):
     @property
     def model_layers(self) -> tuple[Layer, ...]:
         """The layers, outermost first; the one of ``skin_layer_mm`` where none are given."""
-        return self.layers or (Layer(name=TISSUES[0], thickness_mm=self.skin_layer_mm),)
+        return self.layers or (Layer(name="skin", thickness_mm=self.skin_layer_mm),)
 
 
 class MeshTable(_Table):
@@ -196,21 +196,41 @@ class Site(_Table):
         return self
 
 
+class TissueRange(_Table):
+    """Where one tissue's start or bounds differ from those of all; what is not named here stays."""
+
+    start: dict[ParameterName, Positive] = {}
+    lower: dict[ParameterName, Positive] = {}
+    upper: dict[ParameterName, Positive] = {}
+
+
 class MaterialTable(_Table):
-    """Start and bounds of the identification; the defaults are the paper's (section 2.3, table 1)."""
+    """Start and bounds of the identification; the defaults are the paper's (section 2.3, table 1).
+
+    ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
+    """
 
     kappa_ratio: Positive = 100.0
     start: TissueParameters = TissueParameters(c_kPa=4.7, m=3.0, gamma=1.2, tau_s=2.0)
     lower: TissueParameters = TissueParameters(c_kPa=0.047, m=2.0, gamma=0.01, tau_s=0.01)
     upper: TissueParameters = TissueParameters(c_kPa=47.0, m=20.0, gamma=10.0, tau_s=10.0)
+    tissues: dict[str, TissueRange] = {}
+
+    def of(self, tissue: str, which: Literal["start", "lower", "upper"]) -> dict[str, float]:
+        """Start, lower or upper bound of the four parameters of a tissue."""
+        general = getattr(self, which).model_dump()
+        return general | getattr(self.tissues.get(tissue, TissueRange()), which)
 
     @model_validator(mode="after")
     def _ordered(self) -> MaterialTable:
-        for name in PARAMETERS:
-            if not getattr(self.lower, name) <= getattr(self.start, name) <= getattr(self.upper, name):
-                raise ValueError(f"start.{name} lies outside its bounds")
-            if not getattr(self.lower, name) < getattr(self.upper, name):
-                raise ValueError(f"lower.{name} is not below upper.{name}")
+        for tissue in ("", *self.tissues):
+            lower, start, upper = (self.of(tissue, which) for which in ("lower", "start", "upper"))
+            place = f"tissues.{tissue}." if tissue else ""
+            for name in PARAMETERS:
+                if not lower[name] <= start[name] <= upper[name]:
+                    raise ValueError(f"{place}start.{name} lies outside its bounds")
+                if not lower[name] < upper[name]:
+                    raise ValueError(f"{place}lower.{name} is not below upper.{name}")
         return self
 
 
@@ -295,6 +315,25 @@ class Study(_Table):
         if doubled:
             raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
         return sites
+
+    @model_validator(mode="after")
+    def _materials_of_tissues(self) -> Study:
+        material, tissues = self.material, self.tissues
+        unknown = [tissue for tissue in material.tissues if tissue not in tissues]
+        if unknown:
+            known = ", ".join(tissues)
+            raise ValueError(
+                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
+            )
+        for name in PARAMETERS:
+            lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
+            upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
+            if not lower < upper:
+                raise ValueError(
+                    f"material: the tissues' bounds of {name} have no range in common, "
+                    "and the stage of one material needs one; widen them"
+                )
+        return self
 
     @model_validator(mode="after")
     def _one_door(self) -> Study:

@@ -11,13 +11,13 @@ from scipy.stats import t as student
 
 from limbfit.identify import (
     DETERMINED,
-    SEPARATE,
     UNDETERMINED,
     Measured,
     calibrate,
     error_percent,
     estimate_uncertainty,
     prediction_sd,
+    separate,
     summarise,
 )
 
@@ -155,7 +155,7 @@ def test_prediction_intervals_match_the_spread_of_predictions():
             lambda p: [s.respond(p) for s in rest],  # noqa: B023
             data,
             type(PAPER)(PAPER.names, TRUTH, PAPER.lower, PAPER.upper),
-            stages=(SEPARATE,),
+            stages=(separate(PAPER.names),),
         )
         forces.append(held_out.force(found.parameters))
         if seed == 0:

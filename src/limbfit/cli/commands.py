@@ -13,7 +13,7 @@ from rich.table import Table
 import limbfit
 
 from ..errors import InputError
-from ..study import PARAMETERS, TISSUES
+from ..study import PARAMETERS
 from .console import STDERR, STDOUT, AsJson, listening, print_json
 
 StudyPath = Annotated[
@@ -112,7 +112,10 @@ def simulate(
     site: Annotated[str, typer.Option(help="name of the site", show_default=False)],
     parameters: Annotated[
         str | None,
-        typer.Option(help="c_kPa,m,gamma,tau_s of skin, then of muscle; default: identified, else the start"),
+        typer.Option(
+            help="c_kPa,m,gamma,tau_s of each tissue, outermost first (skin, then muscle, unless the study "
+            "has layers); default: identified, or the study's start where nothing is"
+        ),
     ] = None,
     animation: Annotated[
         bool, typer.Option("--animation", help="also store the fields of every step, for ParaView")
@@ -120,11 +123,12 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
+    checked = limbfit.load_study(study)
     with listening() as listener:
         found = limbfit.simulate_site(
-            limbfit.load_study(study),
+            checked,
             site,
-            parameters=parse_parameters(parameters),
+            parameters=parse_parameters(parameters, checked.tissues),
             animation=animation,
             listener=listener,
         )
@@ -135,6 +139,7 @@ def simulate(
             f"site {site}: peak force {found['peak_force_N']:.3f} N at {found['depth_mm']:.2f} mm, "
             f"penetration {found['penetration_mm']:.3f} mm, "
             f"{found['element']}, {found['unknowns']} unknowns\n"
+            f"parameters: {found['parameters_from']}\n"
             f"curve: {found['curve']}\nfields: {found['fields']}"
         )
     if not found["completed"]:
@@ -149,21 +154,23 @@ def report(study: StudyPath, as_json: AsJson = False) -> None:
     show_summary(summary, as_json)
 
 
-def parse_parameters(text: str | None) -> dict[str, dict[str, float]] | None:
+def parse_parameters(text: str | None, tissues: tuple[str, ...]) -> dict[str, dict[str, float]] | None:
+    """``--parameters``: four numbers of each tissue, in the order of the study's tissues."""
     if text is None:
         return None
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != len(TISSUES) * len(PARAMETERS) or not all(0 <= v < float("inf") for v in values):
+    wanted = len(tissues) * len(PARAMETERS)
+    if len(values) != wanted or not all(0 <= v < float("inf") for v in values):
         raise InputError(
-            f"{text!r} is not eight numbers",
+            f"{text!r} is not {wanted} numbers",
             place="--parameters",
-            remedy="give c_kPa,m,gamma,tau_s of skin, then of muscle, separated by commas",
+            remedy=f"give c_kPa,m,gamma,tau_s of {', then of '.join(tissues)}, separated by commas",
         )
     numbers = iter(values)
-    return {tissue: {name: next(numbers) for name in PARAMETERS} for tissue in TISSUES}
+    return {tissue: {name: next(numbers) for name in PARAMETERS} for tissue in tissues}
 
 
 def show_summary(summary: dict[str, Any], as_json: bool) -> None:
@@ -184,9 +191,8 @@ def show_parameters(summary: dict[str, Any]) -> None:
     if "truth" in summary:
         rows.append(("truth", summary["truth"]))
     for kind, values in rows:
-        for tissue in TISSUES:
-            numbers = [f"{values[tissue][name]:.3g}" for name in PARAMETERS]
-            table.add_row(f"{tissue}, {kind}", *numbers)
+        for tissue, known in values.items():
+            table.add_row(f"{tissue}, {kind}", *(f"{known[name]:.3g}" for name in PARAMETERS))
     STDOUT.print(table)
 
 

@@ -2,7 +2,7 @@
 
 from .calibration import Calibration, CalibrationSettings, Iterate, StageResult, State, calibrate
 from .objective import Measured, SiteResponse
-from .parameters import FIXED, SEPARATE, SHARED, TWO_STAGES, Space, Unknowns, search_space
+from .parameters import FIXED, Space, Unknowns, search_space, separate, shared, two_stages
 from .prediction import Summary, error_percent, prediction_sd, summarise
 from .uncertainty import (
     DETERMINED,
@@ -17,9 +17,6 @@ from .uncertainty import (
 __all__ = [
     "DETERMINED",
     "FIXED",
-    "SEPARATE",
-    "SHARED",
-    "TWO_STAGES",
     "UNDETERMINED",
     "WEAK",
     "Calibration",
@@ -40,5 +37,8 @@ __all__ = [
     "estimate_uncertainty",
     "prediction_sd",
     "search_space",
+    "separate",
+    "shared",
     "summarise",
+    "two_stages",
 ]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import CalibrationError
 from .objective import Measured, Objective, Simulate, SiteResponse, check_responses, residuals
-from .parameters import TWO_STAGES, Grouping, Space, Unknowns, search_space
+from .parameters import Grouping, Space, Unknowns, search_space, two_stages
 from .prediction import error_percent
 from .trust_region import FIRST_RADIUS, Point, Step, minimise
 
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 # Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
 _RESTARTS = (0.0, 0.0, 0.1, 0.25, 0.5)
+_RATIOS = (1.0, 0.5, 0.0)  # of the tissues' own starts, put on the start of the next stage until it completes
 _PAPER_CHANGE = 0.01
 _PATIENCE = 4  # steps
 _TRIES = 3  # of a simulation that completed before
@@ -163,7 +164,7 @@ def calibrate(
     unknowns: Unknowns,
     settings: CalibrationSettings | None = None,
     *,
-    stages: Sequence[Grouping] = TWO_STAGES,
+    stages: Sequence[Grouping] = (),
     on_iterate: Callable[[State], None] | None = None,
     state: State | None = None,
 ) -> Calibration:
@@ -176,7 +177,9 @@ def calibrate(
         is not completed, or not finite, makes the trial step fail: a shorter one is tried.
     measured : the records, at the times at which ``simulate`` gives the force.
     unknowns : names, start and bounds of the full parameters.
-    stages : groupings (see ``search_space``), each started from the end of the one before.
+    stages : groupings (see ``search_space``), each started from the end of the one before; by default
+    ``two_stages``. Where tissues have starts of their own, which a stage could not tell apart, the next one
+    puts the same ratios on its start.
     on_iterate : called after every accepted iterate with the state to be kept.
     state : go on from here; one evaluation at its parameters is repeated and not counted.
 
@@ -185,7 +188,8 @@ def calibrate(
     CalibrationError
         Where no first simulation completes.
     """
-    run = _Run(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), tuple(stages))
+    groupings = tuple(stages) or two_stages(unknowns.names)
+    run = _Run(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)
     for current in run.states(state):
         if on_iterate:
             on_iterate(current)
@@ -315,12 +319,21 @@ class _Run:
         )
 
     def _next_stage(self, state: State, logarithms: Array) -> tuple[State, Point]:
-        """The same parameters in the next space; nothing is simulated unless its bounds forbid them."""
+        """The same parameters in the next space, in the ratios of the tissues' own starts.
+
+        Where all tissues start alike, nothing is simulated unless the bounds forbid the parameters.
+        """
         stage = state.stage + 1
-        space = self.space(stage)
-        z = space.reduce(logarithms)
-        point = self.evaluate(space, z)
-        if point is None:
+        before, space = self.space(state.stage), self.space(stage)
+        start = np.log(self.unknowns.start)
+        own = start - before.logarithms(before.reduce(start))
+        own[np.abs(own) < 1e-12] = 0.0  # rounding of the mean must not cost a simulation
+        for share in _RATIOS if own.any() else (0.0,):
+            z = space.reduce(logarithms + share * own)
+            point = self.evaluate(space, z)
+            if point is not None:
+                break
+        else:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
         history = (*state.history, self.iterate(stage, point))
         return State(stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages), point

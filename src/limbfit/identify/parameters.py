@@ -18,10 +18,27 @@ Array = NDArray[np.float64]
 Grouping = tuple[int, ...]
 
 FIXED = -1
-# One material for both tissues, then each its own: the two stages of the paper (section 2.3, figure 5).
-SHARED: Grouping = (0, 1, 2, 3, 0, 1, 2, 3)
-SEPARATE: Grouping = (0, 1, 2, 3, 4, 5, 6, 7)
-TWO_STAGES: tuple[Grouping, ...] = (SHARED, SEPARATE)
+
+
+def shared(names: Sequence[str]) -> Grouping:
+    """One material: parameters ``<tissue>.<name>`` of one name move together, whatever their tissue."""
+    kinds = [name.rpartition(".")[2] for name in names]
+    first = list(dict.fromkeys(kinds))
+    return tuple(first.index(kind) for kind in kinds)
+
+
+def separate(names: Sequence[str]) -> Grouping:
+    """Every tissue its own material."""
+    return tuple(range(len(names)))
+
+
+def two_stages(names: Sequence[str]) -> tuple[Grouping, ...]:
+    """One material for all tissues, then each its own (paper, section 2.3, figure 5).
+
+    A single tissue has one stage: the second would repeat it.
+    """
+    first, second = shared(names), separate(names)
+    return (first,) if first == second else (first, second)
 
 
 @dataclass(frozen=True)

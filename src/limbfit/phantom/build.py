@@ -23,7 +23,7 @@ import numpy as np
 
 from ..anatomy.surfaces import save_anatomy
 from ..errors import InputError
-from ..indentation import Parameters, to_vector
+from ..indentation import Parameters
 from .forces import MESHES, ForceJob, TrueForce, site_force
 from .geometry import Limb, make_limb
 from .mri import DETAIL_GRIDS, make_grid, write_series
@@ -151,10 +151,15 @@ def _write_traces(
     traces.mkdir()
     save_anatomy(truth, true_anatomy(limb))
     parameters = true_parameters(seed)
-    flat = tuple(to_vector(parameters).tolist())
     jobs = [
         ForceJob(
-            site.name, truth, _triple(site.position), _triple(site.axis), _ramp(site), flat, MESHES[detail]
+            site.name,
+            truth,
+            _triple(site.position),
+            _triple(site.axis),
+            _ramp(site),
+            parameters,
+            MESHES[detail],
         )
         for site in indented
     ]

@@ -18,7 +18,7 @@ from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
 from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
-from ..indentation import SiteModel, build_problem, to_parameters
+from ..indentation import Parameters, SiteModel, build_problem
 from .record import Ramp
 
 ELEMENT = "tet10p0"
@@ -31,14 +31,14 @@ MESHES = {
 
 @dataclass(frozen=True)
 class ForceJob:
-    """One indentation to be simulated: where the anatomy is stored, place, ramp, flat parameters (kPa)."""
+    """One indentation to be simulated: where the anatomy is stored, place, ramp, the tissues' parameters."""
 
     site: str
     anatomy: Path
     position: tuple[float, float, float]
     axis: tuple[float, float, float]
     ramp: Ramp
-    parameters: tuple[float, ...]
+    parameters: Parameters
     mesh: MeshSettings
 
 
@@ -79,7 +79,7 @@ def site_force(job: ForceJob) -> TrueForce:
         knots_s=knots_s,
         knots_mm=knots_mm,
     )
-    problem = build_problem(model, mesh, to_parameters(np.array(job.parameters)))
+    problem = build_problem(model, mesh, job.parameters)
     result = solve(replace(problem, element=ELEMENT), steps=STEPS)
     if not result.completed:
         raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")

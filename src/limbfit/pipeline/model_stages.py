@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +18,29 @@ from ..identify.parameters import Unknowns
 from ..identify.prediction import error_percent, prediction_sd, summarise
 from ..identify.uncertainty import Uncertainty, estimate_uncertainty
 from ..indentation import (
-    FLAT,
     Parameters,
     Simulation,
     SimulationJob,
     SiteModel,
+    flat_names,
     simulate_fields,
     to_parameters,
     to_vector,
 )
-from ..study import PARAMETERS, TISSUES, Site, Study, TissueParameters
+from ..study import Site, Study
 from ..traces import Regularised, Trace, find_touch_down, read_trace, regularise
 from .context import Context
 from .simulations import CURVE_POINTS, SimulationCache, recorded_model
 from .store import read_json, write_json
 
 Array = NDArray[np.float64]
-NAMES = tuple(f"{tissue}.{name}" for tissue, name in FLAT)
-STAGE_TITLES = ("one material", "two materials")
+COUNTS = ("no", "one", "two", "three", "four", "five", "six")
+
+
+def stage_titles(tissues: Sequence[str]) -> tuple[str, ...]:
+    """Names of the stages of the identification; a single tissue has one."""
+    n = len(tissues)
+    return ("one material", f"{COUNTS[n] if n < len(COUNTS) else n} materials")[: min(n, 2)]
 
 
 def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[str, Any]]:
@@ -104,32 +110,37 @@ class SiteRecord:
     """A site with its record: what a simulation needs, and the forces it is compared with."""
 
     site: Site
+    tissues: tuple[str, ...]
     model: SiteModel
     times_s: Array
     displacement_mm: Array
     force_N: Array
 
     def job(self, parameters: Array, sensitivities: bool = True) -> SimulationJob:
-        return SimulationJob(
-            self.model, tuple(map(float, parameters)), tuple(map(float, self.times_s)), sensitivities
-        )
+        values, times = tuple(map(float, parameters)), tuple(map(float, self.times_s))
+        return SimulationJob(self.model, self.tissues, values, times, sensitivities)
 
 
 def site_record(context: Context, site: Site) -> SiteRecord:
     curves = read_curves(context.store["traces"] / f"{site.name}.csv")
     return SiteRecord(
-        site, recorded_model(context, site), curves["time_s"], curves["displacement_mm"], curves["force_N"]
+        site=site,
+        tissues=context.study.tissues,
+        model=recorded_model(context, site),
+        times_s=curves["time_s"],
+        displacement_mm=curves["displacement_mm"],
+        force_N=curves["force_N"],
     )
 
 
 def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
-    """Two stages of identification on the fitted sites; every finished simulation and iterate is kept."""
+    """One material, then each tissue its own, on the fitted sites; simulations and iterates are kept."""
     study = context.study
     if not study.fitted:
         raise StudyError("no site is fitted", file=study.file, place="sites", remedy="set fitted = true")
     records = [site_record(context, site) for site in study.fitted]
     measured = [Measured(record.site.name, record.force_N) for record in records]
-    cache = SimulationCache(folder / "runs")
+    cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
     state_file = folder / "state.json"
     evaluations = 0
 
@@ -146,7 +157,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     def keep(state: State) -> None:
         write_json(state_file, state.to_dict())
-        context.tell("calibrate", 0, 0, _describe(state))
+        context.tell("calibrate", 0, 0, _describe(state, study.tissues))
 
     found = calibrate(
         respond,
@@ -171,77 +182,78 @@ def _response(simulation: Simulation) -> SiteResponse:
 
 
 def unknowns(study: Study) -> Unknowns:
-    """The eight parameters with the study's start and bounds, the same for both tissues."""
+    """The four parameters of each tissue with the study's start and bounds."""
+    material, tissues = study.material, study.tissues
 
-    def eight(table: TissueParameters) -> Array:
-        return np.array([getattr(table, name) for _ in TISSUES for name in PARAMETERS])
+    def flat(which: Literal["start", "lower", "upper"]) -> Array:
+        return to_vector({tissue: material.of(tissue, which) for tissue in tissues}, tissues)
 
-    material = study.material
-    return Unknowns(NAMES, eight(material.start), eight(material.lower), eight(material.upper))
+    names = tuple(f"{tissue}.{name}" for tissue, name in flat_names(tissues))
+    return Unknowns(names, flat("start"), flat("lower"), flat("upper"))
 
 
-def _describe(state: State) -> str:
+def _describe(state: State, tissues: Sequence[str]) -> str:
     last = state.history[-1]
-    values = to_parameters(np.array(last.parameters))
-    tissues = " | ".join(
+    values = to_parameters(np.array(last.parameters), tissues)
+    words = " | ".join(
         f"{tissue} c {v['c_kPa']:.3g} kPa, m {v['m']:.3g}, gamma {v['gamma']:.3g}, tau {v['tau_s']:.3g} s"
         for tissue, v in values.items()
     )
-    return f"{STAGE_TITLES[last.stage]}: error {np.mean(last.errors_percent):.2f} % | {tissues}"
+    return f"{stage_titles(tissues)[last.stage]}: error {np.mean(last.errors_percent):.2f} % | {words}"
 
 
 def _calibration_record(
     context: Context, found: Calibration, known: Uncertainty, folder: Path
 ) -> dict[str, Any]:
     """What ``calibration.json`` holds."""
-    study = context.study
-    stages = []
-    start = to_vector({tissue: study.material.start.model_dump() for tissue in TISSUES})
-    for number, stage in enumerate(found.stages):
-        iterates = [iterate for iterate in found.history if iterate.stage == number]
-        stages.append(
-            {
-                "name": STAGE_TITLES[number],
-                "start": to_parameters(start),
-                "parameters": to_parameters(np.array(stage.parameters)),
-                "cost": stage.cost,
-                "evaluations": stage.evaluations,
-                "converged": stage.converged,
-                "reason": stage.reason,
-                "iterations": [
-                    {
-                        "iteration": i,
-                        "parameters": to_parameters(np.array(iterate.parameters)),
-                        "cost": iterate.cost,
-                        "error_percent": float(np.mean(iterate.errors_percent)),
-                        "error_percent_by_site": dict(zip(found.sites, iterate.errors_percent, strict=True)),
-                    }
-                    for i, iterate in enumerate(iterates)
-                ],
-            }
-        )
-        start = np.array(stage.parameters)
+    study, tissues = context.study, context.study.tissues
+    bounds = unknowns(study)
     cache = SimulationCache(folder / "runs")
     example = cache.example()
-    material = study.material
     return {
-        "stages": stages,
+        "stages": [_stage_record(found, i, bounds.start, tissues) for i in range(len(found.stages))],
         "bounds": {
-            "lower": {tissue: material.lower.model_dump() for tissue in TISSUES},
-            "upper": {tissue: material.upper.model_dump() for tissue in TISSUES},
+            "lower": to_parameters(bounds.lower, tissues),
+            "upper": to_parameters(bounds.upper, tissues),
         },
         "objective": study.calibration.objective,
-        "uncertainty": _uncertainty_record(known),
+        "uncertainty": _uncertainty_record(known, tissues),
         "forward_runs": len(cache),
         "linear_solver": example.facts["linear_solver"] if example else None,
         "element": example.facts["element"] if example else None,
     }
 
 
-def _uncertainty_record(known: Uncertainty) -> dict[str, Any]:
+def _stage_record(found: Calibration, number: int, start: Array, tissues: Sequence[str]) -> dict[str, Any]:
+    """One stage: from ``start`` (the first) or the end of the stage before to its own end."""
+    stage = found.stages[number]
+    before = np.array(found.stages[number - 1].parameters) if number else start
+    iterates = [iterate for iterate in found.history if iterate.stage == number]
+    return {
+        "name": stage_titles(tissues)[number],
+        "start": to_parameters(before, tissues),
+        "parameters": to_parameters(np.array(stage.parameters), tissues),
+        "cost": stage.cost,
+        "evaluations": stage.evaluations,
+        "converged": stage.converged,
+        "reason": stage.reason,
+        "iterations": [
+            {
+                "iteration": i,
+                "parameters": to_parameters(np.array(iterate.parameters), tissues),
+                "cost": iterate.cost,
+                "error_percent": float(np.mean(iterate.errors_percent)),
+                "error_percent_by_site": dict(zip(found.sites, iterate.errors_percent, strict=True)),
+            }
+            for i, iterate in enumerate(iterates)
+        ],
+    }
+
+
+def _uncertainty_record(known: Uncertainty, tissues: Sequence[str]) -> dict[str, Any]:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
-    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in TISSUES}
-    for (tissue, name), interval in zip(FLAT, known.intervals_95.tolist(), strict=True):
+    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in tissues}
+    for (tissue, name), interval in zip(flat_names(tissues), known.intervals_95.tolist(), strict=True):
         intervals[tissue][name] = interval
     return {
         "intervals_95": intervals,
@@ -255,26 +267,30 @@ def _uncertainty_record(known: Uncertainty) -> dict[str, Any]:
 
 
 def run_predict(context: Context, folder: Path) -> dict[str, Any]:
-    """Force at every recorded site with both models, intervals, and the fields at the peak."""
+    """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
     study = context.study
     calibration = context.stored("calibrate", "calibration.json")
-    one, two = (to_vector(stage["parameters"]) for stage in calibration["stages"])
+    found = [to_vector(stage["parameters"], study.tissues) for stage in calibration["stages"]]
+    one, best = found[0], found[-1]
     covariance = np.array(calibration["uncertainty"]["covariance_log"])
     records = [site_record(context, site) for site in study.sites if site.trace is not None]
-    cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    jobs = [record.job(two) for record in records]
+    cache = SimulationCache(
+        folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
+    )
+    jobs = [record.job(best) for record in records]
     # At the fitted sites the calibration has simulated the one-material optimum already, with sensitivities.
-    jobs += [record.job(one, sensitivities=record.site.fitted) for record in records]
+    if len(found) > 1:
+        jobs += [record.job(one, sensitivities=record.site.fitted) for record in records]
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
         context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
-    both = list(zip(simulations[: len(records)], simulations[len(records) :], strict=True))
-    _write_fields(context, folder, records, to_parameters(two), len(jobs))
+    ours, simple = simulations[: len(records)], simulations[len(records) :]
+    _write_fields(context, folder, records, best, len(jobs))
     rows = []
-    for record, (ours, simple) in zip(records, both, strict=True):
-        _write_prediction(folder, record, ours, simple, two, covariance)
-        rows.append(_row(record, ours, simple))
+    for record, with_all, with_one in zip_longest(records, ours, simple):
+        _write_prediction(folder, record, with_all, with_one, best, covariance)
+        rows.append(_row(record, with_all, with_one))
     write_json(folder / "predict.json", {"sites": rows, **_means(rows)})
     return {}
 
@@ -284,20 +300,20 @@ class FieldJob:
     """Fields at the deepest point of a site, to be computed and stored by a worker."""
 
     model: SiteModel
-    parameters: tuple[float, ...]
+    parameters: Parameters
     file: Path
 
 
 def store_fields(job: FieldJob) -> str:
-    simulate_fields(job.model, to_parameters(np.array(job.parameters)), job.file)
+    simulate_fields(job.model, job.parameters, job.file)
     return job.model.name
 
 
 def _write_fields(
-    context: Context, folder: Path, records: Sequence[SiteRecord], parameters: Parameters, before: int
+    context: Context, folder: Path, records: Sequence[SiteRecord], vector: Array, before: int
 ) -> None:
-    vector = tuple(to_vector(parameters))
-    jobs = [FieldJob(record.model, vector, folder / f"{record.site.name}.vtu") for record in records]
+    parameters = to_parameters(vector, context.study.tissues)
+    jobs = [FieldJob(record.model, parameters, folder / f"{record.site.name}.vtu") for record in records]
     missing = [job for job in jobs if not job.file.is_file()]
     names = [job.model.name for job in missing]
     for i, name in enumerate(context.executor.map(store_fields, missing, keys=names)):
@@ -306,25 +322,27 @@ def _write_fields(
 
 
 def _write_prediction(
-    folder: Path, record: SiteRecord, ours: Simulation, simple: Simulation, two: Array, covariance: Array
+    folder: Path, record: SiteRecord, ours: Simulation, one: Simulation | None, best: Array, covariance: Array
 ) -> None:
     assert ours.jacobian is not None
-    sd = prediction_sd(ours.jacobian, two, covariance)
+    sd = prediction_sd(ours.jacobian, best, covariance)
     write_curves(
         folder / f"{record.site.name}.csv",
         time_s=record.times_s,
         displacement_mm=record.displacement_mm,
         force_measured_N=record.force_N,
         force_simulated_N=ours.force_N,
-        force_one_material_N=simple.force_N,
+        **({} if one is None else {"force_one_material_N": one.force_N}),
         force_low_N=np.maximum(ours.force_N - 1.96 * sd, 0.0),
         force_high_N=ours.force_N + 1.96 * sd,
     )
 
 
-def _row(record: SiteRecord, ours: Simulation, simple: Simulation) -> dict[str, Any]:
-    def error(simulation: Simulation) -> float | None:
-        return error_percent(simulation.force_N, record.force_N) if simulation.completed else None
+def _row(record: SiteRecord, ours: Simulation, one: Simulation | None) -> dict[str, Any]:
+    def error(simulation: Simulation | None) -> float | None:
+        if simulation is None or not simulation.completed:
+            return None
+        return error_percent(simulation.force_N, record.force_N)
 
     return {
         "site": record.site.name,
@@ -332,7 +350,7 @@ def _row(record: SiteRecord, ours: Simulation, simple: Simulation) -> dict[str, 
         "fitted": record.site.fitted,
         "peak_force_N": float(record.force_N.max()),
         "error_percent": error(ours),
-        "error_one_material_percent": error(simple),
+        "error_one_material_percent": error(one),
         "penetration_mm": ours.penetration_mm,
         "completed": ours.completed,
         "reason": ours.reason,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,8 @@ class Stage:
 
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
-_MECHANICS = ("fe", "indentation", "identify", "mesh", "pipeline/model_stages")
+_UNSEEN: dict[str, Any] = {"region": "", "trace": None, "axis": None, "edge": None}
+_MECHANICS = ("fe", "indentation", "identify", "mesh", "pipeline/model_stages", "pipeline/simulations")
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation"), rooms=("anatomy",)),
     Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=("anatomy",)),
@@ -47,7 +48,14 @@ STAGES = (
         ("name", "fitted", "edge"),
         _MECHANICS,
     ),
-    Stage("predict", run_predict, ("calibrate",), (), ("name", "edge"), (*_MECHANICS, "fields")),
+    Stage(
+        "predict",
+        run_predict,
+        ("sites", "traces", "mesh", "calibrate"),
+        (),
+        ("name", "edge"),
+        (*_MECHANICS, "fields"),
+    ),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region"), ("report", "pipeline")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
@@ -59,15 +67,27 @@ def stages_of(study: Study) -> tuple[Stage, ...]:
 
 
 def keys(study: Study) -> dict[str, str]:
-    """The key of every stage: a digest of its settings, input files, code and of the stages it stands on."""
+    """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
+
+    The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
+    change, come and go without it.
+    """
+    named = {path for paths in input_files(study).values() for path in paths}
+    digests = {path: file_digest(study.path(path)) for path in named}
+    calibrate = _keys(_seen_by_calibration(study), digests)["calibrate"]
+    return _keys(study, digests, {"calibrate": calibrate})
+
+
+def _keys(
+    study: Study, digests: Mapping[Path, str], known: Mapping[str, str] | None = None
+) -> dict[str, str]:
     stated = study.model_dump(mode="json")
     files = {
-        stage: {str(path): file_digest(study.path(path)) for path in paths}
-        for stage, paths in input_files(study).items()
+        stage: {str(path): digests[path] for path in paths} for stage, paths in input_files(study).items()
     }
     found: dict[str, str] = {}
     for stage in stages_of(study):
-        found[stage.name] = digest(
+        found[stage.name] = (known or {}).get(stage.name) or digest(
             stage.name,
             {table: stated[table] for table in stage.tables},
             [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
@@ -76,6 +96,15 @@ def keys(study: Study) -> dict[str, str]:
             [found.get(below) for below in stage.needs],
         )
     return found
+
+
+def _seen_by_calibration(study: Study) -> Study:
+    """The study's fitted sites; with markers the others' places too, since each marker goes to one site."""
+    sites = [site.model_copy(update={"region": ""}) for site in study.fitted]
+    if any(site.near is not None for site in sites):
+        others = [site for site in study.sites if not site.fitted and site.near is not None]
+        sites += [site.model_copy(update=_UNSEEN) for site in others]
+    return study.model_copy(update={"sites": tuple(sites)})
 
 
 def study_status(study: Study) -> list[dict[str, Any]]:

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import InputError
 from ..execution import SerialExecutor
 from ..indentation import Parameters, simulate_fields
-from ..study import TISSUES, Study
+from ..study import Study
 from .context import Context, Listener
 from .model_stages import write_curves
-from .run import run_study
+from .run import keys, run_study
 from .simulations import CURVE_POINTS, planned_model, recorded_model
 from .store import Store, write_json
 
@@ -30,19 +31,20 @@ def simulate_site(
 
     Parameters
     ----------
-    parameters : per tissue; by default the identified ones, else the study's start.
+    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
     animation : also the fields of every step, as a PVD collection.
 
     Raises
     ------
     InputError
-        For a site that the study does not have, or any input of the stages before.
+        For a site that the study does not have, identified parameters that are stale, or any input of the
+        stages before.
     """
     site = study.site(name)
-    run_study(study, until="mesh", listener=listener)
     store = Store(study.results)
-    context = Context(study, store, SerialExecutor(), listener)
     used, origin = (parameters, "given") if parameters else _known_parameters(study, store)
+    run_study(study, until="mesh", listener=listener)
+    context = Context(study, store, SerialExecutor(), listener)
     model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
     folder = store["simulate"]
     folder.mkdir(exist_ok=True)
@@ -78,6 +80,18 @@ def simulate_site(
 
 
 def _known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
-    if (store["calibrate"] / "calibration.json").is_file():
-        return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], "identified"
-    return {tissue: study.material.start.model_dump() for tissue in TISSUES}, "start of the study"
+    """The identified parameters, else the study's start, and which they are.
+
+    Neither will do where the calibration is stale: it is not this study's, and who has identified a model
+    does not expect the start.
+    """
+    if store.stamp("calibrate") is None:
+        start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
+        return start, "start of the study"
+    if store.state("calibrate", keys(study)["calibrate"]).state != "done":
+        raise InputError(
+            "the identified parameters are stale: made from other inputs, settings or code",
+            file=store["calibrate"] / "calibration.json",
+            remedy="identify again (limbfit run), or give --parameters",
+        )
+    return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], "identified"

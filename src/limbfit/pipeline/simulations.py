@@ -13,13 +13,18 @@ from ..execution import Executor
 from ..indentation import Simulation, SimulationJob, SiteModel, simulate
 from ..study import Site, Study
 from .context import Context
+from .provenance import code_digest
 from .store import atomic, digest, file_digest
 
+ROOMS = ("fe", "indentation", "mesh")  # whose code decides a simulation
 CURVE_POINTS = 81  # times, evenly over the indentation, at which measured and simulated force are compared
 
 
 class SimulationCache:
-    """Finished simulations in ``folder``, one file each; ``also`` are other folders to look in."""
+    """Finished simulations in ``folder``, one file each.
+
+    ``also`` are folders of earlier runs: what is found there is copied, since they may be replaced.
+    """
 
     def __init__(self, folder: Path, also: Sequence[Path] = ()) -> None:
         self.folder = folder
@@ -48,10 +53,13 @@ class SimulationCache:
         return len(list(self.folder.glob("*.npz")))
 
     def _find(self, job: SimulationJob) -> Simulation | None:
+        name = f"{job_digest(job)}.npz"
         for place in self.places:
-            file = place / f"{job_digest(job)}.npz"
-            if file.is_file():
-                return _load(file)
+            if (place / name).is_file():
+                if place != self.folder:
+                    with atomic(self.folder / name) as stream:
+                        stream.write((place / name).read_bytes())
+                return _load(self.folder / name)
         return None
 
     def _keep(self, job: SimulationJob, simulation: Simulation) -> None:
@@ -77,11 +85,11 @@ def _load(file: Path) -> Simulation:
 
 
 def job_digest(job: SimulationJob) -> str:
-    """What decides a simulation, wherever its mesh file happens to lie."""
+    """What decides a simulation, code included, wherever its mesh file happens to lie."""
     model = {key: value for key, value in vars(job.model).items() if key != "mesh"}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
-    return digest(model, job.parameters, job.times_s, job.sensitivities)
+    return digest(code_digest(ROOMS), model, job.tissues, job.parameters, job.times_s, job.sensitivities)
 
 
 def site_model(
