@@ -109,6 +109,15 @@ class Grid:
             direction=self.direction[:, list(order)],
         )
 
+    def reversed(self, axes: Sequence[int]) -> Self:
+        """The same samples with some index axes (0, 1, 2 for i, j, k) running the other way."""
+        last = np.zeros(3)
+        last[list(axes)] = [self.size[axis] - 1 for axis in axes]
+        direction = self.direction.copy()
+        direction[:, list(axes)] *= -1
+        array = np.flip(self.array, tuple(2 - axis for axis in axes))
+        return replace(self, array=array, origin=self.index_to_point(last), direction=direction)
+
     def same_grid(self, other: Grid) -> bool:
         """Whether both sample the same points: every corner voxel within 0.01 mm."""
         if self.array.shape != other.array.shape:

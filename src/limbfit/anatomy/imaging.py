@@ -1,4 +1,8 @@
-"""Images and label maps in and out, geometry kept: DICOM folders, NIfTI, NRRD, MetaImage, ``.seg.nrrd``."""
+"""Images and label maps in and out, geometry kept.
+
+Images: DICOM folders, NIfTI, NRRD, MetaImage.  Label maps: ``.seg.nrrd``, any label image, DICOM-SEG and
+RTSTRUCT.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,11 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from ..errors import ImageError, LabelError
-from .dicom import Series, list_series, read_series
+from .dicom import Series, describe_series, list_series, read_series
+from .dicom_labels import find_dicom_labels, read_dicom_labels
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
+from .labelcheck import cleaned
 from .labelfiles import (
-    check_same_grid,
     is_seg_nrrd,
     read_label_image,
     read_seg_nrrd,
@@ -22,6 +27,7 @@ from .labelfiles import (
     write_sidecar,
     wrong_file,
 )
+from .placement import on_grid_of
 
 __all__ = [
     "BONES",
@@ -30,6 +36,9 @@ __all__ = [
     "LabelMap",
     "Series",
     "Volume",
+    "check_image",
+    "cleaned",
+    "describe_series",
     "list_series",
     "read_labels",
     "read_volume",
@@ -39,6 +48,7 @@ __all__ = [
 
 _CHUNK = 1 << 22
 _NIFTI_HEADER = 348  # bytes
+_SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 
 
@@ -72,27 +82,49 @@ def write_volume(path: str | Path, volume: Volume) -> None:
     sitk.WriteImage(volume.to_sitk(), str(path), useCompression=True)
 
 
+def check_image(volume: Volume, path: str | Path) -> None:
+    """Refuse an image that cannot show a limb: one grey value, or of a size that only another unit explains.
+
+    Raises
+    ------
+    ImageError
+    """
+    if volume.array.min() == volume.array.max():
+        raise ImageError("the image is constant", file=path, remedy="check the series, export it again")
+    extent = float((np.array(volume.size) * volume.spacing).max())
+    if not _SMALLEST_MM <= extent <= _LARGEST_MM:
+        raise ImageError(
+            f"the image is {extent:.3g} mm long, which is no limb's size",
+            file=path,
+            remedy="its voxel spacing must be in millimetres",
+        )
+
+
 def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
-    """A label map: ``.seg.nrrd`` (3D Slicer) or a label image with default or sidecar names.
+    """A label map: ``.seg.nrrd``, DICOM-SEG, RTSTRUCT, or a label image with default or sidecar names.
 
     Parameters
     ----------
-    path : the file; a plain image may have its names in ``<file>.json``.
-    like : the image that it belongs to; a cropped ``.seg.nrrd`` is brought to its grid.
+    path : the file, or a folder with one DICOM-SEG or RTSTRUCT; a plain image may have its names in
+        ``<file>.json``.
+    like : the image that it belongs to: the map is brought to its grid, voxel by voxel. Contours need it.
 
     Raises
     ------
     LabelError
-        Also for a map on another grid than ``like``, and for one without a single labelled voxel.
+        Also for a map whose voxels are not those of ``like``, and for one without a single labelled voxel.
     """
     path = Path(path)
-    if is_seg_nrrd(path) and path.is_file():
-        labels = read_seg_nrrd(path, like)
+    dicom = find_dicom_labels(path)
+    if dicom is not None:
+        labels = read_dicom_labels(dicom, like)
+    elif is_seg_nrrd(path) and path.is_file():
+        labels = read_seg_nrrd(path)
     else:
-        labels = check_same_grid(_read_label_file(path), like, path)
+        labels = _read_label_file(path)
     if not labels.array.any():
         raise LabelError("the label map is empty", file=path, remedy="give one with the limb labelled")
-    return labels
+    return labels if like is None else on_grid_of(labels, like, path)
 
 
 def write_labels(path: str | Path, labels: LabelMap) -> None:

@@ -18,7 +18,8 @@ import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
 from ..errors import ImageError, LabelError
-from .grid import DEFAULT_NAMES, Grid, LabelMap, Volume
+from .grid import DEFAULT_NAMES, LabelMap
+from .naming import flatten, plain_name
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "soft tissue": (0.85, 0.55, 0.45),
@@ -28,7 +29,6 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "patella": (0.78, 0.62, 0.86),
 }
 _OTHER_COLOURS = ((0.9, 0.6, 0.2), (0.4, 0.6, 0.9), (0.5, 0.8, 0.7), (0.8, 0.5, 0.6))
-_ON_GRID = 0.01  # voxels
 _SPACES = {
     "left-posterior-superior": np.ones(3),
     "lps": np.ones(3),
@@ -41,8 +41,8 @@ def is_seg_nrrd(path: Path) -> bool:
     return path.name.lower().endswith((".seg.nrrd", ".seg.nhdr"))
 
 
-def read_seg_nrrd(path: Path, like: Volume | None) -> LabelMap:
-    """A ``.seg.nrrd``, placed on the grid of ``like`` if given."""
+def read_seg_nrrd(path: Path) -> LabelMap:
+    """A ``.seg.nrrd`` on its own, maybe cropped, grid."""
     try:
         voxels, header = nrrd.read(str(path))
     except (nrrd.NRRDError, OSError, ValueError, EOFError, KeyError):
@@ -52,9 +52,12 @@ def read_seg_nrrd(path: Path, like: Volume | None) -> LabelMap:
     layers = voxels if voxels.ndim == 4 else voxels[None]
     spacing, origin, direction = _nrrd_geometry(header, path)
     segments = _segments(header, layers, path)
-    flat, names = _flatten(layers, segments)
-    labels = LabelMap(np.transpose(flat, (2, 1, 0)), spacing, origin, direction, names)
-    return labels if like is None else _on_grid(labels, like, path)
+    masks = [layers[layer] == value for _, layer, value in segments]
+    try:
+        flat, names = flatten(masks, [name for name, _, _ in segments])
+    except LabelError as error:
+        raise LabelError(error.what, file=path, remedy=error.remedy) from None
+    return LabelMap(np.transpose(flat, (2, 1, 0)), spacing, origin, direction, names)
 
 
 def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
@@ -144,83 +147,8 @@ def _segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) -> li
         value = int(header.get(f"Segment{n}_LabelValue", 1))
         if not 0 <= layer < len(layers):
             raise LabelError(f"segment {name!r} is in a layer that the file does not have", file=path)
-        found.append((_plain(name), layer, value))
-    if not found:
-        raise LabelError("the file names no segment", file=path, remedy="save it again from 3D Slicer")
-    names = [name for name, _, _ in found]
-    if len(set(names)) < len(names):
-        raise LabelError("two segments have the same name", file=path, remedy="give them different names")
+        found.append((plain_name(name), layer, value))
     return found
-
-
-def _plain(name: str) -> str:
-    """Slicer users write ``Soft Tissue`` or ``soft_tissue``; the names here are lower case with spaces."""
-    return " ".join(name.replace("_", " ").lower().split())
-
-
-def _flatten(
-    layers: NDArray[Any], segments: list[tuple[str, int, int]]
-) -> tuple[NDArray[np.uint8], dict[int, str]]:
-    """Overlapping segments as one map: where two overlap the smaller wins, as a bone in a limb does."""
-    masks = [layers[layer] == value for _, layer, value in segments]
-    values = _label_values([name for name, _, _ in segments])
-    flat = np.zeros(layers.shape[1:], dtype=np.uint8)
-    for n in sorted(range(len(masks)), key=lambda n: -int(masks[n].sum())):
-        flat[masks[n]] = values[n]
-    return flat, {value: segments[n][0] for n, value in enumerate(values)}
-
-
-def _label_values(names: list[str]) -> list[int]:
-    """The default value of a known name, free values for others."""
-    default = {name: value for value, name in DEFAULT_NAMES.items()}
-    free = iter(range(len(default) + 1, 256))
-    return [default[name] if name in default else next(free) for name in names]
-
-
-def _on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
-    """A map that may be cropped, on the whole grid of the image."""
-    offset = _offset(labels, like)
-    if offset is None:
-        raise LabelError(
-            "the label map is on another grid than the image",
-            file=path,
-            remedy="export it with the image as reference geometry",
-        )
-    full = np.zeros(like.array.shape, dtype=np.uint8)
-    i, j, k = offset
-    n_i, n_j, n_k = labels.size
-    full[k : k + n_k, j : j + n_j, i : i + n_i] = labels.array
-    return LabelMap(full, like.spacing, like.origin, like.direction, labels.names)
-
-
-def _offset(labels: Grid, like: Grid) -> tuple[int, int, int] | None:
-    """First voxel of ``labels`` on the grid of ``like``, or None if their voxels do not coincide."""
-    last = np.array(labels.size) - 1.0
-    first = like.point_to_index(labels.origin)
-    whole = np.round(first)
-    end = like.point_to_index(labels.index_to_point(last))
-    middle = like.point_to_index(labels.index_to_point([last[0], 0.0, 0.0]))
-    drift = [first - whole, end - whole - last, middle - whole - [last[0], 0.0, 0.0]]
-    if max(np.abs(d).max() for d in drift) > _ON_GRID:
-        return None
-    if np.any(whole < 0) or np.any(whole + last > np.array(like.size) - 1):
-        return None
-    return int(whole[0]), int(whole[1]), int(whole[2])
-
-
-def check_same_grid(labels: LabelMap, like: Volume | None, path: Path) -> LabelMap:
-    if like is not None and not labels.same_grid(like):
-        raise LabelError(
-            "the label map is on another grid than the image",
-            file=path,
-            remedy=f"image {_shape(like)}, labels {_shape(labels)}: export it with the image as reference",
-        )
-    return labels
-
-
-def _shape(grid: Grid) -> str:
-    size = " x ".join(str(n) for n in grid.size)
-    return f"{size} voxels of {' x '.join(f'{s:.3g}' for s in grid.spacing)} mm"
 
 
 def wrong_file(error: ImageError, path: Path) -> LabelError:

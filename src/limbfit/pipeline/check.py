@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.imaging import read_labels, read_volume
+from ..anatomy.imaging import Volume
 from ..anatomy.surfaces import check_anatomy
 from ..indentation import read_indenter
 from ..study import Study
 from .context import Listener, Progress
 from .geometry_stages import given_anatomy, place_site
+from .inputs import marked_image, study_image, study_labels
 from .model_stages import read_site_trace
 
 
@@ -48,22 +49,23 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
 
 
 def _image_facts(study: Study) -> list[str]:
-    assert study.image is not None
-    facts = []
-    for name, path, series in (
-        ("image", study.image.path, study.image.series),
-        ("image with markers", study.image.markers, study.image.markers_series),
-    ):
-        if path is None:
-            continue
-        volume = read_volume(study.path(path), series)
-        size = " x ".join(str(n) for n in volume.array.shape[::-1])
-        spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
-        facts.append(f"{name}: {size} voxels of {spacing} mm")
-        if name == "image" and study.segmentation.labels is not None:
-            labels = read_labels(study.path(study.segmentation.labels), volume)
-            facts.append("corrected labels: " + ", ".join(labels.names.values()))
+    volume = study_image(study)
+    facts = [_sampling("image", volume)]
+    marked = marked_image(study)
+    if marked is not None:
+        facts.append(_sampling("image with markers", marked))
+    given = study_labels(study, volume)
+    if given is not None:
+        labels, notes = given
+        facts.append("corrected labels: " + ", ".join(labels.names.values()))
+        facts += [f"label map: {note}" for note in notes]
     return facts
+
+
+def _sampling(name: str, volume: Volume) -> str:
+    size = " x ".join(str(n) for n in volume.size)
+    spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
+    return f"{name}: {size} voxels of {spacing} mm"
 
 
 def _surface_facts(study: Study) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..anatomy.amputation import amputate
 from ..anatomy.body import limb_mask, smoothed
-from ..anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_labels
+from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
 from ..anatomy.markers import find_markers, match_markers
 from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
 from ..anatomy.segmentation import segment
@@ -31,6 +31,7 @@ from ..errors import SiteError
 from ..mesh import write_vtu
 from ..study import Site, Study
 from .context import Context
+from .inputs import marked_image, naming, study_image, study_labels
 from .store import read_json, write_json
 
 
@@ -39,23 +40,29 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     assert study.image is not None
     context.tell("segment", 0, 3, "reading the image")
-    volume = read_volume(study.path(study.image.path), study.image.series)
+    volume = study_image(study)
     context.tell("segment", 1, 3, "labelling tissues")
-    if study.segmentation.labels is not None:
-        labels, method = read_labels(study.path(study.segmentation.labels), volume), "corrected by hand"
+    given = study_labels(study, volume)
+    if given is not None:
+        (labels, notes), method = given, "corrected by hand"
+        for note in notes:
+            context.tell("segment", 1, 3, f"label map: {note}")
     else:
-        labels = segment(
-            volume,
-            bias_correction=study.segmentation.bias_correction,
-            min_bone_volume_mm3=study.segmentation.min_bone_volume_mm3,
-        )
-        method = "automatic"
+        with naming(study.path(study.image.path)):
+            labels = segment(
+                volume,
+                bias_correction=study.segmentation.bias_correction,
+                min_bone_volume_mm3=study.segmentation.min_bone_volume_mm3,
+            )
+        notes, method = [], "automatic"
     write_labels(folder / "labels.seg.nrrd", labels)
-    if study.image.markers is not None:
+    marked = marked_image(study)
+    if marked is not None:
         context.tell("segment", 2, 3, "outlining the image with markers")
-        marked = read_volume(study.path(study.image.markers), study.image.markers_series)
         write_labels(folder / "markers.seg.nrrd", outline(marked))
-    write_json(folder / "segment.json", {"method": method, "volumes_cm3": label_volumes(labels)})
+    write_json(
+        folder / "segment.json", {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
+    )
     return {}
 
 

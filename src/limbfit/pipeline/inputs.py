@@ -1,0 +1,55 @@
+"""The image, label map and surfaces that a study names, read and checked in one way for every verb."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
+from ..anatomy.one_limb import check_one_limb
+from ..errors import InputError
+from ..study import Study
+
+
+def study_image(study: Study) -> Volume:
+    """The study's image; of one limb, unless its labels are given too."""
+    assert study.image is not None
+    volume = _image(study.path(study.image.path), study.image.series)
+    if study.segmentation.labels is None:
+        with naming(study.path(study.image.path)):
+            check_one_limb(volume)
+    return volume
+
+
+def marked_image(study: Study) -> Volume | None:
+    """The image of the same limb with markers on, if the study has one."""
+    assert study.image is not None
+    if study.image.markers is None:
+        return None
+    return _image(study.path(study.image.markers), study.image.markers_series)
+
+
+def _image(path: Path, series: str | None) -> Volume:
+    volume = read_volume(path, series)
+    check_image(volume, path)
+    return volume
+
+
+def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | None:
+    """The label map that the study gives, on the image's grid, and what was repaired in it."""
+    if study.segmentation.labels is None:
+        return None
+    path = study.path(study.segmentation.labels)
+    return cleaned(read_labels(path, volume), path)
+
+
+@contextmanager
+def naming(file: Path) -> Iterator[None]:
+    """Say which file an error is about, where it does not say so itself."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None:
+            raise
+        raise type(error)(error.what, file=file, place=error.place, remedy=error.remedy) from None
