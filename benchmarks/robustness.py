@@ -1,12 +1,13 @@
 """How often does a simulation come to its end, whatever limb, indenter and material it is given?
 
     python benchmarks/robustness.py --cases 200 --seed 0 --json robustness.json
-    python benchmarks/robustness.py --only 17            # one case of the same 200
+    python benchmarks/robustness.py --only 17 32         # some cases of the same 200
 
 Every case is drawn from (seed, number) alone: body, site, depth, indenter, speed, and the eight material
 parameters over the whole bounds of the calibration.  Each runs in a worker process with a time limit; what
 came of it is ``completed``, ``partial`` (with the solver's reason), ``crash`` or ``hang``.  Completed
-simulations are then held against physics; see `broken_laws`.
+simulations are then held against physics; see `broken_laws`.  Cases that are in the file of ``--json`` are not
+run again, so that a run can be stopped and gone on with.
 """
 
 from __future__ import annotations
@@ -429,27 +430,39 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=200, help="how many cases (default 200)")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=0, help="another seed is another set of cases")
-    parser.add_argument("--only", type=int, help="run this case alone")
+    parser.add_argument("--only", type=int, nargs="+", help="run these cases alone")
     parser.add_argument("--workers", type=int, default=1, help="processes side by side")
     parser.add_argument(
         "--limit", type=float, default=300.0, help="processor seconds until a case counts as hanging"
     )
     parser.add_argument("--element", default=ELEMENT, help=f"name in the element table (default {ELEMENT})")
-    parser.add_argument("--json", type=Path, help="write every case and the summary here")
+    parser.add_argument(
+        "--json", type=Path, help="write every case and the summary here; cases found there are kept"
+    )
     options = parser.parse_args()
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    numbers = list(range(options.first, options.first + options.cases))
-    outcomes: list[Outcome] = []
-    if options.only is not None:
-        numbers = [options.only]
-    for outcome in run_all(options.seed, numbers, options.limit, options.workers, options.element):
-        outcomes.append(outcome)
+    numbers = options.only or list(range(options.first, options.first + options.cases))
+    kind = {"seed": options.seed, "element": options.element}
+    outcomes = [] if options.json is None else _earlier(options.json, kind)
+    wanted = [number for number in numbers if number not in {outcome.number for outcome in outcomes}]
+    for outcome in run_all(options.seed, wanted, options.limit, options.workers, options.element):
+        outcomes = sorted([*outcomes, outcome], key=lambda o: o.number)
         print(_line(outcome), flush=True)
         if options.json is not None:
-            content = {"seed": options.seed, "summary": summary(outcomes)}
-            options.json.write_text(json.dumps({**content, "cases": [asdict(o) for o in outcomes]}, indent=1))
+            content = {**kind, "summary": summary(outcomes), "cases": [asdict(o) for o in outcomes]}
+            options.json.write_text(json.dumps(content, indent=1))
     _report(outcomes, options.seed)
+
+
+def _earlier(path: Path, kind: dict[str, Any]) -> list[Outcome]:
+    """The outcomes in the file of an earlier run, if there is one and it was of the same kind."""
+    if not path.exists():
+        return []
+    content = json.loads(path.read_text())
+    if {name: content.get(name) for name in kind} != kind:
+        sys.exit(f"{path} holds cases of another seed or element; name another file")
+    return [Outcome(**case) for case in content["cases"]]
 
 
 def _report(outcomes: list[Outcome], seed: int) -> None:
