@@ -23,6 +23,7 @@ TRUTH = {
     "skin": {"c_kPa": 5.6, "m": 4.4, "gamma": 3.1, "tau_s": 0.38},
     "muscle": {"c_kPa": 4.4, "m": 5.0, "gamma": 2.2, "tau_s": 0.52},
 }
+FAT = {"c_kPa": 1.8, "m": 3.1, "gamma": 1.4, "tau_s": 0.9}
 START = {tissue: {"c_kPa": 4.7, "m": 3.0, "gamma": 1.2, "tau_s": 2.0} for tissue in TRUTH}
 ONE = {tissue: {"c_kPa": 4.71, "m": 4.82, "gamma": 2.5, "tau_s": 0.47} for tissue in TRUTH}
 TWO = {
@@ -41,6 +42,39 @@ def radius(z: np.ndarray) -> np.ndarray:
 def skin_point(angle: float, z: float) -> np.ndarray:
     r = float(radius(np.array(z)))
     return np.array([r * np.cos(angle), r * np.sin(angle), z])
+
+
+def add_fat(folder: Path) -> Path:
+    """The stored calibration and truth with a third tissue between skin and muscle."""
+    file, truth = folder / "calibrate" / "calibration.json", folder / "truth.json"
+    content = json.loads(file.read_text())
+
+    def with_fat(tissues: dict, fat: dict) -> dict:
+        return {"skin": tissues["skin"], "fat": fat, "muscle": tissues["muscle"]}
+
+    one, three = content["stages"]
+    three["name"] = "three materials"
+    for stage, fat in ((one, ONE["skin"]), (three, FAT)):
+        stage["start"] = with_fat(stage["start"], stage["start"]["skin"])
+        stage["parameters"] = with_fat(stage["parameters"], fat)
+        for step in stage["iterations"]:
+            step["parameters"] = with_fat(step["parameters"], fat)
+    told = content["uncertainty"]
+    limits = {name: [0.5 * value, 2 * value] for name, value in FAT.items()}
+    told["intervals_95"] = with_fat(told["intervals_95"], limits)
+    names = [f"{tissue}.{name}" for tissue in ("skin", "fat", "muscle") for name in FAT]
+    told["correlation"] = {"names": names, "matrix": np.eye(12).tolist()}
+    told["verdict"] = {name: told["verdict"].get(name, "not determined") for name in names}
+    file.write_text(json.dumps(content))
+    truth.write_text(json.dumps({"parameters": with_fat(TRUTH, FAT)}))
+    run = json.loads((folder / "run.json").read_text())
+    layers = [
+        {"name": "skin", "thickness_mm": 1.5},
+        {"name": "fat", "thickness": "map", "min_thickness_mm": 1.0},
+    ]
+    run["settings"]["geometry"] |= {"layers": layers, "core": "muscle"}
+    (folder / "run.json").write_text(json.dumps(run))
+    return folder
 
 
 def write_results(folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 (coarse)") -> Path:

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from stored_results import SITES, write_results
+from stored_results import SITES, add_fat, write_results
 
 from limbfit.errors import InputError
 from limbfit.report import build_report
@@ -127,6 +127,29 @@ def test_parameter_table_shows_start_both_stages_interval_and_truth(report: str)
     assert cells[0][3:] == ["Start", "One material", "Two materials", "95 % interval", "Verdict", "Truth"]
     assert cells[2][3:] == ["3.00", "4.82", "4.52", "2.71 to 7.68", "weakly determined", "4.40"]
     assert len(cells) == 9
+
+
+def test_three_tissues_stand_in_every_table_and_curve(copy: Path) -> None:
+    text = build_report(add_fat(copy), copy / "report").read_text(encoding="utf-8")
+    assert Outline(text).open == []
+    table = re.search(r'<table id="table-parameters">.*?</table>', text, re.DOTALL)
+    assert table
+    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table.group(), re.DOTALL)
+    cells = [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
+    assert cells[0][4:6] == ["One material", "Three materials"]
+    assert [row[0] for row in cells[1:]] == ["Skin"] * 4 + ["Fat"] * 4 + ["Muscle"] * 4
+    assert cells[5][3:] == ["4.70", "4.71", "1.80", "0.900 to 3.60", "not determined", "1.80"]
+    assert "fat, long-term shear modulus c (0.900 to 3.60 kPa)" in text
+    assert "first as one material, then as skin, fat and muscle." in text
+    assert "three materials predict better." in text
+    assert "Error, three materials (%)" in _section(text, "prediction")
+    assert "skin (1.5 mm) and fat (as thick as the segmented fat, at least 1.0 mm)" in text
+    convergence = _section(text, "convergence")
+    assert convergence.count("var(--third)") >= 4  # the third tissue's curve, a panel for each parameter
+    assert ">truth, fat</text>" in convergence
+    assert _section(text, "parameters").count('scope="col"') >= 12
+    assert "two materials" not in text
+    assert "two tissues" not in text
 
 
 def test_site_table_marks_the_fitted(report: str) -> None:

@@ -22,9 +22,11 @@ from .ink import (
     STYLE,
     TRUTH,
     svg,
+    tissue_style,
+    truth_style,
 )
 from .page import Figure
-from .store import PARAMETERS, TISSUES, Curves, Json, Store
+from .store import PARAMETERS, Curves, Json, Store
 from .tables import SYMBOLS, UNITS, fixed, interval, number
 
 PANEL_WIDTH_IN, MOST_POINTS, LONGEST_TITLE = 9.6, 2500, 44
@@ -101,7 +103,7 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
     words = {"time_s": ("Time (s)", "time"), "displacement_mm": ("Displacement (mm)", "displacement")}
     with matplotlib.rc_context(STYLE):
         for i, (ax, (row, curves)) in enumerate(zip(axes, pairs, strict=True)):
-            _draw_forces(ax, _thin(curves), against)
+            _draw_forces(ax, _thin(curves), against, store.materials)
             ax.set_title(_site_title(store, row, columns))
             if i + columns >= len(pairs):
                 ax.set_xlabel(words[against][0])
@@ -125,7 +127,7 @@ def _short(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-def _draw_forces(ax: Axes, curves: Curves, against: str) -> None:
+def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None:
     x = curves[against]
     if "force_low_N" in curves and against == "time_s":
         low, high = curves["force_low_N"], curves["force_high_N"]
@@ -134,7 +136,7 @@ def _draw_forces(ax: Axes, curves: Curves, against: str) -> None:
         ax.plot(x, curves["force_measured_N"], color=MEASURED, lw=2.6, alpha=0.55, label="measured")
     if "force_one_material_N" in curves:
         ax.plot(x, curves["force_one_material_N"], color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
-    ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label="two materials")
+    ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label=materials)
     ax.margins(x=0.01)
 
 
@@ -191,13 +193,10 @@ def _draw_stage(axes: list[Axes], stage: Json, offset: int) -> int:
         axes[0].plot(x, errors, color=MUTED, lw=0.8)
     mean = [step.get("error_percent", math.nan) for step in steps]
     axes[0].plot(x, mean, color=INK, marker="o", ms=3, label="mean error" if offset == 0 else None)
-    styles = {"skin": (SIMULATED, "o", "-"), "muscle": (ONE_MATERIAL, "s", "--")}
     for ax, name in zip(axes[1:], PARAMETERS, strict=True):
-        for tissue in TISSUES:
-            color, marker, line = styles[tissue]
+        for i, tissue in enumerate(stage["parameters"]):
             values = [step["parameters"].get(tissue, {}).get(name, math.nan) for step in steps]
-            label = tissue if offset == 0 else None
-            ax.plot(x, values, color=color, marker=marker, ms=3, ls=line, label=label)
+            ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **tissue_style(i))
     if offset:
         for ax in axes:
             ax.axvline(offset - 0.5, color=MUTED, lw=0.8)
@@ -213,9 +212,9 @@ def _finish_convergence(axes: list[Axes], store: Store, stages: list[Json]) -> N
         unit = UNITS[name]
         ax.set_title(f"{SYMBOLS[name]} ({unit})" if len(unit) > 1 or unit == "s" else f"{SYMBOLS[name]} (–)")
         truth = store.truth.get("parameters", {})
-        for tissue, line in zip(TISSUES, (":", "-."), strict=True):
-            if name in truth.get(tissue, {}):
-                ax.axhline(truth[tissue][name], color=TRUTH, lw=1, ls=line, label=f"truth, {tissue}")
+        for i, (tissue, values) in enumerate(truth.items()):
+            if name in values:
+                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **truth_style(i))
     for ax in axes:
         ax.set_xlabel("Iterate")
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
@@ -252,7 +251,7 @@ def interval_figure(store: Store) -> Figure | None:
     if not store.stages:
         return None
     last = store.stages[-1].get("parameters", {})
-    names = [(t, n) for t in TISSUES for n in PARAMETERS if last.get(t, {}).get(n)]
+    names = [(t, n) for t in store.tissues for n in PARAMETERS if last.get(t, {}).get(n)]
     if not names:
         return None
     drawing, (ax,) = _panels(1, 1, 0.7 + 0.3 * len(names))

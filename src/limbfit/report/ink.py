@@ -18,7 +18,12 @@ from matplotlib.figure import Figure as Drawing
 
 INK, GRID, MUTED = "#010101", "#010102", "#010103"
 MEASURED, SIMULATED, ONE_MATERIAL, TRUTH = "#010104", "#010105", "#010106", "#010107"
+THIRD = "#010108"
 FITTED, HELD_OUT = SIMULATED, ONE_MATERIAL
+# Tissues, outermost first, are told apart by marker and line too; from the fifth on colours come again.
+_COLOURS, _MARKERS = (SIMULATED, ONE_MATERIAL, THIRD, INK), ("o", "s", "^", "D", "v", "P", "X")
+_LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (8, 2)))
+_TRUE_LINES: tuple[Any, ...] = (":", "-.", (0, (6, 2)), (0, (1, 3)), (0, (3, 1, 1, 1, 1, 1)))
 POINT_PX = 1.5  # a drawing of 9.6 in fills the page; smaller ones keep the same size of letters
 _VARIABLES = {
     INK: "--ink",
@@ -28,6 +33,7 @@ _VARIABLES = {
     SIMULATED: "--simulated",
     ONE_MATERIAL: "--one-material",
     TRUTH: "--truth",
+    THIRD: "--third",
 }
 
 STYLE: dict[Any, Any] = {
@@ -56,6 +62,20 @@ STYLE: dict[Any, Any] = {
     "path.simplify": True,
     "path.simplify_threshold": 0.3,
 }
+
+
+def tissue_style(index: int) -> dict[str, Any]:
+    """Colour, marker and line of the curve of a tissue."""
+    return {
+        "color": _COLOURS[index % len(_COLOURS)],
+        "marker": _MARKERS[index % len(_MARKERS)],
+        "ls": _LINES[index % len(_LINES)],
+    }
+
+
+def truth_style(index: int) -> dict[str, Any]:
+    """Colour and line of the true value of a tissue's parameter."""
+    return {"color": TRUTH, "ls": _TRUE_LINES[index % len(_TRUE_LINES)]}
 
 
 def svg(drawing: Drawing, name: str, alt: str) -> str:

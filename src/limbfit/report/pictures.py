@@ -29,6 +29,7 @@ from .tables import number
 
 PAPER = "#f6f5f1"
 SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
+BETWEEN = ("#7d6a2e", "#f7efce", "#4a6472")  # layers between the outermost and the core
 SKIN_SURFACE = "#d9a07c"
 MATT: dict[str, Any] = {"ambient": 0.35, "diffuse": 0.75, "specular": 0.0}
 FITTED, HELD_OUT = "#0072b2", "#d55e00"
@@ -217,16 +218,21 @@ def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
         return None
     whole: list[Shot] = []
     near: list[Shot] = []
+    colours: dict[str, str] = {}
     for row, file in rows:
         view, close = _cut_views(store, row, file)
         plotter = _plotter()
-        _add_regions(plotter, _far_side(_linear(file), view))
+        grid = _linear(file)
+        colours |= _region_colours(grid)
+        _add_regions(plotter, _far_side(grid, view))
         whole.append((_shoot(plotter, view), view, [_mark(row, axis=True)]))
         near.append((_shoot(plotter, close), close, []))
         plotter.close()
     names = [row["site"] for row, _ in rows]
-    alt = "Meshes cut through the sites " + ", ".join(names) + ": skin layer, muscle and bone voids"
-    legend = _legend((("skin–adipose layer", SKIN), ("muscle–soft tissue", MUSCLE), ("wall of a bone", BONE)))
+    alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
+    paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
+    words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
+    legend = _legend((*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE)))
     caption = (
         "The mesh of each fitted site, cut along the limb through the site (above), and near the indenter "
         "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
@@ -320,15 +326,21 @@ def _far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
 
 
 def _add_regions(plotter: Any, grid: Grid) -> None:
-    names = [str(name) for name in grid.field_data.get("region_names", ("skin", "muscle"))]
     regions = np.asarray(grid.cell_data["region"])
-    for index, name in enumerate(names):
+    for index, colour in enumerate(_region_colours(grid).values()):
         part = grid.extract_cells(np.flatnonzero(regions == index))
         if part.n_cells:
             surface = part.extract_surface(algorithm="dataset_surface")
             bone = _on_bone(surface)
-            for chosen, color in ((~bone, SKIN if name == "skin" else MUSCLE), (bone, BONE)):
+            for chosen, color in ((~bone, colour), (bone, BONE)):
                 _add_faces(plotter, surface.extract_cells(np.flatnonzero(chosen)), color)
+
+
+def _region_colours(grid: Grid) -> dict[str, str]:
+    """The colour of each region: layers, outermost first, and the core."""
+    names = [str(name) for name in grid.field_data["region_names"]]
+    between = [BETWEEN[i % len(BETWEEN)] for i in range(len(names) - 2)]
+    return dict(zip(names, [SKIN, *between, MUSCLE], strict=False))
 
 
 def _on_bone(surface: Grid) -> NDArray[np.bool_]:

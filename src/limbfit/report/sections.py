@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from . import figures, pictures, tables
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
-from .store import PARAMETERS, TISSUES, Store
+from .store import PARAMETERS, Json, Store
 
 PRIVACY = (
     "This report holds no name, date of birth or other identity from the images. It does show the shape of "
@@ -58,7 +58,7 @@ def key_numbers(store: Store) -> tuple[KeyNumber, ...]:
         heldout, fitted = (tables.mean_and_deviation(store, which) for which in ("heldout", "fitted"))
         found.append(KeyNumber(heldout, "%", "mean force error at the held-out sites"))
         found.append(KeyNumber(fitted, "%", "mean force error at the fitted sites"))
-    for tissue in TISSUES:
+    for tissue in store.tissues:
         last = store.stages[-1].get("parameters", {}).get(tissue) if store.stages else None
         if last:
             found.append(KeyNumber(tables.number(last.get("c_kPa")), "kPa", _with_interval(store, tissue)))
@@ -94,11 +94,20 @@ def _what_was_done(store: Store) -> str:
         sites = f"{len(names)} indentation site{'s' if len(names) > 1 else ''}"
         simulated = ", each simulated with the parameters of the study" if store.predicted else ""
         return f"The study has {sites}{simulated}; no parameters have been identified."
-    return (
+    start = (
         f"The soft tissue of this limb was identified from robotic indentations at {len(fitted)} of "
-        f"{len(names)} sites ({', '.join(fitted)}): first as one material, then as a skin–adipose layer and "
-        "the muscle–soft tissue beneath it."
+        f"{len(names)} sites ({', '.join(fitted)})"
     )
+    if len(store.stages) == 1:
+        return f"{start} as one material."
+    paper = store.tissues == tuple(tables.PAPER_TISSUES)
+    parts = "a skin–adipose layer and the muscle–soft tissue beneath it"
+    return f"{start}: first as one material, then as {parts if paper else _listed(store.tissues)}."
+
+
+def _listed(words: Sequence[str]) -> str:
+    """``skin, fat and muscle``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _how_well(store: Store) -> str:
@@ -126,8 +135,8 @@ def _one_or_two(store: Store) -> str:
     first, second = (statistics.fmean(column) for column in zip(*known, strict=True))
     start = f"With one material for all soft tissue the held-out error is {tables.fixed(first)} %: "
     if abs(first - second) < 0.1 * max(first, second):
-        return start + "here two materials predict no better than one."
-    return start + ("two materials predict better." if second < first else "two materials predict worse.")
+        return start + f"here {store.materials} predict no better than one."
+    return start + f"{store.materials} predict {'better' if second < first else 'worse'}."
 
 
 def _verdict(store: Store) -> tuple[str, ...]:
@@ -135,7 +144,7 @@ def _verdict(store: Store) -> tuple[str, ...]:
     stored = uncertainty.get("verdict") or {}
     if not stored:
         return ()
-    names = {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in TISSUES for n in PARAMETERS}
+    names = {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
     groups: dict[str, list[str]] = {}
     for name, word in stored.items():
         groups.setdefault(str(word), []).append(names.get(name, name))
@@ -296,7 +305,6 @@ def method(store: Store) -> Section:
     options = store.run.get("settings") or {}
     geometry, indenter = options.get("geometry") or {}, options.get("indenter") or {}
     kappa = (options.get("material") or {}).get("kappa_ratio", tables.NOTHING)
-    layer = geometry.get("skin_layer_mm", tables.NOTHING)
     width = indenter.get("width_mm", tables.NOTHING)
     return Section(
         "method",
@@ -304,10 +312,10 @@ def method(store: Store) -> Section:
         (
             Prose(
                 "The method follows Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater.): "
-                "both tissues obey the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with "
+                "all tissues obey the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with "
                 "quasi-linear viscoelasticity, G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress. "
-                f"The bulk modulus κ is c times {kappa}. The skin–adipose layer is {layer} mm "
-                "thick; bones are voids whose surfaces, like the proximal cut, do not move."
+                f"The bulk modulus κ is c times {kappa}. {_layers(geometry)} Bones are voids whose "
+                "surfaces, like the proximal cut, do not move."
             ),
             Prose(
                 f"A rigid {indenter.get('shape') or 'square'} indenter of {width} mm follows the measured "
@@ -318,6 +326,23 @@ def method(store: Store) -> Section:
             ),
         ),
     )
+
+
+def _layers(geometry: Json) -> str:
+    """The layers of tissue in a sentence."""
+    layers = geometry.get("layers")
+    if not layers:
+        return f"The skin–adipose layer is {geometry.get('skin_layer_mm', tables.NOTHING)} mm thick."
+    words = [
+        f"{layer['name']} ("
+        + (
+            f"{layer['thickness_mm']} mm)"
+            if layer.get("thickness_mm")
+            else f"as thick as the segmented fat, at least {layer.get('min_thickness_mm')} mm)"
+        )
+        for layer in layers
+    ]
+    return f"Over the {geometry.get('core')} lie, outermost first: {_listed(words)}."
 
 
 def timing(store: Store) -> Section:

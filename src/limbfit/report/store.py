@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 
 PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
-TISSUES = ("skin", "muscle")
 
 Curves = dict[str, NDArray[np.float64]]
 Json = dict[str, Any]
@@ -54,6 +53,16 @@ class Store:
     def stages(self) -> tuple[Json, ...]:
         """The stages of the identification, one material first."""
         return tuple(self.calibration.get("stages", ()))
+
+    @property
+    def tissues(self) -> tuple[str, ...]:
+        """Names of the identified tissues, outermost first; none where nothing was identified."""
+        return tuple(self.stages[-1].get("parameters", ())) if self.stages else ()
+
+    @property
+    def materials(self) -> str:
+        """What the model with a material for each tissue is called: ``two materials``."""
+        return str(self.stages[-1].get("name")) if self.stages else "identified materials"
 
     @property
     def surface_files(self) -> dict[str, Path]:

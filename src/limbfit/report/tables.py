@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from .page import Cell, Row, Table
-from .store import PARAMETERS, TISSUES, Json, Store
+from .store import PARAMETERS, Json, Store
 
 NOTHING = "–"
 SYMBOLS = {"c_kPa": "c", "m": "m", "gamma": "γ", "tau_s": "τ"}
@@ -17,7 +17,7 @@ MEANING = {
     "gamma": "relaxation amplitude",
     "tau_s": "relaxation time",
 }
-TISSUE_NAMES = {"skin": "Skin–adipose", "muscle": "Muscle"}
+PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}  # where fat is no tissue of its own
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -78,12 +78,19 @@ def verdict(store: Store, tissue: str, name: str) -> str:
     return f"{word}; at its bound" if (uncertainty.get("at_bound") or {}).get(key) else word
 
 
+def tissue_name(store: Store, tissue: str) -> str:
+    """A tissue as the head of a row; the two of the paper as the paper names them."""
+    if store.tissues == tuple(PAPER_TISSUES):
+        return PAPER_TISSUES[tissue]
+    return tissue.replace("_", " ").capitalize()
+
+
 def _limits(limits: list[float] | None) -> str:
     return f"{number(limits[0])} to {number(limits[1])}" if limits else NOTHING
 
 
 def parameter_table(store: Store) -> Table:
-    """Table 1: start, one material, two materials, interval, verdict, and the truth where it is known."""
+    """Table 1: start, value after each stage, interval, verdict, and the truth where it is known."""
     stages = store.stages
     head = ["Tissue", "Parameter", "Unit", "Start"]
     head += [f"{str(stage['name']).capitalize()}" for stage in stages]
@@ -93,14 +100,14 @@ def parameter_table(store: Store) -> Table:
         caption="Table 1. Constitutive parameters before and after each stage of the identification. "
         "The interval and the verdict belong to the last stage.",
         head=tuple(head),
-        rows=tuple(_parameter_row(store, tissue, name) for tissue in TISSUES for name in PARAMETERS),
+        rows=tuple(_parameter_row(store, tissue, name) for tissue in store.tissues for name in PARAMETERS),
     )
 
 
 def _parameter_row(store: Store, tissue: str, name: str) -> Row:
     stages = store.stages
     values = [stages[0].get("start", {}), *(stage.get("parameters", {}) for stage in stages)]
-    cells = [_h(TISSUE_NAMES[tissue]), Cell(f"{SYMBOLS[name]}, {MEANING[name]}"), Cell(UNITS[name])]
+    cells = [_h(tissue_name(store, tissue)), Cell(f"{SYMBOLS[name]}, {MEANING[name]}"), Cell(UNITS[name])]
     cells += [_n(number(tissues.get(tissue, {}).get(name))) for tissues in values]
     cells += [_n(_limits(interval(store, tissue, name))), Cell(verdict(store, tissue, name))]
     if store.truth:
@@ -117,7 +124,7 @@ def site_table(store: Store) -> Table:
         "Largest force (N)",
         "Depth (mm)",
         "Error, one material (%)",
-        "Error, two materials (%)",
+        f"Error, {store.materials} (%)",
     )
     return Table(
         name="sites",
@@ -351,7 +358,8 @@ def simulated_table(store: Store) -> Table:
 def iteration_table(stage: Json) -> Table:
     """Every accepted iterate of one identification stage."""
     iterations = stage.get("iterations") or []
-    tissues = TISSUES if stage.get("name") != "one material" else TISSUES[:1]
+    known = tuple(stage.get("parameters", ()))
+    tissues = known if stage.get("name") != "one material" else known[:1]
     columns = [(tissue, name) for tissue in tissues for name in PARAMETERS]
     heads = [
         f"{tissue + ' ' if len(tissues) > 1 else ''}{SYMBOLS[name]}{_unit(name)}" for tissue, name in columns
