@@ -99,7 +99,12 @@ def check_stored(study) -> None:
     report = (results / "report/report.html").read_text()
     assert "stump" in report
     run = json.loads((results / "run.json").read_text())
-    assert set(run["inputs"]) == {"skin.stl", "tibia.stl", "1.csv", "2.csv"}
+    assert set(run["inputs"]) == {
+        "surfaces.skin",
+        "surfaces.bones.tibia",
+        "sites.1.trace",
+        "sites.2.trace",
+    }
     assert all(stage["seconds"] > 0 for stage in run["stages"].values())
     assert not [p for p in results.iterdir() if p.name.startswith((".work", ".old"))]
 

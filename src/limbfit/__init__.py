@@ -5,6 +5,7 @@ Everything the command line does is one call away:
 ========================  =========================================================
 ``limbfit demo``          ``run_demo(folder, seed=0, listener=print)``
 ``limbfit phantom``       ``make_phantom_study(folder, detail="coarse", seed=0, listener=print)``
+``limbfit series``        ``describe_series(folder)``
 ``limbfit check``         ``check_study(load_study(path), listener=print)``
 ``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
 ``limbfit status``        ``study_status(load_study(path))``
@@ -31,6 +32,7 @@ _HOME = {
     "bench_forward": "bench",
     "bench_scaling": "bench",
     "check_study": "pipeline",
+    "describe_series": "anatomy.imaging",
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",
     "run_demo": "pipeline",

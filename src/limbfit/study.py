@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from .anatomy.markups import read_markups
 from .errors import StudyError
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+BoneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ().+_-]{0,39}$")]
 PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
 ParameterName = Literal["c_kPa", "m", "gamma", "tau_s"]
 TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
@@ -52,7 +54,7 @@ class ImageTable(_Table):
 
 
 class SegmentationTable(_Table):
-    """``labels``: a corrected label map (``.seg.nrrd`` or any image); it wins over the automatic one."""
+    """``labels``: a label map (``.seg.nrrd``, image, DICOM-SEG, RTSTRUCT); it wins over the automatic one."""
 
     labels: Path | None = None
     bias_correction: bool = True
@@ -60,11 +62,22 @@ class SegmentationTable(_Table):
 
 
 class SurfacesTable(_Table):
-    """Closed surfaces as the way in, instead of an image."""
+    """Closed surfaces as the way in, instead of an image.
+
+    ``coordinates`` is by default what the files say themselves, or LPS where they do not.
+    """
 
     skin: Path
-    bones: dict[str, Path] = Field(default_factory=dict)
-    coordinates: Literal["LPS", "RAS"] = "LPS"
+    bones: dict[BoneName, Path] = Field(default_factory=dict)
+    coordinates: Literal["LPS", "RAS"] | None = None
+    unit: Literal["mm", "cm", "m", "inch"] = "mm"
+
+
+class MarkupsTable(_Table):
+    """Control points of 3D Slicer (``.mrk.json``): ``position`` or ``near`` of the sites of their names."""
+
+    file: Path
+    gives: Literal["position", "near"] = "position"
 
 
 class Plane(_Table):
@@ -256,7 +269,7 @@ class ExecutionTable(_Table):
 
 
 class Study(_Table):
-    """A checked study; ``folder`` is where it lives."""
+    """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
 
     study: StudyTable
     image: ImageTable | None = None
@@ -266,12 +279,14 @@ class Study(_Table):
     mesh: MeshTable = MeshTable()
     indenter: IndenterTable = IndenterTable()
     traces: TracesTable = TracesTable()
+    markups: MarkupsTable | None = None
     sites: tuple[Site, ...]
     material: MaterialTable = MaterialTable()
     calibration: CalibrationTable = CalibrationTable()
     solver: SolverTable = SolverTable()
     execution: ExecutionTable = ExecutionTable()
     file: Path = Field(default=Path("study.toml"), exclude=True)
+    notes: tuple[str, ...] = Field(default=(), exclude=True)
 
     @property
     def folder(self) -> Path:
@@ -289,6 +304,23 @@ class Study(_Table):
     def tissues(self) -> tuple[str, ...]:
         """Names of the materials and of the mesh's regions: the layers, outermost first, and the core."""
         return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
+
+    @property
+    def inputs(self) -> dict[str, Path]:
+        """Every file and folder that the study names, by its key."""
+        named: dict[str, Path | None] = {
+            "segmentation.labels": self.segmentation.labels,
+            "indenter.file": self.indenter.file,
+            **{f"sites.{site.name}.trace": site.trace for site in self.sites},
+        }
+        if self.image is not None:
+            named |= {"image.path": self.image.path, "image.markers": self.image.markers}
+        if self.surfaces is not None:
+            named["surfaces.skin"] = self.surfaces.skin
+            named |= {f"surfaces.bones.{name}": path for name, path in self.surfaces.bones.items()}
+        if self.markups is not None:
+            named["markups.file"] = self.markups.file
+        return {key: path for key, path in named.items() if path is not None}
 
     def path(self, relative: Path) -> Path:
         """A path of the study file as a path of this machine."""
@@ -367,13 +399,49 @@ def load_study(path: str | Path) -> Study:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise StudyError(f"not valid TOML: {error}", file=file) from None
-    content.pop("file", None)
+    content = {key: value for key, value in content.items() if key not in ("file", "notes")}
+    notes = _place_by_markups(content, file)
     try:
-        study = Study(**content, file=file)
+        study = Study(**content, file=file, notes=notes)
     except ValidationError as error:
         raise _study_error(error, file) from None
     _check_paths(study)
     return study
+
+
+def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
+    """Give sites without a place that of the control point of their name; say which points are left over.
+
+    What is malformed is left for the check of the types to refuse.
+    """
+    table, sites = content.get("markups"), content.get("sites")
+    if not isinstance(table, dict) or not isinstance(table.get("file"), str) or not isinstance(sites, list):
+        return ()
+    source = file.parent / table["file"]
+    if not source.is_file():
+        raise StudyError(f"{table['file']} does not exist", file=file, place="markups.file")
+    points = read_markups(source)
+    for site in (site for site in sites if isinstance(site, dict)):
+        name = str(site.get("name"))
+        is_placed = "position" in site or "near" in site
+        if is_placed and name in points:
+            raise StudyError(
+                "the site has a place here and a control point in the markups file",
+                file=file,
+                place=f"sites.{name}",
+                remedy="leave one of them out",
+            )
+        if not is_placed and name not in points:
+            raise StudyError(
+                f"no control point of {table['file']} is labelled {name!r}",
+                file=file,
+                place=f"sites.{name}",
+                remedy="it has " + (", ".join(map(repr, points)) or "none"),
+            )
+        if not is_placed:
+            site[table.get("gives", "position")] = points[name].tolist()
+    unused = sorted(set(points) - {str(site.get("name")) for site in sites if isinstance(site, dict)})
+    return (f"control points without a site: {', '.join(unused)}",) if unused else ()
 
 
 def _study_error(error: ValidationError, file: Path) -> StudyError:
@@ -389,20 +457,6 @@ def _study_error(error: ValidationError, file: Path) -> StudyError:
 
 def _check_paths(study: Study) -> None:
     """Every input that the study names must exist before anything runs."""
-    named: list[tuple[str, Path]] = [
-        (f"sites.{s.name}.trace", s.trace) for s in study.sites if s.trace is not None
-    ]
-    if study.image is not None:
-        named.append(("image.path", study.image.path))
-        if study.image.markers is not None:
-            named.append(("image.markers", study.image.markers))
-    if study.segmentation.labels is not None:
-        named.append(("segmentation.labels", study.segmentation.labels))
-    if study.indenter.file is not None:
-        named.append(("indenter.file", study.indenter.file))
-    if study.surfaces is not None:
-        named.append(("surfaces.skin", study.surfaces.skin))
-        named += [(f"surfaces.bones.{name}", path) for name, path in study.surfaces.bones.items()]
-    for place, path in named:
+    for place, path in study.inputs.items():
         if not study.path(path).exists():
             raise StudyError(f"{path} does not exist", file=study.file, place=place)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 from typing import Any, Self
 
 import numpy as np
@@ -117,6 +118,20 @@ class Grid:
         direction[:, list(axes)] *= -1
         array = np.flip(self.array, tuple(2 - axis for axis in axes))
         return replace(self, array=array, origin=self.index_to_point(last), direction=direction)
+
+    def nearest_lps(self) -> Self:
+        """The same samples with index axes in the order and sense nearest to x, y, z.
+
+        What is computed from them then does not depend on how the file stored them.
+        """
+        return self.along(np.eye(3))
+
+    def along(self, axes: Array) -> Self:
+        """The same samples with index axes in the order and sense nearest to the columns of ``axes``."""
+        across = np.asarray(axes).T @ self.direction
+        order = max(permutations(range(3)), key=lambda p: sum(abs(across[n, p[n]]) for n in range(3)))
+        turned = self.turned(order)
+        return turned.reversed([n for n in range(3) if across[n, order[n]] < 0])
 
     def same_grid(self, other: Grid) -> bool:
         """Whether both sample the same points: every corner voxel within 0.01 mm."""

@@ -114,7 +114,7 @@ def _sidecar_names(path: Path) -> dict[int, str]:
     if not file.is_file():
         return dict(DEFAULT_NAMES)
     try:
-        return {int(value): str(name) for value, name in json.loads(file.read_text("utf-8")).items()}
+        return {int(value): plain_name(name) for value, name in json.loads(file.read_text("utf-8")).items()}
     except (ValueError, AttributeError):
         raise LabelError(
             "the names of the labels cannot be read", file=file, remedy='write {"2": "tibia", ...}'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,8 +15,12 @@ Mask = NDArray[np.bool_]
 
 
 def plain_name(name: str) -> str:
-    """Users of other programs write ``Soft Tissue`` or ``soft_tissue``; here it is lower case with spaces."""
-    return " ".join(str(name).replace("_", " ").lower().split())
+    """Users of other programs write ``Soft Tissue`` or ``soft_tissue``; here it is lower case with spaces.
+
+    Names become names of files, so whatever is not a letter, a digit or one of ``().+-`` becomes a space.
+    """
+    words = re.sub(r"[^\w().+-]|_", " ", str(name).lower()).strip(" .").split()
+    return " ".join(words)[:40] or "unnamed"
 
 
 def flatten(masks: Sequence[Mask], names: Sequence[str]) -> tuple[NDArray[np.uint8], dict[int, str]]:

@@ -24,7 +24,7 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     """
     if labels.same_grid(like):
         return labels
-    labels = _cropped(_along(labels, like))
+    labels = _cropped(labels.along(like.direction))
     offset = _offset(labels, like)
     if offset is None:
         raise LabelError(
@@ -43,17 +43,6 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     full = np.zeros(like.array.shape, dtype=np.uint8)
     full[tuple(slice(a, b) for a, b in zip(offset[::-1], last[::-1]))] = labels.array
     return LabelMap(full, like.spacing, like.origin, like.direction, labels.names)
-
-
-def _along(labels: LabelMap, like: Grid) -> LabelMap:
-    """The same voxels with index axes in the order and sense of those of ``like``."""
-    across = like.direction.T @ labels.direction
-    order = np.argmax(np.abs(across), axis=1)
-    if len(set(order.tolist())) < 3:
-        return labels
-    turned = labels.turned(order)
-    backward = [axis for axis in range(3) if like.direction[:, axis] @ turned.direction[:, axis] < 0]
-    return turned.reversed(backward)
 
 
 def _cropped(labels: LabelMap) -> LabelMap:

@@ -20,15 +20,14 @@ from ..errors import LabelError, SurfaceError
 from .ends import ProximalEnd, layer, proximal_end
 from .extraction import extract_surface, fine_surface, remesh
 from .grid import LabelMap
+from .surfacefiles import read_surface, write_surface
 from .triangles import (
     Surface,
     bodies,
     check_closed,
     from_pyvista,
     half_edges,
-    read_surface,
     self_intersections,
-    write_surface,
 )
 
 __all__ = [
@@ -105,6 +104,7 @@ def build_anatomy(
     SurfaceError
         For a cut that misses the limb.
     """
+    labels = labels.nearest_lps()
     end = proximal_end(labels.limb, labels)
     point, normal = _default_cut(labels, end) if proximal_cut is None else _plane(*proximal_cut)
     extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)

@@ -1,11 +1,10 @@
-"""Closed triangle surfaces: the type, files, and whether one may bound a body."""
+"""Closed triangle surfaces: the type, and whether one may bound a body."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyvista as pv
@@ -19,9 +18,9 @@ from ..errors import SurfaceError
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-SUFFIXES = (".stl", ".ply", ".vtp", ".obj")
-_SMALLEST_MM = {"skin": 60.0}  # diagonal of the bounding box; a limb is larger than this, a bone than 5 mm
-_SMALLEST_BONE_MM = 5.0
+# Diagonals of the bounding box: a limb and a bone are larger; in inches or centimetres they are not.
+_SMALLEST_MM = {"skin": 60.0}
+_SMALLEST_BONE_MM = 15.0
 _LARGEST_MM = 3000.0
 
 
@@ -119,63 +118,6 @@ def half_edges(faces: Faces) -> Faces:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def read_surface(path: str | Path, coordinates: Literal["LPS", "RAS"] = "LPS") -> Surface:
-    """A surface from .stl, .ply, .vtp or .obj, in mm; coincident points are merged.
-
-    Parameters
-    ----------
-    path : the file.
-    coordinates : what the file holds; RAS is turned into LPS.
-
-    Raises
-    ------
-    SurfaceError
-        For a file that cannot be read or holds no triangles. Closedness is for :func:`check_closed`.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise SurfaceError("no such surface", file=path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise SurfaceError(
-            f"unknown kind of surface {path.suffix!r}", file=path, remedy="use one of " + " ".join(SUFFIXES)
-        )
-    surface = _read_triangles(path)
-    if not np.all(np.isfinite(surface.points)):
-        raise SurfaceError("points that are not numbers", file=path, remedy="export the surface again")
-    sign = np.array([-1.0, -1.0, 1.0]) if coordinates == "RAS" else np.ones(3)
-    return _merged(Surface(surface.points * sign, surface.faces))
-
-
-def _read_triangles(path: Path) -> Surface:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the error below says it
-            poly = pv.read(str(path))
-    except Exception:  # VTK readers raise many kinds; all mean the same to the user
-        raise SurfaceError("the surface cannot be read", file=path) from None
-    if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
-        raise SurfaceError("the file holds no triangles", file=path, remedy="export the surface again")
-    return from_pyvista(poly.triangulate())
-
-
-def _merged(surface: Surface) -> Surface:
-    """One point where several coincide exactly (STL repeats them), without faces that collapse."""
-    points, inverse = np.unique(surface.points, axis=0, return_inverse=True)
-    faces = inverse.ravel()[surface.faces]
-    a, b, c = faces.T
-    return compacted(Surface(points, faces[(a != b) & (b != c) & (c != a)]))
-
-
-def write_surface(path: str | Path, surface: Surface) -> None:
-    """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise SurfaceError(
-            f"unknown kind of surface {path.suffix!r}", file=path, remedy="use one of " + " ".join(SUFFIXES)
-        )
-    surface.to_pyvista().save(str(path))
-
-
 def check_closed(surface: Surface, name: str = "skin", file: str | Path | None = None) -> None:
     """Refuse a surface that does not bound a body.
 
@@ -221,11 +163,11 @@ def _check_size(surface: Surface, name: str, file: str | Path | None) -> None:
     diagonal = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
     smallest = _SMALLEST_MM.get(name, _SMALLEST_BONE_MM)
     if diagonal < smallest or diagonal > _LARGEST_MM:
-        unit = "metres or centimetres" if diagonal < smallest else "another unit"
+        units = "metres, centimetres or inches" if diagonal < smallest else "another unit"
         raise SurfaceError(
             f"{name}: {diagonal:.3g} mm from end to end",
             file=file,
-            remedy=f"if it was written in {unit}, scale it to millimetres",
+            remedy=f"if it is in {units}, say so (surfaces.unit in study.toml) or scale it to millimetres",
         )
 
 

@@ -67,6 +67,23 @@ def phantom(
         STDOUT.print(f"synthetic patient in {folder}; next: limbfit run {folder}")
 
 
+def series(
+    folder: Annotated[Path, typer.Argument(help="a folder of DICOM files", show_default=False)],
+    as_json: AsJson = False,
+) -> None:
+    """List the DICOM series of a folder, to choose one by its UID (image.series in study.toml)."""
+    found = limbfit.describe_series(folder)
+    if as_json:
+        print_json({"series": found})
+        return
+    for row in found:
+        number = f"series {row['number']}: " if row["number"] else ""
+        size = f"{row['slices']} slices of {row['rows']} x {row['columns']}"
+        step = " x ".join(f"{s:.4g}" for s in row["spacing_mm"]) + " mm, whole" if row["whole"] else ""
+        state = step or f"no volume: {row['why_not']}"
+        STDOUT.print(f"{number}{row['modality'] or '?'}, {size}, {state}\n  {row['uid']}", soft_wrap=True)
+
+
 def check(study: StudyPath, as_json: AsJson = False) -> None:
     """Read every input of a study and say what is wrong with it, before anything runs."""
     with listening() as listener:
@@ -208,4 +225,4 @@ def show_sites(summary: dict[str, Any]) -> None:
             STDOUT.print(f"mean error at the {kind} sites: {summary[key]:.2f} %")
 
 
-VERBS = (demo, phantom, check, run, status, simulate, report)
+VERBS = (demo, phantom, series, check, run, status, simulate, report)

@@ -29,7 +29,7 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     InputError
         For an image, label map, surface, site or record that cannot be used.
     """
-    facts: list[str] = []
+    facts = list(study.notes)
     listener(Progress("check", 0, 2, "geometry"))
     facts += _image_facts(study) if study.image is not None else _surface_facts(study)
     if study.indenter.file is not None:

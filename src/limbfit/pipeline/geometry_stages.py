@@ -117,7 +117,9 @@ def given_anatomy(study: Study) -> Anatomy:
     assert study.surfaces is not None
     tables = study.surfaces
     files = {"skin": tables.skin, **tables.bones}
-    surfaces = {name: read_surface(study.path(path), tables.coordinates) for name, path in files.items()}
+    surfaces = {
+        name: read_surface(study.path(path), tables.coordinates, tables.unit) for name, path in files.items()
+    }
     for name, surface in surfaces.items():
         check_closed(surface, name, study.path(files[name]))
     skin = surfaces.pop("skin")
@@ -133,6 +135,8 @@ def run_sites(context: Context, folder: Path) -> dict[str, Any]:
     """Where each indentation is: on the skin, with the indenter's axis; markers matched to names."""
     study = context.study
     anatomy = load_anatomy(context.store["surfaces"])
+    for note in study.notes:
+        context.tell("sites", 0, 1, note)
     context.tell("sites", 0, 1, "placing sites")
     markers = _matched_markers(context, anatomy)
     placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]

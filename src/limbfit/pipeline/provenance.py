@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..anatomy.labelfiles import sidecar
 from ..study import Study
 from .store import digest, file_digest
 
@@ -73,9 +75,34 @@ def input_files(study: Study) -> dict[str, list[Path]]:
         files["segment"] += [study.image.path, *filter(None, [study.image.markers])]
     if study.segmentation.labels is not None:
         files["segment"].append(study.segmentation.labels)
+        names = sidecar(study.segmentation.labels)
+        files["segment"] += [names] if study.path(names).is_file() else []
     if study.surfaces is not None:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
     if study.indenter.file is not None:
         files["calibrate"] = [study.indenter.file]
     files["traces"] += [site.trace for site in study.sites if site.trace is not None]
     return files
+
+
+def input_digests(study: Study) -> dict[str, str]:
+    """SHA-256 of every input by its key in the study file; names of files and folders may be a patient's."""
+    return {key: file_digest(study.path(path)) for key, path in study.inputs.items()}
+
+
+def settings_record(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
+    """Every setting of a study, with digests in place of paths and series, which may identify a person."""
+    by_path = {path: f"sha256:{digests[key][:16]}" for key, path in study.inputs.items()}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Path):
+            return by_path[value]
+        if isinstance(value, dict):
+            return {key: plain(part) for key, part in value.items()}
+        return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+
+    record = plain(study.model_dump())
+    for key in ("series", "markers_series"):
+        if record["image"] and record["image"][key]:
+            record["image"][key] = f"sha256:{digest(record['image'][key])}"
+    return record

@@ -14,7 +14,7 @@ from ..study import Study
 from .context import Context, Listener
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
 from .model_stages import run_calibrate, run_predict, run_traces
-from .provenance import code_digest, input_files, machine, versions
+from .provenance import code_digest, input_digests, input_files, machine, settings_record, versions
 from .report_stage import run_report
 from .store import Store, digest, file_digest, lock, write_json
 
@@ -170,13 +170,11 @@ def run_record(study: Study) -> dict[str, Any]:
     """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
     store = Store(study.results)
     stamps = {stage.name: store.stamp(stage.name) for stage in stages_of(study)}
-    inputs = {
-        str(path): file_digest(study.path(path)) for paths in input_files(study).values() for path in paths
-    }
+    inputs = input_digests(study)
     return {
         "limbfit": __version__,
         "study": study.study.model_dump(mode="json"),
-        "settings": study.model_dump(mode="json"),
+        "settings": settings_record(study, inputs),
         "versions": versions(),
         "machine": machine(),
         "inputs": inputs,

@@ -379,7 +379,7 @@ def provenance(store: Store) -> Section:
     known = {name: value for name, value in versions.items() if value}
     blocks = _blocks(
         tables.pair_table("versions", "Software.", ("Library", "Version"), known) if known else None,
-        tables.pair_table("inputs", "Inputs and their SHA-256.", ("File", "SHA-256"), inputs)
+        tables.pair_table("inputs", "Inputs and their SHA-256.", ("Key of the study", "SHA-256"), inputs)
         if inputs
         else None,
         otherwise="No versions and input hashes are stored.",
