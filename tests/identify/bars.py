@@ -1,6 +1,6 @@
 """A closed-form viscoelastic model whose truth is known, to be identified.
 
-At each site an incompressible bar of skin beside one of muscle, compressed together between plates
+At each site incompressible bars, one of each tissue, compressed together between plates
 (uniaxial stress, second-order Ogden, quasi-linear viscoelasticity of the nominal stress). Bars differ in
 length and section from site to site, as tissue does. Derivatives come by complex step, exact to rounding.
 """
@@ -28,10 +28,10 @@ PAPER = Unknowns(
 
 @dataclass(frozen=True)
 class Bars:
-    """A site: sections in mm^2, lengths in mm of skin and muscle, depth in mm at 0.96 mm/s."""
+    """A site: sections in mm^2 and lengths in mm of each tissue's bar, depth in mm at 0.96 mm/s."""
 
-    sections: tuple[float, float]
-    lengths: tuple[float, float]
+    sections: tuple[float, ...]
+    lengths: tuple[float, ...]
     depth: float
     points: int = 60
 
@@ -41,7 +41,7 @@ class Bars:
         time = np.linspace(0, 2 * self.depth / 0.96, n)
         travel = 0.96 * np.minimum(time, time[-1] - time)
         total = np.zeros(n, dtype=p.dtype)
-        for section, length, (c, m, gamma, tau) in zip(self.sections, self.lengths, p.reshape(2, 4)):
+        for section, length, (c, m, gamma, tau) in zip(self.sections, self.lengths, p.reshape(-1, 4)):
             stretch = 1 - travel / length
             powers = (
                 stretch ** (m - 1) - stretch ** (-m - 1) - stretch ** (-m / 2 - 1) + stretch ** (m / 2 - 1)

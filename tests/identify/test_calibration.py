@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from bars import PAPER, SITES, TRUTH, Counted, records, simulate
+from bars import NAMES, PAPER, SITES, TRUTH, Bars, Counted, records, simulate
 
 from limbfit.errors import CalibrationError, ProblemError
 from limbfit.identify import (
@@ -56,6 +56,82 @@ def test_the_second_stage_starts_where_the_first_ended_without_a_new_simulation(
     last = [h for h in found.history if h.stage == 0][-1]
     first = next(h for h in found.history if h.stage == 1)
     assert (first.parameters, first.evaluations) == (last.parameters, last.evaluations)
+
+
+THREE = tuple(f"{tissue}.{name.split('.')[1]}" for tissue in ("skin", "fat", "muscle") for name in NAMES[:4])
+TRUE_THREE = np.array([9.0, 6.0, 2.0, 0.5, 2.0, 4.0, 1.0, 1.5, 5.0, 5.0, 3.0, 0.2])
+BARS = tuple(
+    Bars(sections, lengths, depth)
+    for sections, lengths, depth in (
+        ((320.0, 60.0, 40.0), (14.0, 20.0, 18.0), 4.0),
+        ((60.0, 500.0, 40.0), (18.0, 16.0, 25.0), 5.0),
+        ((40.0, 80.0, 380.0), (20.0, 24.0, 17.0), 6.0),
+        ((250.0, 250.0, 20.0), (11.0, 15.0, 20.0), 3.5),
+        ((20.0, 250.0, 300.0), (20.0, 22.0, 26.0), 7.0),
+        ((200.0, 20.0, 250.0), (16.0, 20.0, 14.0), 4.5),
+    )
+)
+
+
+def three_tissues(**own: list[float]) -> Unknowns:
+    """Three tissues with the paper's start and bounds; ``own`` are starts by tissue."""
+    starts = [own.get(tissue, PAPER.start[:4]) for tissue in ("skin", "fat", "muscle")]
+    return Unknowns(THREE, np.concatenate(starts), np.tile(PAPER.lower[:4], 3), np.tile(PAPER.upper[:4], 3))
+
+
+def respond_three(parameters):
+    return [bar.respond(parameters) for bar in BARS]
+
+
+def test_three_tissues_are_found_from_one_start():
+    data = records(truth=TRUE_THREE, sites=BARS)
+    found = calibrate(respond_three, data, three_tissues(), CalibrationSettings(relative_tolerance=1e-5))
+    assert found.converged, found.reason
+    assert found.parameters == pytest.approx(TRUE_THREE, rel=0.02)
+    one, three = found.stages
+    assert one.grouping == (0, 1, 2, 3) * 3
+    assert one.parameters[:4] == one.parameters[4:8] == one.parameters[8:]
+    first = next(h for h in found.history if h.stage == 1)
+    assert first.parameters == one.parameters
+    assert one.evaluations + three.evaluations == found.evaluations
+
+
+def test_tissues_with_starts_of_their_own_keep_their_ratio_at_the_start_of_the_second_stage():
+    unknowns = three_tissues(fat=[4.7 / 8, 3.0, 1.2, 2.0])
+    found = calibrate(respond_three, records(truth=TRUE_THREE, sites=BARS), unknowns)
+    assert found.converged, found.reason
+    very_first = found.history[0].parameters
+    assert very_first == pytest.approx(
+        [4.7 / 2, 3.0, 1.2, 2.0] * 3
+    )  # the geometric mean of 4.7, 4.7 / 8, 4.7
+    one = np.array(found.stages[0].parameters)
+    second = np.array(next(h for h in found.history if h.stage == 1).parameters)
+    ratio = np.ones(12)
+    ratio[[0, 4, 8]] = 2, 1 / 4, 2
+    assert second == pytest.approx(one * ratio)
+    assert max(found.history[-1].errors_percent) < 0.5
+
+
+def test_a_start_in_the_tissues_ratio_that_fails_moves_to_the_answer_of_one_material():
+    unknowns = three_tissues(fat=[4.7 / 8, 3.0, 1.2, 2.0])
+    data = records(truth=TRUE_THREE, sites=BARS)
+
+    def fails(parameters):
+        apart = parameters[4] < 0.9 * parameters[0]
+        return [SiteResponse(r.force_N, r.jacobian, not apart, "too soft") for r in respond_three(parameters)]
+
+    found = calibrate(fails, data, unknowns)
+    second = next(h for h in found.history if h.stage == 1)
+    assert second.parameters == pytest.approx(found.stages[0].parameters)
+
+
+def test_a_single_tissue_has_one_stage():
+    alone = Unknowns(PAPER.names[4:], PAPER.start[4:], PAPER.lower[4:], PAPER.upper[4:])
+    bar = Bars((300.0,), (17.0,), 5.0)
+    data = records(truth=TRUTH[4:], sites=[bar])
+    found = calibrate(lambda p: [bar.respond(p)], data, alone)
+    assert len(found.stages) == 1
+    assert found.parameters == pytest.approx(TRUTH[4:], rel=5e-3)
 
 
 def test_fixed_parameters_stay_and_the_others_are_found():
