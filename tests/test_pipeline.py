@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
+from limbfit.errors import InputError
 from limbfit.mesh import read_vtu
 from limbfit.pipeline import Progress, run_study, simulate_site, study_status
 from limbfit.study import load_study
@@ -80,6 +81,8 @@ def test_interrupted_calibration_goes_on_and_ends_the_same(coarse, tmp_path_fact
     )
     check_stored(coarse)
     check_repeated_run_does_nothing(coarse)
+    check_another_held_out_record_leaves_the_calibration(coarse)
+    check_identified_parameters_are_used_until_stale(coarse)
 
 
 def check_stored(study) -> None:
@@ -113,6 +116,35 @@ def check_repeated_run_does_nothing(study) -> None:
     told = []
     run_study(load_study(study), listener=told.append)
     assert {event.text for event in told} == {"is up to date"}
+
+
+def check_another_held_out_record_leaves_the_calibration(study) -> None:
+    results = study / "results"
+    stamp = (results / "calibrate/stage.json").read_text()
+    before = {file.name for file in (results / "predict/runs").iterdir()}
+    record = np.loadtxt(study / "2.csv", delimiter=",", skiprows=1) * [1.0, 1.0, 1.1]
+    header = "time_s,displacement_mm,force_N"
+    np.savetxt(study / "2.csv", record, delimiter=",", header=header, comments="")
+    told = []
+    run_study(load_study(study), listener=told.append)
+    assert (results / "calibrate/stage.json").read_text() == stamp
+    assert any(event.stage == "calibrate" and event.text == "is up to date" for event in told)
+    assert len(before) == 4  # two sites, one material and two
+    after = {file.name for file in (results / "predict/runs").iterdir()}
+    assert len(before & after) == 2  # those of the fitted site
+
+
+def check_identified_parameters_are_used_until_stale(study) -> None:
+    found = simulate_site(load_study(study), "1", listener=quiet)
+    identified = json.loads((study / "results/calibrate/calibration.json").read_text())["stages"][-1]
+    assert found["parameters_from"] == "identified"
+    assert found["parameters"] == identified["parameters"]
+    file = study / "study.toml"
+    file.write_text(file.read_text() + "lower = { c_kPa = 0.1, m = 2.0, gamma = 0.01, tau_s = 0.01 }\n")
+    with pytest.raises(InputError, match=r"identified parameters are stale.*limbfit run.*--parameters"):
+        simulate_site(load_study(study), "1", listener=quiet)
+    given = {tissue: {**values, "c_kPa": 5.0} for tissue, values in identified["parameters"].items()}
+    assert simulate_site(load_study(study), "1", parameters=given, listener=quiet)["parameters"] == given
 
 
 def test_planned_indentation_is_simulated_without_a_record(coarse):
