@@ -29,7 +29,7 @@ from .page import Figure
 from .store import PARAMETERS, Curves, Json, Store
 from .tables import SYMBOLS, UNITS, fixed, interval, number
 
-PANEL_WIDTH_IN, MOST_POINTS, LONGEST_TITLE = 9.6, 2500, 44
+PANEL_WIDTH_IN, MOST_POINTS, LONGEST_TITLE, MOST_IN_A_ROW = 9.6, 2500, 44, 7
 
 
 def _thin(curves: Curves) -> Curves:
@@ -173,7 +173,10 @@ def convergence_figure(store: Store) -> Figure | None:
             offset += _draw_stage(axes, stage, offset)
         _finish_convergence(axes, store, stages)
         handles = [*axes[0].get_legend_handles_labels()[0], *axes[1].get_legend_handles_labels()[0]]
-        drawing.legend(handles, [str(h.get_label()) for h in handles], loc="outside upper left", ncols=6)
+        rows = math.ceil(len(handles) / MOST_IN_A_ROW)
+        columns = math.ceil(len(handles) / rows)
+        labels = [str(handle.get_label()) for handle in handles]
+        drawing.legend(handles, labels, loc="outside upper left", ncols=columns)
     last = fixed(stages[-1]["iterations"][-1].get("error_percent"), 2)
     alt = f"Error and parameters against iteration; the error ends at {last} %"
     caption = (
