@@ -114,7 +114,7 @@ class GeometryTable(_Table):
     skin_layer_mm: Positive = 3.0
     layers: tuple[Layer, ...] = ()
     core: str = Field(default="muscle", pattern=TISSUE_NAME)
-    bone_policy: Literal["trim-bone"] = "trim-bone"
+    bone_policy: Literal["trim-bone", "thin-skin"] = "trim-bone"
     bone_clearance_mm: Positive = 1.5
     proximal_cut: Plane | None = None
     amputation: Plane | None = None

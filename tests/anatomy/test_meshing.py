@@ -13,9 +13,9 @@ from limbs import SHARED, rotation
 
 from limbfit.anatomy import engines
 from limbfit.anatomy.background import LAYER, banded, box_grid, cut, volumes
+from limbfit.anatomy.columns import columns
 from limbfit.anatomy.curving import with_diagonals
-from limbfit.anatomy.extrusion import prism_tets
-from limbfit.anatomy.layers import limb_fields, signed_distance
+from limbfit.anatomy.layers import LayerSpec, limb_fields, signed_distance
 from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.anatomy.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
@@ -99,6 +99,7 @@ def test_volume_layer_and_quality(meshed: tuple) -> None:
     assert report.min_dihedral_deg >= 8.0
     assert report.min_scaled_jacobian > 0.1
     assert quality(mesh).inverted == 0
+    assert report.interface_error_mm["mean"] < 0.1
     assert report.warnings == ()
     assert sum(report.region_cells.values()) == report.cells == len(mesh.cells)
 
@@ -161,7 +162,7 @@ def test_shallow_bone_is_trimmed_and_reported() -> None:
     position, axis = site_of(shallow, np.array([1.0, 0, 0]), -40.0)
     mesh, report = mesh_site(shallow, position, axis, COARSE)
     trimmed = report.trimmed_bone["tibia"]
-    fields = limb_fields(shallow, COARSE.skin_layer_mm, COARSE.bone_clearance_mm)
+    fields = limb_fields(shallow, COARSE.layers, COARSE.bone_clearance_mm)
     nearest = fields.depth(fields.frame.to_limb(shallow.bones["tibia"].points))[0][
         fields_below(fields, shallow)
     ].min()
@@ -232,7 +233,7 @@ def test_a_mesher_that_crashes_is_an_error_not_a_crash() -> None:
 
 def test_nothing_under_the_layer_is_refused(oblique: Anatomy) -> None:
     with pytest.raises(MeshingError, match="no muscle is left"):
-        base_mesh(oblique, replace(COARSE, skin_layer_mm=60.0))
+        base_mesh(oblique, replace(COARSE, layers=(LayerSpec("skin", 60.0),)))
 
 
 def test_a_skin_that_does_not_reach_the_cut_is_refused(oblique: Anatomy) -> None:
@@ -242,12 +243,13 @@ def test_a_skin_that_does_not_reach_the_cut_is_refused(oblique: Anatomy) -> None
 
 
 def test_diagonals_follow_the_curved_edges_above_and_below() -> None:
+    stack = columns(np.array([0, 1, 2]), np.ones((1, 3), int), 3)
     points = np.array([[0.0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 1], [6, 0, 1], [0, 6, 1]])
-    tets = prism_tets(np.array([[0, 1, 2]]), np.array([3, 4, 5]))
+    tets, _ = stack.tets(np.array([[0, 1, 2]]))
     mesh = to_tet10(Mesh(points, tets, "tet4", np.zeros(3, np.int64), ("skin",)))
     flat = np.isin(mesh.points[:, 2], [0.0, 1.0]) & (np.arange(len(mesh.points)) >= 6)
     target = mesh.points + np.where(flat, 2.0, 0.0)[:, None] * np.array([0, 0, 1.0])
-    found = with_diagonals(mesh, target, np.array([0, 1, 2, 0, 1, 2])) - mesh.points
+    found = with_diagonals(mesh, target, stack) - mesh.points
     upright = (mesh.points[:, 2] == 0.5) & np.isin(mesh.points[:, :2], points[:, :2]).all(axis=1)
     diagonal = (mesh.points[:, 2] == 0.5) & (mesh.points[:, :2] % 6 != 0).any(axis=1)
     assert diagonal.sum() == 3

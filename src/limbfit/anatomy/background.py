@@ -65,7 +65,7 @@ def volumes(points: Array, tets: Ints) -> Array:
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0
 
 
-def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool_]]:
+def cut(grid: TetGrid, field: Field, bit: int, slack: float = 0.0) -> tuple[TetGrid, NDArray[np.bool_]]:
     """Cut a grid along ``field = 0``.
 
     Parameters
@@ -73,12 +73,13 @@ def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool
     grid : the grid.
     field : signed function of points (k, 3) that gives values (k,) and gradients (k, 3).
     bit : mask bit that the points on the level set receive.
+    slack : as for :func:`banded`.
 
     Returns
     -------
     The cut grid and, per tetrahedron, whether it lies where the field is positive.
     """
-    values = banded(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing)
+    values = banded(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
     edges = _crossed_edges(grid.tets, values)
     t = _roots(grid.points, edges, values, field)
     grid, snapped = _snapped(grid, edges, t, bit)
@@ -95,11 +96,12 @@ def cut(grid: TetGrid, field: Field, bit: int) -> tuple[TetGrid, NDArray[np.bool
     return TetGrid(np.vstack([grid.points, fresh]), tets, mask, grid.spacing), values[tets].sum(axis=1) > 0
 
 
-def banded(field: Field, points: Array, band: float, spacing: float) -> Array:
+def banded(field: Field, points: Array, band: float, spacing: float, slack: float = 0.0) -> Array:
     """Values (n,) of a distance-like field: exact up to ``band``, elsewhere of the right sign and beyond it.
 
-    A field that changes by at most 1 per mm cannot come back into the band within a cell whose centre is
-    farther from it than half the cell's diagonal; such cells of points are settled by one value.
+    A field that changes by at most ``slack`` more than 1 per mm cannot come back into the band within a cell
+    whose centre is farther from it than that and half the cell's diagonal; such cells of points are settled
+    by one value.
     """
     values = np.zeros(len(points))
     open_ = np.arange(len(points))  # indices that are not settled yet
@@ -109,7 +111,7 @@ def banded(field: Field, points: Array, band: float, spacing: float) -> Array:
         _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
         centres = np.asarray((index[first] + 0.5) * cell, dtype=np.float64)
         values[open_] = field(centres)[0][inverse]
-        open_ = open_[np.abs(values[open_]) <= band + np.sqrt(0.75) * cell]
+        open_ = open_[np.abs(values[open_]) <= band + slack + np.sqrt(0.75) * cell]
     values[open_] = field(points[open_])[0]
     return values
 

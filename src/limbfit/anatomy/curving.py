@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import TET10_EDGES, Mesh, node_jacobians
+from .columns import Columns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,32 +32,45 @@ def curved(mesh: Mesh, target: Array) -> Mesh:
     return mesh
 
 
-def with_diagonals(mesh: Mesh, target: Array, base: Ints) -> Array:
-    """Targets (n, 3) where diagonals across the sides of an extruded layer follow the edges above and below.
+def with_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
+    """Targets (n, 3) where edges within extruded layers follow the curved edges at their foot and head.
 
-    A diagonal that stayed straight between two curved edges would fold thin elements.
+    An edge that stayed straight between two curved ones would fold thin elements.
 
     Parameters
     ----------
     mesh : tet10, straight-sided.
-    target : (n, 3) for the mid-edge nodes of both faces of the layer.
-    base : (corners,) the node under each extruded corner node; itself for any other.
+    target : (n, 3) for the mid-edge nodes of the layers' innermost and outermost faces.
+    stack : the layers' columns.
     """
-    corners = len(base)
-    ends = np.zeros((len(mesh.points), 2), dtype=np.int64)
-    ends[mesh.cells[:, 4:].ravel()] = mesh.cells[:, TET10_EDGES].reshape(-1, 2)
-    ends = np.sort(ends[corners:], axis=1)
-    keys = ends[:, 0] * corners + ends[:, 1]
-    extruded = base != np.arange(corners)
-    top = np.arange(corners)
-    top[base[extruded]] = np.flatnonzero(extruded)
-    low, high = ends.T  # extruded nodes have the greater numbers
-    diagonal = np.flatnonzero(extruded[high] & ~extruded[low] & (base[high] != low))
-    sides = [np.sort([low[diagonal], base[high[diagonal]]], axis=0)]
-    sides.append(np.sort(top[sides[0]], axis=0))
+    corners = int(mesh.cells[:, :4].max()) + 1
+    ends = np.zeros((len(mesh.points) - corners, 2), dtype=np.int64)
+    ends[mesh.cells[:, 4:].ravel() - corners] = mesh.cells[:, TET10_EDGES].reshape(-1, 2)
+    column, share = np.full(corners, -1), np.zeros(corners)
+    column[stack.base] = np.arange(len(stack.base))
+    new = stack.top[0] + np.arange(len(stack.owner))
+    column[new] = stack.owner
+    foot, head = mesh.points[stack.base], mesh.points[stack.top]
+    length = np.linalg.norm(head - foot, axis=1)[stack.owner]
+    share[new] = np.linalg.norm(mesh.points[new] - foot[stack.owner], axis=1) / length
+    sides = column[ends]
+    within = (sides >= 0).all(axis=1) & (sides[:, 0] != sides[:, 1]) & (ends >= stack.top[0]).any(axis=1)
+    keys = _keys(ends, corners)
     order = np.argsort(keys)
-    nodes = [corners + order[np.searchsorted(keys, a * corners + b, sorter=order)] for a, b in sides]
-    target = target.copy()
     moved = target - mesh.points
-    target[corners + diagonal] += (moved[nodes[0]] + moved[nodes[1]]) / 2
+    feet, heads = (
+        moved[corners + order[np.searchsorted(keys, _keys(nodes[sides[within]], corners), sorter=order)]]
+        for nodes in (stack.base, stack.top)
+    )
+    part = share[ends[within]].mean(axis=1)[:, None]
+    target = target.copy()
+    target[corners + np.flatnonzero(within)] = (
+        mesh.points[corners:][within] + (1 - part) * feet + part * heads
+    )
     return target
+
+
+def _keys(ends: Ints, count: int) -> Ints:
+    """One number (n,) for each edge (n, 2) between ``count`` nodes."""
+    low, high = np.sort(ends, axis=1).T
+    return np.asarray(low * count + high)

@@ -1,4 +1,4 @@
-"""The skin layer as prisms between the interface and the skin, and nodes put exactly on their surfaces."""
+"""Nodes put on smooth surfaces, exactly or as far as their elements allow."""
 
 from __future__ import annotations
 
@@ -45,18 +45,3 @@ def guarded(points: Array, target: Array, tets: Ints, floor_deg: float) -> Array
             return moved
         share[bad] = share[bad] / 2 if attempt < BISECTIONS - 1 else 0.0
     return points
-
-
-def prism_tets(triangles: Ints, top: Ints) -> Ints:
-    """Three tetrahedra per prism (3 m, 4) over outward triangles (m, 3); ``top`` maps base to upper nodes.
-
-    Each quadrilateral is split from its lower-numbered base node, so neighbouring prisms agree. Volumes are
-    positive where the prism is not folded.
-    """
-    order = np.argsort(triangles, axis=1)
-    a, b, c = np.take_along_axis(triangles, order, axis=1).T
-    A, B, C = top[a], top[b], top[c]
-    tets = np.stack([a, b, c, C, a, b, C, B, a, A, B, C], axis=1).reshape(-1, 3, 4)
-    odd = (order[:, 1] - order[:, 0]) % 3 == 2
-    tets[odd] = tets[odd][:, :, [1, 0, 2, 3]]
-    return tets.reshape(-1, 4)

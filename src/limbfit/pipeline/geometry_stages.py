@@ -12,6 +12,7 @@ import numpy as np
 from ..anatomy.amputation import amputate
 from ..anatomy.body import limb_mask, smoothed
 from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
+from ..anatomy.layers import LayerSpec
 from ..anatomy.markers import find_markers, match_markers
 from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
 from ..anatomy.segmentation import segment
@@ -27,12 +28,15 @@ from ..anatomy.surfaces import (
     save_anatomy,
     write_surface,
 )
+from ..anatomy.thickness import fat_depth, read_thickness, write_thickness
 from ..errors import SiteError
 from ..mesh import write_vtu
 from ..study import Site, Study
 from .context import Context
 from .inputs import marked_image, naming, study_image, study_labels
 from .store import read_json, write_json
+
+THICKNESS = "fat-depth.vtp"
 
 
 def run_segment(context: Context, folder: Path) -> dict[str, Any]:
@@ -88,7 +92,11 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     if study.surfaces is not None:
         anatomy = given_anatomy(study)
     else:
-        anatomy = _imaged_anatomy(context)
+        labels = _limb_labels(context)
+        anatomy = _imaged_anatomy(study, labels)
+        if any(layer.thickness == "map" for layer in study.geometry.model_layers):
+            depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
+            write_thickness(folder / THICKNESS, anatomy.skin, depth)
         if study.image is not None and study.image.markers is not None:
             context.tell("surfaces", 1, 2, "skin with markers")
             marked = read_labels(context.store["segment"] / "markers.seg.nrrd")
@@ -98,12 +106,18 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _imaged_anatomy(context: Context) -> Anatomy:
+def _limb_labels(context: Context) -> LabelMap:
+    """The label map of the segment stage, after the virtual amputation where there is one."""
     geometry = context.study.geometry
     labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
-    if geometry.amputation is not None:
-        plane = geometry.amputation
-        labels = amputate(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
+    if geometry.amputation is None:
+        return labels
+    plane = geometry.amputation
+    return amputate(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
+
+
+def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
+    geometry = study.geometry
     cut = geometry.proximal_cut
     return build_anatomy(
         labels,
@@ -212,7 +226,9 @@ def make_mesh(job: MeshJob) -> dict[str, Any]:
 def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     """What all sites of a study share; a worker makes it once."""
     anatomy = load_anatomy(surfaces)
-    return anatomy, base_mesh(anatomy, settings)
+    mapped = any(layer.thickness_mm is None for layer in settings.layers)
+    depth = read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
+    return anatomy, base_mesh(anatomy, settings, depth)
 
 
 def mesh_settings(study: Study) -> MeshSettings:
@@ -225,7 +241,12 @@ def mesh_settings(study: Study) -> MeshSettings:
         growth=table.growth,
         flatness=table.flatness,
         time_limit_s=table.time_limit_s,
-        skin_layer_mm=geometry.skin_layer_mm,
+        layers=tuple(
+            LayerSpec(layer.name, layer.thickness_mm, layer.min_thickness_mm)
+            for layer in geometry.model_layers
+        ),
+        core=geometry.core,
+        bone_policy=geometry.bone_policy,
         bone_clearance_mm=geometry.bone_clearance_mm,
     )
 
