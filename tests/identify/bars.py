@@ -79,6 +79,31 @@ def records(noise: float = 0.0, seed: int = 0, truth: np.ndarray = TRUTH, sites=
     return [Measured(f"s{k}", f + noise * rng.standard_normal(f.size)) for k, f in enumerate(forces)]
 
 
+THREE = tuple(f"{tissue}.{name.split('.')[1]}" for tissue in ("skin", "fat", "muscle") for name in NAMES[:4])
+TRUE_THREE = np.array([9.0, 6.0, 2.0, 0.5, 2.0, 4.0, 1.0, 1.5, 5.0, 5.0, 3.0, 0.2])
+BARS = tuple(
+    Bars(sections, lengths, depth)
+    for sections, lengths, depth in (
+        ((320.0, 60.0, 40.0), (14.0, 20.0, 18.0), 4.0),
+        ((60.0, 500.0, 40.0), (18.0, 16.0, 25.0), 5.0),
+        ((40.0, 80.0, 380.0), (20.0, 24.0, 17.0), 6.0),
+        ((250.0, 250.0, 20.0), (11.0, 15.0, 20.0), 3.5),
+        ((20.0, 250.0, 300.0), (20.0, 22.0, 26.0), 7.0),
+        ((200.0, 20.0, 250.0), (16.0, 20.0, 14.0), 4.5),
+    )
+)
+
+
+def three_tissues(**own: list[float]) -> Unknowns:
+    """Three tissues with the paper's start and bounds; ``own`` are starts by tissue."""
+    starts = [own.get(tissue, PAPER.start[:4]) for tissue in ("skin", "fat", "muscle")]
+    return Unknowns(THREE, np.concatenate(starts), np.tile(PAPER.lower[:4], 3), np.tile(PAPER.upper[:4], 3))
+
+
+def respond_three(parameters):
+    return [bar.respond(parameters) for bar in BARS]
+
+
 class Counted:
     """A simulation that counts its calls, fails at random, or in a part of the parameter space."""
 

@@ -6,7 +6,19 @@ import json
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, Bars, Counted, records, simulate
+from bars import (
+    BARS,
+    PAPER,
+    SITES,
+    TRUE_THREE,
+    TRUTH,
+    Bars,
+    Counted,
+    records,
+    respond_three,
+    simulate,
+    three_tissues,
+)
 
 from limbfit.errors import CalibrationError, ProblemError
 from limbfit.identify import (
@@ -56,31 +68,6 @@ def test_the_second_stage_starts_where_the_first_ended_without_a_new_simulation(
     last = [h for h in found.history if h.stage == 0][-1]
     first = next(h for h in found.history if h.stage == 1)
     assert (first.parameters, first.evaluations) == (last.parameters, last.evaluations)
-
-
-THREE = tuple(f"{tissue}.{name.split('.')[1]}" for tissue in ("skin", "fat", "muscle") for name in NAMES[:4])
-TRUE_THREE = np.array([9.0, 6.0, 2.0, 0.5, 2.0, 4.0, 1.0, 1.5, 5.0, 5.0, 3.0, 0.2])
-BARS = tuple(
-    Bars(sections, lengths, depth)
-    for sections, lengths, depth in (
-        ((320.0, 60.0, 40.0), (14.0, 20.0, 18.0), 4.0),
-        ((60.0, 500.0, 40.0), (18.0, 16.0, 25.0), 5.0),
-        ((40.0, 80.0, 380.0), (20.0, 24.0, 17.0), 6.0),
-        ((250.0, 250.0, 20.0), (11.0, 15.0, 20.0), 3.5),
-        ((20.0, 250.0, 300.0), (20.0, 22.0, 26.0), 7.0),
-        ((200.0, 20.0, 250.0), (16.0, 20.0, 14.0), 4.5),
-    )
-)
-
-
-def three_tissues(**own: list[float]) -> Unknowns:
-    """Three tissues with the paper's start and bounds; ``own`` are starts by tissue."""
-    starts = [own.get(tissue, PAPER.start[:4]) for tissue in ("skin", "fat", "muscle")]
-    return Unknowns(THREE, np.concatenate(starts), np.tile(PAPER.lower[:4], 3), np.tile(PAPER.upper[:4], 3))
-
-
-def respond_three(parameters):
-    return [bar.respond(parameters) for bar in BARS]
 
 
 def test_three_tissues_are_found_from_one_start():
