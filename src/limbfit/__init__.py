@@ -10,6 +10,7 @@ Everything the command line does is one call away:
 ``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
 ``limbfit status``        ``study_status(load_study(path))``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
+``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
 ``limbfit bench``         ``bench_febio_parity(tell=print)``, ``bench_forward(..)``, ``bench_scaling(..)``
 ========================  =========================================================
@@ -37,6 +38,7 @@ _HOME = {
     "report_study": "pipeline",
     "run_demo": "pipeline",
     "run_study": "pipeline",
+    "simulate_feb": "pipeline",
     "simulate_site": "pipeline",
     "study_status": "pipeline",
 }

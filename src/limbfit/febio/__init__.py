@@ -1,7 +1,17 @@
-"""FEBio 4 beside limbfit: its inputs as problems, its logs as arrays."""
+"""FEBio beside limbfit: its inputs as problems, problems as its inputs, its logs as arrays."""
 
 from .logs import Log, read_log
-from .model import FebModel, Motion, Part, read_feb
-from .problem import to_problem
+from .model import FebModel, read_feb
+from .problem import step_control, to_problem
+from .running import FebRun, run_feb
 
-__all__ = ["FebModel", "Log", "Motion", "Part", "read_feb", "read_log", "to_problem"]
+__all__ = [
+    "FebModel",
+    "FebRun",
+    "Log",
+    "read_feb",
+    "read_log",
+    "run_feb",
+    "step_control",
+    "to_problem",
+]

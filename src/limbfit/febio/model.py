@@ -1,12 +1,11 @@
-"""Inputs of FEBio 4 (``.feb``) as arrays: mesh, named sets, materials, boundary conditions, load curves.
+"""Inputs of FEBio 3 and 4 (``.feb``): mesh, named sets, materials, conditions, contact, time and output.
 
 Read is what an indentation needs; a part of the format that would change the mechanics and is not
-understood is an error, never skipped (FEBio User Manual 4.0, chapter 3).
+understood is an error that names its line, never skipped (FEBio User Manual 4.0, chapter 3).
 """
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,182 +14,191 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import OgdenQLV
+from ..fe import Material
+from .controls import Curve, Phase, read_curves, read_phases
+from .geometry import Geometry, Indices, Part, node_set, read_geometry
+from .materials import RigidBody, read_materials
+from .requests import Request, read_requests
+from .tree import Node, read_tree
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 COMPONENTS = ("x", "y", "z")
-
-
-@dataclass(frozen=True)
-class Part:
-    """Cells (m, k) of one type in FEBio's (and VTK's) node order, and the name of their material."""
-
-    cell_type: str
-    cells: Indices
-    material: str
+CONTACTS = ("sliding-elastic", "sliding-facet-on-facet", "sliding-node-on-facet")
+_EMPTY = ("Loads", "Initial", "Constraints", "Discrete", "MeshAdaptor", "MeshData", "Include")
+_READ = (
+    "Module", "Control", "Globals", "Material", "Mesh", "MeshDomains", "Boundary", "Rigid", "Contact",
+    "LoadData", "Step", "Output",
+)  # fmt: skip
+# What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
+_CONTACT_ZERO = ("tension", "fric_coeff", "offset", "node_reloc")
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Displacement ``component`` of a node set or rigid body: ``factor`` times the load curve (0: held)."""
+    """Displacement ``component`` of nodes or of a rigid body: ``factor`` times a load curve (0: held)."""
 
     target: str
+    nodes: Indices
     component: int
     factor: float
+    curve: int
+    line: int
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact between two surfaces; ``penalty`` is times FEBio's own where ``automatic``."""
+
+    rule: str
+    surfaces: tuple[str, str]
+    penalty: float
+    automatic: bool
+    augmented: bool
+    line: int
 
 
 @dataclass(frozen=True)
 class FebModel:
-    """A ``.feb`` in mm, N, s, MPa; nodes are numbered from 0 in the order of the file.
+    """A ``.feb`` in mm, N, s, MPa.
 
-    ``materials`` are the deformable ones, ``rigid`` the centres of mass (3,) of the rigid ones, both by name;
-    ``surfaces`` faces (f, k) by name; ``contact`` the surface that may touch the rigid body, or empty;
-    ``load (n, 2)`` time and value of the load curve.
+    ``materials`` are the deformable ones, ``rigid`` the others, both by name; ``motions`` those of nodes,
+    ``rigid_motions`` those of rigid bodies; ``notes`` what was read and has no meaning for limbfit.
     """
 
-    points: Array
-    parts: Mapping[str, Part]
-    node_sets: Mapping[str, Indices]
-    surfaces: Mapping[str, Indices]
-    materials: Mapping[str, OgdenQLV]
-    rigid: Mapping[str, Array]
-    node_motions: tuple[Motion, ...]
+    geometry: Geometry
+    materials: Mapping[str, Material]
+    rigid: Mapping[str, RigidBody]
+    motions: tuple[Motion, ...]
     rigid_motions: tuple[Motion, ...]
-    contact: str
-    load: Array
+    contact: Contact | None
+    curves: Mapping[int, Curve]
+    phases: tuple[Phase, ...]
+    requests: tuple[Request, ...]
+    notes: tuple[str, ...]
+
+    def parts_of(self, materials: Mapping[str, object]) -> dict[str, Part]:
+        """The parts made of any of these materials."""
+        return {name: part for name, part in self.geometry.parts.items() if part.material in materials}
 
 
 def read_feb(path: str | Path) -> FebModel:
-    """Read a FEBio 4 input.
+    """Read a FEBio 3 or 4 input.
 
     Raises
     ------
     ProblemError
-        Where the file is missing, is not XML, or holds what limbfit does not know.
+        Where the file is missing, is not XML, or holds what limbfit does not know; with its line.
     """
+    root = read_tree(path)
     try:
-        root = ET.parse(path).getroot()
-    except OSError as error:
-        raise ProblemError(error.strerror or "cannot be read", file=path) from error
-    except ET.ParseError as error:
-        raise ProblemError(f"is not well-formed XML: {error}", file=path) from error
-    if root.tag != "febio_spec" or not root.get("version", "").startswith("4"):
-        raise ProblemError("is no input of FEBio 4", file=path, remedy="save it anew with FEBio Studio 2")
-    try:
+        version = root.attributes.get("version", "")
+        if root.tag != "febio_spec" or version.partition(".")[0] not in ("3", "4"):
+            raise root.refuse("is no input of FEBio 3 or 4", "save it anew with FEBio Studio 2")
         return _model(root)
     except ProblemError as error:
-        raise ProblemError(error.what, file=path, place=error.place) from error
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise ProblemError(
-            f"a part of the input is missing or not as expected ({error})", file=path
-        ) from error
+        raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None
 
 
-def _model(root: ET.Element) -> FebModel:
-    mesh = _child(root, "Mesh")
-    nodes = [node for group in mesh.findall("Nodes") for node in group]
-    index = {int(node.attrib["id"]): i for i, node in enumerate(nodes)}
-
-    def numbered(text: str | None) -> list[int]:
-        return [index[int(value)] for value in (text or "").split(",")]
-
-    materials, rigid = _materials(_child(root, "Material"))
-    owner = {domain.get("name"): domain.get("mat", "") for domain in _child(root, "MeshDomains")}
-    pairs = {pair.get("name"): pair.findtext("primary", "") for pair in mesh.findall("SurfacePair")}
-    contacts = [pairs[node.get("surface_pair")] for node in root.iterfind("Contact/contact")]
+def _model(root: Node) -> FebModel:
+    for section in root:
+        if "from" in section.attributes:
+            raise section.refuse("stands in another file", "write the input as one file")
+        if section.tag in _EMPTY and len(section):
+            raise section[0].refuse(f"nothing in <{section.tag}> is supported")
+        if section.tag not in (*_EMPTY, *_READ):
+            raise section.refuse("this section is not supported")
+        if section.tag == "Module" and section.attributes.get("type", "solid") != "solid":
+            raise section.refuse(f"module {section.attributes['type']!r} is not supported, only solid")
+    materials, rigid = read_materials(root.child("Material"))
+    geometry = read_geometry(root, (*materials, *rigid))
+    load = root.find("LoadData")
+    curves = read_curves(load)
+    requests, notes = read_requests(root.find("Output"))
     return FebModel(
-        points=np.array([_floats(node) for node in nodes]),
-        parts={
-            name: Part(group.get("type", ""), np.array([numbered(cell.text) for cell in group]), owner[name])
-            for name, group in _named(mesh, "Elements")
-        },
-        node_sets={name: np.array(numbered(group.text)) for name, group in _named(mesh, "NodeSet")},
-        surfaces={
-            name: np.array([numbered(face.text) for face in group]) for name, group in _named(mesh, "Surface")
-        },
-        materials=materials,
-        rigid=rigid,
-        node_motions=tuple(m for bc in root.iterfind("Boundary/bc") for m in _node_motions(bc)),
-        rigid_motions=tuple(m for bc in root.iterfind("Rigid/rigid_bc") for m in _rigid_motions(bc)),
-        contact=contacts[0] if contacts else "",
-        load=_load(root),
+        geometry,
+        materials,
+        rigid,
+        tuple(_node_motions(root.find("Boundary"), geometry, curves)),
+        tuple(_rigid_motions(root.find("Rigid"), rigid, curves)),
+        _contact(root.find("Contact"), geometry),
+        curves,
+        read_phases(root, curves),
+        requests,
+        notes,
     )
 
 
-def _child(node: ET.Element, tag: str) -> ET.Element:
-    found = node.find(tag)
-    if found is None:
-        raise ProblemError(f"has no <{tag}>")
-    return found
-
-
-def _named(mesh: ET.Element, tag: str) -> Iterator[tuple[str, ET.Element]]:
-    for group in mesh.findall(tag):
-        yield group.attrib["name"], group
-
-
-def _floats(node: ET.Element) -> list[float]:
-    return [float(value) for value in (node.text or "").split(",")]
-
-
-def _value(node: ET.Element, path: str, default: float | None = None) -> float:
-    text = node.findtext(path)
-    if text is None and default is not None:
-        return default
-    if text is None:
-        raise ProblemError(f"has no <{path}>", place=f"material {node.get('name')}")
-    return float(text)
-
-
-def _materials(section: ET.Element) -> tuple[dict[str, OgdenQLV], dict[str, Array]]:
-    soft: dict[str, OgdenQLV] = {}
-    rigid: dict[str, Array] = {}
-    for node in section:
-        name = node.attrib["name"]
-        if node.get("type") == "rigid body":
-            rigid[name] = np.array(_floats(_child(node, "center_of_mass")))
+def _node_motions(section: Node | None, geometry: Geometry, curves: Mapping[int, Curve]) -> Iterator[Motion]:
+    for bc in section or ():
+        if bc.tag != "bc":
+            raise bc.refuse("only <bc> is supported here")
+        target, kind = bc.attribute("node_set"), bc.attribute("type")
+        nodes = node_set(geometry, target, bc)
+        if kind in ("zero displacement", "fix"):
+            for i, letter in enumerate(COMPONENTS):
+                named = letter in [dof.strip() for dof in bc.string("dofs", "").split(",")]
+                if named or bc.flag(f"{letter}_dof"):
+                    yield Motion(target, nodes, i, 0.0, 0, bc.line)
+        elif kind in ("prescribed displacement", "prescribe"):
+            yield Motion(target, nodes, *_driven(bc, curves), bc.line)
         else:
-            soft[name] = _ogden(node)
-    return soft, rigid
+            raise bc.refuse(f"boundary condition {kind!r} is not supported")
 
 
-def _ogden(node: ET.Element) -> OgdenQLV:
-    """The paper's tissue: one Prony term around an Ogden pair ``c, m`` and ``c, -m``."""
-    place = f"material {node.get('name')}"
-    elastic = node.find("elastic")
-    if node.get("type") != "uncoupled viscoelastic" or elastic is None or elastic.get("type") != "Ogden":
-        raise ProblemError(f"material type {node.get('type')!r} is not known", place=place)
-    c, m = _value(elastic, "c1"), _value(elastic, "m1")
-    pair = (_value(elastic, "c2"), _value(elastic, "m2")) == (c, -m)
-    if not pair or _value(node, "g0", 1.0) != 1.0 or any(node.find(f"g{i}") is not None for i in range(2, 7)):
-        raise ProblemError("is not one Ogden pair c, m and c, -m with g0 = 1 and one Prony term", place=place)
-    # The wrapper adds its own k to the elastic material's.
-    k = _value(node, "k", 0.0) + _value(elastic, "k", 0.0)
-    return OgdenQLV(c, m, _value(node, "g1"), _value(node, "t1"), k / c)
+def _driven(bc: Node, curves: Mapping[int, Curve]) -> tuple[int, float, int]:
+    """Component, factor and load curve of a prescribed displacement."""
+    dof = bc.string("dof").lower().removeprefix("r")  # FEBio 3 calls those of a rigid body RX, ..
+    if dof not in COMPONENTS:
+        raise bc.refuse(f"degree of freedom {bc.string('dof')!r} is not supported")
+    if bc.flag("relative"):
+        raise bc.child("relative").refuse("relative displacements are not supported")
+    value = bc.find("value")
+    value = bc.child("scale") if value is None else value
+    factor, number = value.scalar(), value.attributes.get("lc", "")
+    if factor == 0.0:
+        return COMPONENTS.index(dof), 0.0, 0
+    if not (number.isdecimal() and int(number) in curves):
+        raise value.refuse(f"there is no load curve {number!r}" if number else "needs a load curve")
+    curve = curves[int(number)]
+    if curve.interpolate != "LINEAR":
+        raise value.refuse(f"load curve {number} is {curve.interpolate}; a displacement needs a linear one")
+    return COMPONENTS.index(dof), factor, int(number)
 
 
-def _node_motions(bc: ET.Element) -> Iterator[Motion]:
-    target = bc.attrib["node_set"]
-    if bc.get("type") == "zero displacement":
-        for component, letter in enumerate(COMPONENTS):
-            if bc.findtext(f"{letter}_dof") == "1":
-                yield Motion(target, component, 0.0)
-    elif bc.get("type") == "prescribed displacement":
-        yield Motion(target, COMPONENTS.index(bc.findtext("dof", "")), _value(bc, "value"))
-    else:
-        raise ProblemError(f"boundary condition {bc.get('type')!r} is not known")
+def _rigid_motions(
+    section: Node | None, rigid: Mapping[str, RigidBody], curves: Mapping[int, Curve]
+) -> Iterator[Motion]:
+    """Motions of rigid bodies; what does not move is held, as it is in every indentation."""
+    nothing = np.zeros(0, np.int64)
+    names = {str(body.number): name for name, body in rigid.items()}
+    for bc in section or ():
+        kind = bc.attribute("type")
+        name = names.get(bc.string("rb"), bc.string("rb"))
+        if name not in rigid:
+            raise bc.refuse(f"there is no rigid body {name!r}")
+        if kind in ("rigid_fixed", "fix"):
+            continue
+        if kind not in ("rigid_displacement", "prescribe"):
+            raise bc.refuse(f"rigid condition {kind!r} is not supported")
+        yield Motion(name, nothing, *_driven(bc, curves), bc.line)
 
 
-def _rigid_motions(bc: ET.Element) -> Iterator[Motion]:
-    if bc.get("type") == "rigid_displacement":
-        yield Motion(bc.findtext("rb", ""), COMPONENTS.index(bc.findtext("dof", "")), _value(bc, "value"))
-    elif bc.get("type") != "rigid_fixed":
-        raise ProblemError(f"rigid boundary condition {bc.get('type')!r} is not known")
-
-
-def _load(root: ET.Element) -> Array:
-    curves = root.findall("LoadData/load_controller")
-    if len(curves) != 1 or curves[0].findtext("interpolate") != "LINEAR":
-        raise ProblemError("has not exactly one linear load curve")
-    return np.array([_floats(point) for point in _child(curves[0], "points")])
+def _contact(section: Node | None, geometry: Geometry) -> Contact | None:
+    if section is None or not len(section):
+        return None
+    if len(section) > 1:
+        raise section[1].refuse("more than one contact is not supported")
+    node = section[0]
+    rule, pair = node.attribute("type"), node.attribute("surface_pair")
+    if rule not in CONTACTS:
+        raise node.refuse(f"contact {rule!r} is not supported", "limbfit has " + ", ".join(CONTACTS))
+    if pair not in geometry.pairs:
+        raise node.refuse(f"there is no surface pair {pair!r}")
+    for tag in _CONTACT_ZERO:
+        if node.number(tag, 0.0) != 0.0:
+            raise node.child(tag).refuse("is supported as 0 only")
+    augmented = node.string("laugon", "PENALTY").upper() not in ("PENALTY", "0")
+    penalty = node.number("penalty", 1.0)
+    if not penalty > 0.0:
+        raise node.child("penalty").refuse("is not positive")
+    return Contact(rule, geometry.pairs[pair], penalty, node.flag("auto_penalty"), augmented, node.line)

@@ -1,27 +1,59 @@
-"""A FEBio input as limbfit's own problem: same mesh, supports, materials and history."""
+"""A FEBio input as limbfit's own problem: same mesh, supports, materials, history and time steps."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import History, Indenter, Problem, Support
+from ..fe import ELEMENTS, History, Indenter, Material, Problem, RigidSurface, StepControl, Support
+from ..fe.elements import face_quadrature, reference_gradients
+from ..fe.materials import prony_factors
 from ..mesh import Mesh
-from .model import FebModel
+from .controls import step_times
+from .geometry import boundary, refuse_part, triangles
+from .model import FebModel, Motion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+# FEBio's penalty acts over the current area of the skin, limbfit's over that at rest: what touches a punch
+# has stretched by that much at the peak of the four reference cases with contact (docs/contact.md).
+CURRENT_AREA = 1.21
+
+
+@dataclass(frozen=True)
+class Body:
+    """The deformable parts as one mesh; ``nodes (n,)`` are the places of its nodes in the model's, ``number``
+    the way back (-1: none), ``cell_ids (m,)`` FEBio's numbers."""
+
+    mesh: Mesh
+    nodes: Indices
+    number: Indices
+    cell_ids: Indices
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The one history of a problem: advance (mm) in time, and the ``axis (3,)`` of the rigid body, if any.
+
+    ``factors`` of the node motions with respect to it, in their order.
+    """
+
+    history: History
+    axis: Array | None
+    factors: tuple[float, ...]
 
 
 def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: Any) -> Problem:
     """The problem of a FEBio input.
 
-    FEBio's rigid body is faces; ``indenter`` gives the shape that they stand for, which is put where the
-    body's foremost point is, along its motion.  Regions carry the names of the parts.
+    FEBio's rigid body is faces, which become an indenter of shape ``stl``; where ``indenter`` is given, they
+    stand for its shape, which is put where the body's foremost point is.  Regions carry the names of the
+    parts.
 
     Parameters
     ----------
@@ -30,72 +62,259 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     Raises
     ------
     ProblemError
-        Where the input has no deformable part, or no rigid body for the indenter.
+        Where the input has no deformable part, several element types, or motions that are not one history.
     """
-    mesh, number = _body(model)
-    fixed, supports = _supports(model, number)
-    faces = np.zeros((0, 3), np.int64)
-    if indenter is not None:
-        indenter = _placed(model, indenter)
-        faces = number[model.surfaces[model.contact]]
-    names = mesh.region_names
+    body, driven = deformable_body(model), drive(model)
+    faces, placed = np.zeros((0, 3), np.int64), None
+    if model.contact is not None:
+        faces, name = contact_faces(model, body), touching_body(model)
+        placed = _tool(model, driven, name) if indenter is None else _placed(model, driven, name, indenter)
+    elif model.rigid_motions:
+        raise ProblemError("the rigid body touches nothing: the input has no contact")
+    fixed, supports = _supports(model, body.number, driven)
+    rule = "nodes" if model.contact and model.contact.rule == "sliding-node-on-facet" else "gauss"
+    element = next(iter(model.parts_of(model.materials).values())).element
     return Problem(
-        mesh=mesh,
-        materials={name: model.materials[model.parts[name].material] for name in names},
+        mesh=body.mesh,
+        materials={
+            name: model.materials[model.geometry.parts[name].material] for name in body.mesh.region_names
+        },
         fixed=fixed,
         contact_faces=faces,
-        indenter=indenter,
-        history=History(*model.load.T),
+        indenter=placed,
+        history=driven.history,
         supports=supports,
         start="as-given",
-        **settings,
+        **{"element": element, "contact_rule": rule, **settings},
     )
 
 
-def _body(model: FebModel) -> tuple[Mesh, Indices]:
-    """The deformable parts as one mesh, and the new number of each node."""
-    parts = {name: part for name, part in model.parts.items() if part.material in model.materials}
-    if len({part.cell_type for part in parts.values()}) != 1:
-        raise ProblemError("the deformable parts are not of one element type")
+def deformable_body(model: FebModel) -> Body:
+    """The deformable parts as one mesh.
+
+    Raises
+    ------
+    ProblemError
+        Where there is none, where their elements differ, or where one is inverted.
+    """
+    parts = model.parts_of(model.materials)
+    if not parts:
+        raise ProblemError("no part is made of a deformable material")
+    first = next(iter(parts.values()))
+    for name, part in parts.items():
+        if not part.element:
+            raise refuse_part(part, name, "only tet4, tet10 and hex8 can deform")
+        if part.element != first.element:
+            raise refuse_part(
+                part, name, f"all tissue must be of one element type, not also {first.cell_type}"
+            )
     cells = np.vstack([part.cells for part in parts.values()])
+    ids = np.concatenate([part.ids for part in parts.values()])
     regions = np.repeat(np.arange(len(parts)), [len(part.cells) for part in parts.values()])
-    used = np.unique(cells)
-    number = np.full(len(model.points), -1)
-    number[used] = np.arange(len(used))
-    cell_type = next(iter(parts.values())).cell_type
-    return Mesh(model.points[used], number[cells], cell_type, regions, tuple(parts)), number
+    nodes = np.unique(cells)
+    number = np.full(len(model.geometry.points), -1)
+    number[nodes] = np.arange(len(nodes))
+    points = model.geometry.points[nodes]
+    mesh = Mesh(points, number[cells], first.cell_type, regions, tuple(parts), _node_sets(model, number))
+    _, weights = reference_gradients(ELEMENTS[first.element], points, mesh.cells)
+    bad = np.flatnonzero((weights <= 0.0).any(axis=1))
+    if len(bad):
+        part_name = mesh.region_names[regions[bad[0]]]
+        what = f"{len(bad)} elements are inverted or flat, the first is element {ids[bad[0]]}"
+        raise refuse_part(parts[part_name], part_name, what)
+    return Body(mesh, nodes, number, ids)
 
 
-def _supports(model: FebModel, number: Indices) -> tuple[Indices, tuple[Support, ...]]:
+def _node_sets(model: FebModel, number: Indices) -> dict[str, Indices]:
+    sets = {name: number[nodes] for name, nodes in model.geometry.node_sets.items()}
+    return {name: nodes for name, nodes in sets.items() if (nodes >= 0).all()}
+
+
+def contact_faces(model: FebModel, body: Body) -> Indices:
+    """The deformable of the two surfaces in contact, in the numbers of the body's nodes."""
+    assert model.contact is not None
+    for name in model.contact.surfaces:
+        faces = body.number[model.geometry.surfaces[name]]
+        if (faces >= 0).all():
+            return np.asarray(faces)
+    raise ProblemError("neither surface lies on tissue", place=f"line {model.contact.line}, <contact>")
+
+
+def touching_body(model: FebModel) -> str:
+    """The rigid body that one of the surfaces in contact lies on."""
+    assert model.contact is not None
+    surfaces = [model.geometry.surfaces[name] for name in model.contact.surfaces]
+    for name in model.rigid:
+        parts = model.parts_of({name: None}).values()
+        nodes = np.concatenate([np.zeros(0, np.int64), *(part.cells.ravel() for part in parts)])
+        if any(np.isin(surface, nodes).all() for surface in surfaces):
+            return name
+    place = f"line {model.contact.line}, <contact>"
+    raise ProblemError("neither surface is that of a rigid body", place=place)
+
+
+def drive(model: FebModel) -> Drive:
+    """The motions of the input as one history.
+
+    Raises
+    ------
+    ProblemError
+        Where bodies or nodes move by load curves that are not multiples of one another.
+    """
+    end = sum(phase.seconds for phase in model.phases)
+    moving = [m for m in (*model.rigid_motions, *model.motions) if m.factor != 0.0]
+    if not moving:
+        raise ProblemError("nothing moves: there is no prescribed displacement")
+    knots = np.unique(np.concatenate([model.curves[m.curve].points[:, 0] for m in moving]))
+    times = np.concatenate([[0.0], knots[(knots > 0.0) & (knots < end * (1.0 - 1e-9))], [end]])
+    base = model.curves[moving[0].curve].at(times)
+    if not base.any():
+        raise ProblemError("nothing moves: the load curve is zero", place=f"line {moving[0].line}")
+    scales = {m.curve: _multiple(model.curves[m.curve].at(times), base, m) for m in moving}
+    axis, length = None, 1.0
+    if {m.target for m in model.rigid_motions if m.factor != 0.0}:
+        if len({m.target for m in model.rigid_motions if m.factor != 0.0}) > 1:
+            raise ProblemError("more than one rigid body moves", place=f"line {model.rigid_motions[-1].line}")
+        axis = np.zeros(3)
+        for m in model.rigid_motions:
+            axis[m.component] += m.factor * scales.get(m.curve, 0.0)
+        length = float(np.linalg.norm(axis))
+        axis /= length
+    sign = float(np.sign(base[np.abs(base).argmax()]))
+    factors = tuple(m.factor * scales.get(m.curve, 0.0) * sign / length for m in model.motions)
+    return Drive(History(times, sign * length * base), None if axis is None else sign * axis, factors)
+
+
+def _multiple(values: Array, base: Array, motion: Motion) -> float:
+    scale = float(values @ base / (base @ base))
+    if np.abs(values - scale * base).max() > 1e-9 * np.abs(values).max():
+        raise ProblemError(
+            f"load curve {motion.curve} is no multiple of that of the other motions",
+            place=f"line {motion.line}",
+            remedy="limbfit drives everything by one history",
+        )
+    return scale
+
+
+def _supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices, tuple[Support, ...]]:
     """Nodes held in all directions, and single components held or moved."""
-    held = {
-        target: {m.component for m in model.node_motions if m.target == target and m.factor == 0.0}
-        for target in model.node_sets
-    }
-    clamped = [target for target, components in held.items() if len(components) == 3]
-    nodes = [number[model.node_sets[target]] for target in clamped]
+    held: dict[str, set[int]] = {}
+    for m in model.motions:
+        if (number[m.nodes] < 0).any():
+            raise ProblemError(f"node set {m.target!r} has nodes of no tissue", place=f"line {m.line}")
+        if m.factor == 0.0:
+            held.setdefault(m.target, set()).add(m.component)
+    clamped = {target: nodes for target, nodes in held.items() if len(nodes) == 3}
+    nodes = [number[m.nodes] for m in model.motions if m.target in clamped]
     single = tuple(
-        Support(number[model.node_sets[m.target]], m.component, m.factor)
-        for m in model.node_motions
+        Support(number[m.nodes], m.component, factor)
+        for m, factor in zip(model.motions, driven.factors)
         if m.target not in clamped
     )
     return np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64), single
 
 
-def motion_axis(model: FebModel) -> Array:
-    """Unit vector (3,) along which the rigid body moves."""
-    direction = np.zeros(3)
-    for motion in model.rigid_motions:
-        direction[motion.component] += motion.factor
-    length = np.linalg.norm(direction)
-    if abs(length - 1.0) > 1e-6:
-        raise ProblemError("the rigid body does not move by the load curve along one direction")
-    return direction / length
+def rigid_corners(model: FebModel, name: str) -> Array:
+    """Corners (m, 3, 3) of the triangles around a rigid body, mm."""
+    return np.asarray(model.geometry.points[triangles(boundary(model.parts_of({name: None}).values()))])
 
 
-def _placed(model: FebModel, indenter: Indenter) -> Indenter:
-    axis = motion_axis(model)
-    ((name, centre),) = model.rigid.items()
-    cells = [part.cells.ravel() for part in model.parts.values() if part.material == name]
-    foremost = ((model.points[np.concatenate(cells)] - centre) @ axis).max()
+def _along(model: FebModel, driven: Drive, name: str) -> Array:
+    if driven.axis is None or any(m.target != name for m in model.rigid_motions if m.factor != 0.0):
+        raise ProblemError(f"the rigid body {name!r} that touches the tissue does not move")
+    return driven.axis
+
+
+def _tool(model: FebModel, driven: Drive, name: str) -> Indenter:
+    """The faces of a rigid body as an indenter whose axis passes through the middle of the body."""
+    axis = _along(model, driven, name)
+    faces = triangles(boundary(model.parts_of({name: None}).values()))
+    used, faces = np.unique(faces, return_inverse=True)
+    frame = Indenter("sphere", axis=axis).frame
+    points = model.geometry.points[used] @ frame.T
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    middle[2] = points[:, 2].max()
+    try:
+        surface = RigidSurface(points - middle, faces.reshape(-1, 3))
+    except ProblemError as error:
+        part_name, part = next(iter(model.parts_of({name: None}).items()))
+        raise refuse_part(part, part_name, error.what) from None
+    return Indenter("stl", surface=surface, centre=middle @ frame, axis=axis)
+
+
+def _placed(model: FebModel, driven: Drive, name: str, indenter: Indenter) -> Indenter:
+    axis = _along(model, driven, name)
+    centre = model.rigid[name].centre
+    if centre is None:
+        raise ProblemError(f"the rigid body {name!r} has no center_of_mass")
+    foremost = float(((rigid_corners(model, name) - centre) @ axis).max())
     return replace(indenter, centre=centre + foremost * axis, axis=axis)
+
+
+def step_control(model: FebModel, problem: Problem, **settings: Any) -> StepControl:
+    """FEBio's time steps, a tolerance no looser than its own and, where it penalises contact, its penalty.
+
+    Augmented and nodal contact are limbfit's own, which keeps the penetration below 1 % of the depth.
+    """
+    times = step_times(model.phases, model.curves)
+    finest = min(phase.tolerance for phase in model.phases)
+    chosen: dict[str, Any] = {
+        "times": tuple(times),
+        "tolerance": min(StepControl.tolerance, max(0.1 * finest, 1e-11)),
+    }
+    contact = model.contact
+    if contact is not None and not contact.augmented and contact.rule != "sliding-node-on-facet":
+        chosen |= {"penalty": mean_penalty(model, problem, float(times[0])), "penetration": 1.0}
+    return StepControl(**{**chosen, **settings})
+
+
+def mean_penalty(model: FebModel, problem: Problem, dt: float) -> float:
+    """FEBio's penalty as `StepControl.penalty`, 1/mm.
+
+    Automatic: ``penalty E A / V`` of each face and the element behind it, with Young's modulus
+    ``9 k mu / (3 k + mu)`` over the first step of ``dt`` s; the mean over the faces.  ``sliding-elastic``
+    acts over the current area, ``sliding-facet-on-facet`` over that at rest.
+    """
+    assert model.contact is not None
+    materials = [problem.materials[name] for name in problem.mesh.region_names]
+    over = float(np.mean([material.instantaneous_modulus for material in materials]))
+    penalty = model.contact.penalty / over
+    if model.contact.rule == "sliding-elastic":
+        penalty *= CURRENT_AREA
+    if not model.contact.automatic:
+        return penalty
+    mesh, faces = problem.mesh, np.asarray(problem.contact_faces)
+    behind = _cells_behind(mesh, faces)
+    _, areas = face_quadrature(problem.formulation, mesh.points, faces, problem.contact_rule)
+    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
+    stiff = np.array([_young(material, dt) for material in materials])
+    own = stiff[mesh.regions[behind]] * areas.sum(axis=1) / weights.sum(axis=1)
+    return penalty * float(own.mean())
+
+
+def _cells_behind(mesh: Mesh, faces: Indices) -> Indices:
+    """The cell (f,) that each face belongs to."""
+    corners = faces[:, : 4 if mesh.cell_type == "hex8" else 3]
+    touched = np.flatnonzero(np.isin(mesh.cells, corners).sum(axis=1) >= corners.shape[1])
+    owner = {int(cell): set(mesh.cells[cell].tolist()) for cell in touched}
+    by_node: dict[int, list[int]] = {}
+    for cell, nodes in owner.items():
+        for node in nodes:
+            by_node.setdefault(node, []).append(cell)
+    found = []
+    for face in corners.tolist():
+        cells = [cell for cell in by_node.get(face[0], ()) if set(face) <= owner[cell]]
+        if len(cells) != 1:
+            raise ProblemError(f"a contact face belongs to {len(cells)} elements, not to one")
+        found.append(cells[0])
+    return np.array(found)
+
+
+def _young(material: Material, dt: float) -> float:
+    """Young's modulus at rest over a step of ``dt`` s, MPa."""
+    table = material.table()
+    mu = float(table.terms[:, 0].sum()) / 2.0
+    if len(table.prony):
+        ramp = prony_factors(dt, table.prony[:, 1])[1]
+        mu *= 1.0 + float(table.prony[:, 0] @ ramp)
+    return 9.0 * table.kappa * mu / (3.0 * table.kappa + mu)

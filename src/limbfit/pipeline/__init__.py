@@ -15,6 +15,7 @@ _HOME = {
     "report_study": "run",
     "run_demo": "demo",
     "run_study": "run",
+    "simulate_feb": "febfile",
     "simulate_site": "simulate",
     "study_status": "run",
     "summarise": "run",

@@ -1,0 +1,251 @@
+"""Mesh and domains of a FEBio input: nodes, parts, named sets; every reference checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from .tree import Node
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+CELL_NODES = {"tet4": 4, "tet10": 10, "hex8": 8, "penta6": 6, "tri3": 3, "tri6": 6, "quad4": 4}
+FACE_NODES = {"tri3": 3, "tri6": 6, "quad4": 4}
+# FEBio's names of an element with its quadrature, as rows of limbfit's element table.
+FORMULATIONS = {
+    ("tet4", ""): "tet4",
+    ("tet4", "TET4G1"): "tet4",
+    ("tet10", ""): "tet10g8",
+    ("tet10", "TET10G8"): "tet10g8",
+    ("tet10", "TET10G4"): "tet10",
+    ("hex8", ""): "hex8",
+    ("hex8", "HEX8G8"): "hex8",
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """Cells (m, k) of one type in FEBio's (and VTK's) node order.
+
+    ``material`` by name, ``ids (m,)`` FEBio's numbers, ``element`` the row of limbfit's element table
+    (empty for a type that limbfit cannot deform), ``line`` where it stands in the file.
+    """
+
+    cell_type: str
+    cells: Indices
+    material: str
+    ids: Indices
+    element: str
+    line: int
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What stands in ``<Mesh>`` and ``<MeshDomains>``; nodes are numbered from 0 in the order of the file."""
+
+    points: Array
+    node_ids: Indices
+    parts: Mapping[str, Part]
+    node_sets: Mapping[str, Indices]
+    surfaces: Mapping[str, Indices]
+    pairs: Mapping[str, tuple[str, str]]
+
+
+def read_geometry(root: Node, materials: Iterable[str]) -> Geometry:
+    """Read ``<Mesh>`` and ``<MeshDomains>``.
+
+    Raises
+    ------
+    ProblemError
+        For a node, element, set or material that does not exist or is there twice.
+    """
+    mesh = root.child("Mesh")
+    nodes = [node for group in mesh.all("Nodes") for node in group]
+    if not nodes:
+        raise mesh.refuse("has no nodes")
+    numbers = _Numbers(nodes)
+    owners = _owners(root.child("MeshDomains"), materials)
+    parts, seen = {}, set[int]()
+    for name, group in _named(mesh, "Elements"):
+        if name not in owners:
+            raise group.refuse(f"part {name!r} has no domain, hence no material")
+        parts[name] = _part(group, owners[name], numbers, seen)
+    for name, domain in owners.items():
+        if name not in parts:
+            raise domain.refuse(f"there is no part {name!r}")
+    surfaces = {name: _faces(group, numbers) for name, group in _named(mesh, "Surface")}
+    pairs = {}
+    for name, pair in _named(mesh, "SurfacePair"):
+        both = pair.string("primary"), pair.string("secondary")
+        for surface in both:
+            if surface not in surfaces:
+                raise pair.refuse(f"there is no surface {surface!r}")
+        pairs[name] = both
+    sets = {name: _node_set(group, numbers) for name, group in _named(mesh, "NodeSet")}
+    points = np.array([node.numbers(3) for node in nodes])
+    return Geometry(points, numbers.ids, parts, sets, surfaces, pairs)
+
+
+class _Numbers:
+    """FEBio's node numbers and the places of the nodes."""
+
+    def __init__(self, nodes: list[Node]) -> None:
+        self.place: dict[int, int] = {}
+        for i, node in enumerate(nodes):
+            if self.place.setdefault(node.identity(), i) != i:
+                raise node.refuse(f"node {node.identity()} is there twice")
+        self.ids = np.array(list(self.place), dtype=np.int64)
+
+    def of(self, node: Node, ids: list[int]) -> list[int]:
+        try:
+            return [self.place[i] for i in ids]
+        except KeyError as error:
+            raise node.refuse(f"there is no node {error.args[0]}") from None
+
+
+def _named(mesh: Node, tag: str) -> list[tuple[str, Node]]:
+    found: dict[str, Node] = {}
+    for group in mesh.all(tag):
+        name = group.attribute("name")
+        if name in found:
+            raise group.refuse(f"{name!r} is there twice")
+        found[name] = group
+    return list(found.items())
+
+
+def _owners(section: Node, materials: Iterable[str]) -> dict[str, Node]:
+    known, owners = set(materials), dict[str, Node]()
+    for domain in section:
+        name = domain.attribute("name")
+        if domain.tag not in ("SolidDomain", "ShellDomain"):
+            raise domain.refuse("this kind of domain is not supported")
+        if domain.attribute("mat") not in known:
+            raise domain.refuse(f"there is no material {domain.attribute('mat')!r}")
+        if name in owners:
+            raise domain.refuse(f"part {name!r} has two domains")
+        owners[name] = domain
+    return owners
+
+
+def _part(group: Node, domain: Node, numbers: _Numbers, seen: set[int]) -> Part:
+    # FEBio also takes the quadrature in the place of the type: TET10G4, HEX8G8, ..
+    given = group.attribute("type")
+    cell_type, rule = given.lower(), domain.attributes.get("elem_type", "")
+    for (kind, name), _ in FORMULATIONS.items():
+        if given == name:
+            cell_type, rule = kind, rule or name
+    if cell_type not in CELL_NODES:
+        raise group.refuse(f"elements of type {given!r} are not supported")
+    count = CELL_NODES[cell_type]
+    ids, cells = [], []
+    for element in group:
+        number, corners = element.identity(), element.integers()
+        if number in seen:
+            raise element.refuse(f"element {number} is there twice")
+        if len(corners) != count:
+            raise element.refuse(f"element {number} has {len(corners)} nodes; {cell_type} has {count}")
+        seen.add(number)
+        ids.append(number)
+        cells.append(numbers.of(element, corners))
+    if not ids:
+        raise group.refuse("has no elements")
+    formulation = _formulation(domain, cell_type, rule)
+    material = domain.attribute("mat")
+    return Part(cell_type, np.array(cells), material, np.array(ids), formulation, group.line)
+
+
+def _formulation(domain: Node, cell_type: str, rule: str) -> str:
+    """Limbfit's element, or nothing where the cell type is one for rigid bodies only."""
+    kind = domain.attributes.get("type", "")
+    if kind in ("", "rigid-solid", "rigid-shell") or cell_type not in ("tet4", "tet10", "hex8"):
+        known = True
+    else:  # hex8 with an uncoupled material is three-field by itself; one point makes tet4 both
+        natural = {"tet4": ("elastic-solid", "three-field-solid"), "tet10": ("elastic-solid",)}
+        known = kind in natural.get(cell_type, ("three-field-solid",))
+    if not known or (cell_type in ("tet4", "tet10", "hex8") and (cell_type, rule) not in FORMULATIONS):
+        raise domain.refuse(f"{cell_type} as {kind or rule!r} is not supported")
+    return FORMULATIONS.get((cell_type, rule), "")
+
+
+def _faces(group: Node, numbers: _Numbers) -> Indices:
+    kinds = {face.tag for face in group}
+    if len(kinds) != 1 or not kinds <= set(FACE_NODES):
+        raise group.refuse(f"a surface needs faces of one type of {', '.join(FACE_NODES)}")
+    count = FACE_NODES[kinds.pop()]
+    faces = []
+    for face in group:
+        corners = face.integers()
+        if len(corners) != count:
+            raise face.refuse(f"has {len(corners)} nodes, not {count}")
+        faces.append(numbers.of(face, corners))
+    return np.array(faces)
+
+
+def _node_set(group: Node, numbers: _Numbers) -> Indices:
+    if group.children:  # FEBio 3: <n id="1"/>
+        return np.array(numbers.of(group, [node.identity() for node in group]))
+    ids: list[int] = []
+    for text in group.text.split(","):
+        first, _, last = text.strip().partition(":")
+        try:
+            low, high = int(first), int(last or first)
+        except ValueError:
+            raise group.refuse(f"{text.strip()[:40]!r} is no node number") from None
+        if high - low >= len(numbers.ids):
+            raise group.refuse(f"there are no nodes {low} to {high}")
+        ids += range(low, high + 1)
+    return np.array(numbers.of(group, ids))
+
+
+def node_set(geometry: Geometry, name: str, node: Node) -> Indices:
+    """Nodes of a set, or, as ``@surface:name``, of a surface; ``node`` is what asks for it."""
+    kind, _, surface = name.partition(":")
+    found = geometry.node_sets.get(name)
+    if kind == "@surface" and surface in geometry.surfaces:
+        found = np.unique(geometry.surfaces[surface])
+    if found is None:
+        raise node.refuse(f"there is no node set {name!r}")
+    return found
+
+
+def boundary(parts: Iterable[Part]) -> list[Indices]:
+    """Faces (3 or 4 corners each, as in the parts) that belong to one cell only; shells are faces."""
+    single: dict[tuple[int, ...], Indices] = {}
+    for part in parts:
+        for local in _FACES[part.cell_type]:
+            for face in part.cells[:, local]:
+                key = tuple(sorted(face.tolist()))
+                if single.pop(key, None) is None:
+                    single[key] = face
+    return list(single.values())
+
+
+_TET = ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])
+_FACES: dict[str, tuple[list[int], ...]] = {
+    "tet4": _TET,
+    "tet10": _TET,
+    "hex8": ([0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]),
+    "penta6": ([0, 2, 1], [3, 4, 5], [0, 1, 4, 3], [1, 2, 5, 4], [2, 0, 3, 5]),
+    "tri3": ([0, 1, 2],),
+    "tri6": ([0, 1, 2],),
+    "quad4": ([0, 1, 2, 3],),
+}
+
+
+def triangles(faces: Iterable[Indices]) -> Indices:
+    """Faces of three or four corners as triangles (m, 3)."""
+    out = []
+    for face in faces:
+        out += [face[:3]] if len(face) == 3 else [face[[0, 1, 2]], face[[0, 2, 3]]]
+    return np.array(out, dtype=np.int64).reshape(-1, 3)
+
+
+def refuse_part(part: Part, name: str, what: str) -> ProblemError:
+    """The error that names a part and its line."""
+    ids = f"elements {part.ids.min()} to {part.ids.max()}"
+    return ProblemError(f"part {name!r} ({part.cell_type}, {ids}): {what}", place=f"line {part.line}")

@@ -1,0 +1,147 @@
+"""Materials of FEBio as limbfit's: uncoupled hyperelastic laws, with Prony terms around them.
+
+Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from ..fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from .tree import Node
+
+Array = NDArray[np.float64]
+
+ELASTIC = {
+    "Ogden": {f"{letter}{i}" for letter in "cm" for i in range(1, 7)},
+    "Mooney-Rivlin": {"c1", "c2"},
+    "incomp neo-Hookean": {"G"},
+}
+_SHARED = {"k", "density", "pressure_model", "laugon", "atol"}
+_RELAXING = {"g0", "elastic"} | {f"{letter}{i}" for letter in "gt" for i in range(1, 7)}
+_VOLUMETRIC = {
+    "": "log", "default": "log", "0": "log",
+    "NIKE3D": "nike3d", "1": "nike3d",
+    "Abaqus": "abaqus", "2": "abaqus",
+    "Abaqus (GOH)": "abaqus-goh", "3": "abaqus-goh",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A rigid material: its number in the file and its centre of mass (3,), mm; None: to be found."""
+
+    number: int
+    centre: Array | None
+
+
+def read_materials(section: Node) -> tuple[dict[str, Material], dict[str, RigidBody]]:
+    """Deformable and rigid materials by name.
+
+    Raises
+    ------
+    ProblemError
+        For a law, or a parameter of one, that limbfit does not have.
+    """
+    soft: dict[str, Material] = {}
+    rigid: dict[str, RigidBody] = {}
+    numbers = set()
+    for node in section:
+        name, number = node.attribute("name"), node.identity()
+        if name in soft or name in rigid or number in numbers:
+            raise node.refuse(f"material {name!r} or its id is there twice")
+        numbers.add(number)
+        if node.attribute("type") == "rigid body":
+            centre = node.find("center_of_mass")
+            rigid[name] = RigidBody(number, None if centre is None else np.array(centre.numbers(3)))
+            continue
+        try:
+            soft[name] = _law(node)
+        except ProblemError as error:
+            what = f"material {name}: {error.what}"
+            raise ProblemError(what, place=error.place or node.place, remedy=error.remedy) from None
+    return soft, rigid
+
+
+def _law(node: Node) -> Material:
+    kind = node.attribute("type")
+    if kind in ELASTIC:
+        return _elastic(node, 1.0, (), node.number("k", 0.0), _volumetric(node))
+    if kind != "uncoupled viscoelastic":
+        raise _unknown(node, kind)
+    elastic = node.child("elastic")
+    if elastic.attribute("type") not in ELASTIC:
+        raise _unknown(elastic, elastic.attribute("type"))
+    _only(node, _RELAXING | _SHARED)
+    g0 = node.number("g0", 1.0)
+    if not g0 > 0.0:
+        raise node.refuse("g0 is not positive: nothing would hold the tissue in the long term")
+    prony = [(node.number(f"g{i}", 0.0), i) for i in range(1, 7)]
+    terms = tuple((g / g0, node.number(f"t{i}", 1.0)) for g, i in prony if g != 0.0)
+    law = _volumetric(node)
+    if elastic.find("pressure_model") is not None and _volumetric(elastic) != law:
+        raise elastic.refuse("its pressure_model differs from that of the material around it")
+    # The wrapper adds its own k to the elastic material's; g0 scales the deviatoric part only.
+    return _elastic(elastic, g0, terms, node.number("k", 0.0) + elastic.number("k", 0.0), law)
+
+
+def _unknown(node: Node, kind: str) -> ProblemError:
+    remedy = "limbfit has uncoupled materials: " + ", ".join(ELASTIC) + ", and uncoupled viscoelastic"
+    if kind in ("neo-Hookean", "isotropic elastic"):
+        remedy = "use 'incomp neo-Hookean' with G = E / (2 (1 + v)) and k = E / (3 (1 - 2 v))"
+    return node.refuse(f"material type {kind!r} is not known", remedy)
+
+
+def _volumetric(node: Node) -> str:
+    name = node.string("pressure_model", "")
+    if name not in _VOLUMETRIC:
+        raise node.child("pressure_model").refuse(f"volumetric law {name!r} is not known")
+    return _VOLUMETRIC[name]
+
+
+def _only(node: Node, known: set[str]) -> None:
+    for child in node:
+        if child.tag not in known:
+            raise child.refuse("this parameter of the material is not known")
+        varies = child.attributes.get("lc") or child.attributes.get("type") not in (None, "const")
+        if varies and child.tag != "elastic":
+            raise child.refuse("a parameter that changes in time or space is not supported")
+    if node.flag("laugon"):
+        raise node.child("laugon").refuse("augmented incompressibility is not supported")
+
+
+def _elastic(
+    node: Node, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
+) -> Material:
+    """The law of ``node``, its moduli times ``scale``, with bulk modulus ``k`` (MPa)."""
+    kind = node.attribute("type")
+    _only(node, ELASTIC[kind] | _SHARED)
+    if not k > 0.0:
+        raise node.refuse("has no positive bulk modulus k")
+    shared: dict[str, Any] = {"prony": prony, "volumetric": law}
+    if kind == "incomp neo-Hookean":
+        mu = scale * node.number("G")
+        return NeoHookean(mu, kappa_ratio=k / _modulus(node, mu), **shared)
+    if kind == "Mooney-Rivlin":
+        c1, c2 = scale * node.number("c1"), scale * node.number("c2", 0.0)
+        return MooneyRivlin(c1, c2, kappa_ratio=k / _modulus(node, 2.0 * (c1 + c2)), **shared)
+    terms = [(scale * node.number(f"c{i}", 0.0), node.number(f"m{i}", 1.0)) for i in range(1, 7)]
+    terms = [term for term in terms if term[0] != 0.0]
+    ratio = k / _modulus(node, sum(c for c, _ in terms) / 2.0)
+    if len(terms) == 2 and law == "log" and len(prony) < 2:
+        (c, m), (other, minus) = terms
+        if (c, m) == (other, -minus) and m > 0.0:
+            gamma, tau = prony[0] if prony else (0.0, 1.0)
+            return OgdenQLV(c, m, gamma, tau, ratio)
+    return Ogden(tuple(terms), kappa_ratio=ratio, **shared)
+
+
+def _modulus(node: Node, mu: float) -> float:
+    if not mu > 0.0:
+        raise node.refuse(f"the shear modulus of small strains is {mu:.4g} MPa, not positive")
+    return mu
