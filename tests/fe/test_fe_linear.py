@@ -7,11 +7,13 @@ import pytest
 import scipy.sparse as sp
 from blocks import punch
 
-from limbfit.fe import System
+from limbfit.bench.blocks import punched_block
+from limbfit.fe import StepControl, System
 from limbfit.fe.factor import Factor
 from limbfit.fe.history import Memory
 from limbfit.fe.laws import Laws
 from limbfit.fe.linear import SOLVERS, NotPositiveDefiniteError, linear_solver, symmetric_product
+from limbfit.fe.stepping import Simulation
 
 
 def system(n: int = 200) -> tuple[sp.csr_matrix, np.ndarray]:
@@ -75,3 +77,10 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
     off = np.linalg.norm(b - factor.product(data, x), axis=0)
     assert (off <= 1e-6 * np.linalg.norm(b, axis=0)).all()
     assert factor.counts["inexact"] == 0
+
+
+def test_a_deep_first_step_does_not_cost_the_single_precision():
+    """Stiff contact deep inside makes the first tangent indefinite, which says nothing of the digits."""
+    run = Simulation(punched_block("tet10", 6), StepControl(), False, None)
+    next(run.run())
+    assert run.factor.counts["double_precision"] == 0

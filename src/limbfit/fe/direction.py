@@ -27,7 +27,7 @@ def newton_direction(system: System, at: Evaluation, factor: Factor, tolerance: 
     """
     b = -at.residual.ravel()[system.free][:, None]
     if not factor.ready:
-        renew(at, factor)
+        _begin(system, at, factor)
     if at.touch is None:
         found = factor.solve(at.tangent, b, None, tolerance)
         if not found.converged and found.convex:
@@ -117,6 +117,14 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     if not found.convex:
         return factor.solve_indefinite(at.tangent, b, tolerance, x)
     return found.x
+
+
+def _begin(system: System, at: Evaluation, factor: Factor) -> None:
+    """The first factor, without contact: it is positive definite, however deep the indenter is at first."""
+    if at.touch is None:
+        factor.factorise(at.tangent)
+    else:
+        factor.factorise(system.with_springs(at.tangent, -at.touch.blocks), np.zeros_like(at.touch.blocks))
 
 
 def renew(at: Evaluation, factor: Factor) -> None:

@@ -84,7 +84,8 @@ class Factor:
 
     def next_step(self) -> None:
         """From here the cost counts for another step."""
-        self._costs.append(0.0)
+        if self._costs != [0.0]:  # a factor made between steps has served none yet
+            self._costs.append(0.0)
 
     def factorise(self, data: Array, blocks: Array | None = None) -> None:
         """Factorise; a tangent that is not positive definite is shifted until it is.
