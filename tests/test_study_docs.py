@@ -29,7 +29,7 @@ def keys_of(table: type[BaseModel], prefix: str, default: Any) -> Iterator[tuple
     for name, field in table.model_fields.items():
         value = getattr(default, name) if isinstance(default, BaseModel) else field.default
         inside = tables_in(field.annotation)
-        if field.exclude:
+        if field.exclude and not prefix:
             continue
         if inside:
             yield from keys_of(inside[0], f"{prefix}{name}.", value)

@@ -196,7 +196,8 @@ def _problem(model: SiteModel, parameters: Parameters) -> Problem:
     return known.with_materials(materials(parameters, model.kappa_ratio))
 
 
-def _steps(model: SiteModel) -> StepControl:
+def steps_of(model: SiteModel) -> StepControl:
+    """How the solver steps through a site's history, before it adapts."""
     return StepControl(load_steps=model.steps.load_steps, unload_steps=model.steps.unload_steps)
 
 
@@ -208,7 +209,7 @@ def simulate(job: SimulationJob) -> Simulation:
     model = job.model
     result = solve(
         _problem(model, to_parameters(np.array(job.parameters), job.tissues)),
-        steps=_steps(model),
+        steps=steps_of(model),
         sensitivities=job.sensitivities,
         warm_start=_last.get(model),
         store="all",
@@ -239,7 +240,7 @@ def simulate_fields(
     frames = None if animation is None else Animation(problem, animation)
     result = solve(
         problem,
-        steps=_steps(model),
+        steps=steps_of(model),
         warm_start=_last.get(model),
         on_step=None if frames is None else frames.add,
         store="peak",

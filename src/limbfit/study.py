@@ -256,10 +256,23 @@ class CalibrationTable(_Table):
 
 
 class SolverTable(_Table):
-    """Steps over loading and unloading before the solver adapts them."""
+    """Steps over loading and unloading before the solver adapts them.
 
+    ``solver`` is what ``limbfit simulate`` runs; identification and prediction are always limbfit's own.
+    """
+
+    solver: Literal["limbfit", "febio"] = Field(default="limbfit", exclude=True)  # of no stage, so of no key
     load_steps: Annotated[int, Field(ge=2, le=500)] = 10
     unload_steps: Annotated[int, Field(ge=2, le=500)] = 8
+
+
+class FebioTable(_Table):
+    """FEBio beside limbfit: where it is, what it may take, and its contact penalty (times its automatic one)."""
+
+    program: Path | None = None
+    threads: Annotated[int, Field(ge=1, le=256)] = 1
+    time_limit_s: Positive = 3600.0
+    penalty: Positive = 3.0
 
 
 class ExecutionTable(_Table):
@@ -284,6 +297,7 @@ class Study(_Table):
     material: MaterialTable = MaterialTable()
     calibration: CalibrationTable = CalibrationTable()
     solver: SolverTable = SolverTable()
+    febio: FebioTable = FebioTable()
     execution: ExecutionTable = ExecutionTable()
     file: Path = Field(default=Path("study.toml"), exclude=True)
     notes: tuple[str, ...] = Field(default=(), exclude=True)

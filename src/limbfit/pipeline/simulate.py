@@ -42,7 +42,7 @@ def simulate_site(
     """
     site = study.site(name)
     store = Store(study.results)
-    used, origin = (parameters, "given") if parameters else _known_parameters(study, store)
+    used, origin = (parameters, "given") if parameters else known_parameters(study, store)
     run_study(study, until="mesh", listener=listener)
     context = Context(study, store, SerialExecutor(), listener)
     model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
@@ -79,7 +79,7 @@ def simulate_site(
     return found
 
 
-def _known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
+def known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
     """The identified parameters, else the study's start, and which they are.
 
     Neither will do where the calibration is stale: it is not this study's, and who has identified a model
