@@ -267,7 +267,7 @@ class SolverTable(_Table):
 
 
 class FebioTable(_Table):
-    """FEBio beside limbfit: where it is, what it may take, and its contact penalty (times its automatic one)."""
+    """FEBio beside limbfit: where it is, what it may take; ``penalty`` is times its automatic one."""
 
     program: Path | None = None
     threads: Annotated[int, Field(ge=1, le=256)] = 1
