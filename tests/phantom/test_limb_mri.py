@@ -8,7 +8,7 @@ import pydicom
 import pytest
 import SimpleITK as sitk  # noqa: N813
 
-from limbfit.phantom.geometry import BONES, make_limb
+from limbfit.phantom.geometry import BONES, SKIN_AND_FAT, make_limb
 from limbfit.phantom.mri import (
     BIAS,
     CORTEX_MM,
@@ -101,6 +101,15 @@ def test_tags_are_those_of_one_mr_study_of_nobody(series) -> None:
     assert first.FrameOfReferenceUID == other.FrameOfReferenceUID
     assert first.SeriesInstanceUID != other.SeriesInstanceUID
     assert float(first.SpacingBetweenSlices) == pytest.approx(2.0)
+
+
+def test_the_bright_layer_is_as_thick_as_skin_and_fat(limb, grid, points) -> None:
+    fat = make_limb(0, SKIN_AND_FAT)
+    image = rendered(fat, grid, noise=0.0)
+    skin, bones = fat.skin(points), fat.bones(points)
+    band = (skin < -4.2) & (skin > -4.8) & (bones > 8)
+    assert fat.layers_mm == 6.0
+    assert np.median(image[band]) > 1.6 * np.median(rendered(limb, grid, noise=0.0)[band])
 
 
 def test_contrast_is_that_of_an_ultra_short_echo(limb, clean, points) -> None:

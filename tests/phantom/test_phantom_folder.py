@@ -91,6 +91,26 @@ def test_another_seed_is_another_patient() -> None:
         assert 3.8 < parameters["muscle"]["c_kPa"] < 5.2
 
 
+def test_a_limb_with_fat_has_three_tissues_and_is_the_same_otherwise(tmp_path, made) -> None:
+    jobs = []
+
+    def kept(function, given):
+        jobs.extend(given)
+        return cubic_law(function, jobs)
+
+    truth = make_phantom(tmp_path / "study", seed=2, sites=["05"], fat=True, mapping=kept)
+    study = load_study(tmp_path / "study")
+    assert study.tissues == tuple(truth["parameters"]) == ("skin", "fat", "muscle")
+    _, plain = made
+    assert truth["limb"] == plain["limb"]
+    assert truth["parameters"]["muscle"] == plain["parameters"]["muscle"]
+    assert truth["parameters"]["fat"]["c_kPa"] < truth["parameters"]["muscle"]["c_kPa"]
+    assert jobs[0].parameters == truth["parameters"]
+    assert [layer.name for layer in jobs[0].mesh.layers] == ["skin", "fat"]
+    stated = [layer.thickness_mm for layer in study.geometry.layers]
+    assert [layer.thickness_mm for layer in jobs[0].mesh.layers] == stated
+
+
 def test_a_failure_leaves_nothing_behind(tmp_path) -> None:
     def breaks(function, jobs):
         yield from cubic_law(function, list(jobs)[:1])

@@ -56,11 +56,12 @@ def phantom(
         Detail, typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
     ] = Detail.coarse,
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
+    fat: Annotated[bool, typer.Option("--fat", help="three tissues: skin, fat and muscle")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
     with listening() as listener:
-        truth = limbfit.make_phantom_study(folder, detail=detail.value, seed=seed, listener=listener)
+        truth = limbfit.make_phantom_study(folder, detail=detail.value, seed=seed, fat=fat, listener=listener)
     if as_json:
         print_json({"study": str(folder / "study.toml"), **truth})
     else:

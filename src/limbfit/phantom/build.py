@@ -15,7 +15,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from ..anatomy.surfaces import save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
 from .forces import MESHES, ForceJob, TrueForce, site_force
-from .geometry import Limb, make_limb
+from .geometry import SKIN_AND_FAT, SKIN_LAYER, Limb, make_limb
 from .mri import DETAIL_GRIDS, make_grid, write_series
 from .record import Ramp, record
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
@@ -39,19 +39,25 @@ PARAMETER_BASE: Parameters = {
     "skin": {"c_kPa": 7.5, "m": 6.0, "gamma": 2.5, "tau_s": 0.5},
     "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.2, "tau_s": 0.3},
 }
+FAT_BASE = {"c_kPa": 2.2, "m": 4.0, "gamma": 1.2, "tau_s": 0.9}
 PARAMETER_SPREAD = 0.15
 KAPPA_RATIO = 100.0
 
 
-def true_parameters(seed: int) -> Parameters:
-    """The tissues of a seed: within 15 % of the base, three digits."""
+def true_parameters(seed: int, fat: bool = False) -> Parameters:
+    """The tissues of a seed, with or without fat: within 15 % of the base, three digits."""
     random = np.random.default_rng([seed, 7])
+    found = {tissue: _drawn(values, random) for tissue, values in PARAMETER_BASE.items()}
+    if not fat:
+        return found
+    between = _drawn(FAT_BASE, np.random.default_rng([seed, 9]))
+    return {"skin": found["skin"], "fat": between, "muscle": found["muscle"]}
+
+
+def _drawn(values: dict[str, float], random: np.random.Generator) -> dict[str, float]:
     return {
-        tissue: {
-            name: float(f"{value * (1 + PARAMETER_SPREAD * random.uniform(-1, 1)):.3g}")
-            for name, value in values.items()
-        }
-        for tissue, values in PARAMETER_BASE.items()
+        name: float(f"{value * (1 + PARAMETER_SPREAD * random.uniform(-1, 1)):.3g}")
+        for name, value in values.items()
     }
 
 
@@ -60,6 +66,7 @@ def make_phantom(
     detail: str = "coarse",
     seed: int = 0,
     sites: Sequence[str] | None = None,
+    fat: bool = False,
     mapping: Mapping = map,
     progress: Listener | None = None,
 ) -> dict[str, Any]:
@@ -71,6 +78,7 @@ def make_phantom(
     detail : ``coarse`` (2.4 mm voxels, 6 sites) or ``paper`` (the paper's voxels, 18 sites).
     seed : which patient; the same seed gives the same files.
     sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
+    fat : three tissues, skin of 1.5 mm over fat of 4.5 mm over muscle, instead of two.
     mapping : like ``map``; given one that works in several processes, sites are simulated side by side.
     progress : called with what is being done, how much of it is done, and of how much.
 
@@ -88,14 +96,16 @@ def make_phantom(
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
-    limb = make_limb(seed)
+    limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER)
+    parameters = true_parameters(seed, fat)
     everywhere = true_sites(limb, seed)
     indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
     with _appearing(folder) as work:
         _write_images(work, limb, everywhere, detail, seed, tell)
-        truth = _truth(limb, everywhere, detail, seed)
-        truth["sites"] = _write_traces(work, limb, indented, detail, seed, mapping, tell)
-        (work / "study.toml").write_text(study_text(indented, detail, seed), encoding="utf-8")
+        truth = _truth(limb, everywhere, detail, seed, parameters)
+        truth["sites"] = _write_traces(work, limb, indented, detail, seed, parameters, mapping, tell)
+        text = study_text(indented, detail, seed, limb.layers)
+        (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
 
@@ -142,6 +152,7 @@ def _write_traces(
     indented: Sequence[TrueSite],
     detail: str,
     seed: int,
+    parameters: Parameters,
     mapping: Mapping,
     tell: Listener,
 ) -> list[dict[str, Any]]:
@@ -150,7 +161,7 @@ def _write_traces(
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, true_anatomy(limb))
-    parameters = true_parameters(seed)
+    settings = replace(MESHES[detail], layers=limb.layers)
     jobs = [
         ForceJob(
             site.name,
@@ -159,7 +170,7 @@ def _write_traces(
             _triple(site.axis),
             _ramp(site),
             parameters,
-            MESHES[detail],
+            settings,
         )
         for site in indented
     ]
@@ -207,11 +218,13 @@ def _site_facts(site: TrueSite) -> dict[str, Any]:
     }
 
 
-def _truth(limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int) -> dict[str, Any]:
+def _truth(
+    limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, parameters: Parameters
+) -> dict[str, Any]:
     return {
         "seed": seed,
         "detail": detail,
-        "parameters": true_parameters(seed),
+        "parameters": parameters,
         "kappa_ratio": KAPPA_RATIO,
         "indenter_mm": INDENTER_MM,
         "limb": {
@@ -220,5 +233,5 @@ def _truth(limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int) -
             "origin_mm": limb.origin.tolist(),
         },
         "markers": [_site_facts(site) for site in everywhere],
-        "mesh": asdict(MESHES[detail]),
+        "mesh": {**asdict(MESHES[detail]), "layers": [asdict(layer) for layer in limb.layers]},
     }

@@ -14,9 +14,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ..anatomy.layers import LayerSpec
+
 Array = NDArray[np.floating]
 BONES = ("tibia", "fibula", "patella", "femur")
 PROXIMAL_CUT_MM = 250.0
+# Tissue over the muscle, outermost first: as in the paper, or with fat of its own.
+SKIN_LAYER = (LayerSpec("skin", 3.0),)
+SKIN_AND_FAT = (LayerSpec("skin", 1.5), LayerSpec("fat", 4.5))
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,12 @@ class Limb:
     shape: LimbShape
     rotation: NDArray[np.float64]
     origin: NDArray[np.float64]
+    layers: tuple[LayerSpec, ...] = SKIN_LAYER
+
+    @property
+    def layers_mm(self) -> float:
+        """Depth of the muscle under the skin's surface."""
+        return sum(layer.thickness_mm or 0.0 for layer in self.layers)
 
     def to_limb(self, points: Array) -> Array:
         """Points (..., 3) from LPS to the limb frame."""
@@ -131,15 +142,15 @@ class Limb:
         return self.rotation @ np.array([0.0, 0.0, 1.0])
 
 
-def make_limb(seed: int) -> Limb:
-    """The limb of a seed: its shape, lying 8 to 14 degrees off the patient axes."""
+def make_limb(seed: int, layers: tuple[LayerSpec, ...] = SKIN_LAYER) -> Limb:
+    """The limb of a seed: its shape, lying 8 to 14 degrees off the patient axes, under some layers."""
     random = np.random.default_rng([seed, 2])
     lean = np.deg2rad(random.uniform(8, 14))
     towards = random.uniform(0, 2 * np.pi)
     lean_axis = np.array([np.cos(towards), np.sin(towards), 0.0])
     turn = rotation_about(np.array([0.0, 0.0, 1.0]), np.deg2rad(random.uniform(-8, 8)))
     origin = np.array([-95.0, 15.0, -420.0]) + random.uniform(-15, 15, 3)
-    return Limb(limb_shape(seed), rotation_about(lean_axis, lean) @ turn, origin)
+    return Limb(limb_shape(seed), rotation_about(lean_axis, lean) @ turn, origin, layers)
 
 
 def gradient_of(field, points: Array, step: float = 0.05) -> NDArray[np.float64]:  # type: ignore[no-untyped-def]

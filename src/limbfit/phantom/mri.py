@@ -21,7 +21,6 @@ from scipy.special import ndtr
 from .geometry import BONES, PROXIMAL_CUT_MM, Limb, rotation_about
 
 FAT, MUSCLE, MARROW, CORTEX, MARKER = 1.0, 0.5, 0.8, 0.12, 1.15
-FAT_THICKNESS_MM = 3.0
 CORTEX_MM = {"tibia": 3.2, "fibula": 2.4, "patella": 2.4, "femur": 2.8}
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
 NOISE = MUSCLE / 27.0
@@ -98,7 +97,7 @@ def _occupancy(
 
 def _tissue(limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float]) -> tuple:
     """Noise-free signal of a block and the share of each voxel inside the skin."""
-    skin, inner = _occupancy(limb.skin(points), spacing, (0.0, FAT_THICKNESS_MM))
+    skin, inner = _occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
     signal = FAT * skin + (MUSCLE - FAT) * inner
     for name in BONES:
         bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, CORTEX_MM[name]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ..anatomy.layers import LayerSpec
 from .sites import INDENTER_MM, TrueSite
 
 _HEAD = """\
@@ -19,7 +20,7 @@ path = "mri/plain"        # DICOM, ultra-short echo time
 markers = "mri/markers"   # the same limb with skin markers on
 
 [geometry]
-skin_layer_mm = 3.0       # skin and adipose tissue, uniform
+{layers}
 surface_edge_mm = {surface:.1f}
 
 [indenter]
@@ -63,12 +64,28 @@ near = [{x:.1f}, {y:.1f}, {z:.1f}]
 """
 
 
-def study_text(sites: Sequence[TrueSite], detail: str, seed: int) -> str:
-    """The content of ``study.toml`` for some sites."""
-    surface = _SURFACE_EDGE_MM[detail]
-    parts = [_HEAD.format(seed=seed, detail=detail, surface=surface, width=INDENTER_MM, mesh=_MESH[detail])]
+def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequence[LayerSpec]) -> str:
+    """The content of ``study.toml`` for some sites of a limb under some layers."""
+    head = _HEAD.format(
+        seed=seed,
+        detail=detail,
+        layers=_layers(layers),
+        surface=_SURFACE_EDGE_MM[detail],
+        width=INDENTER_MM,
+        mesh=_MESH[detail],
+    )
+    parts = [head]
     for site in sites:
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
     return "".join(parts)
+
+
+def _layers(layers: Sequence[LayerSpec]) -> str:
+    if len(layers) == 1:
+        return f"skin_layer_mm = {layers[0].thickness_mm}       # skin and adipose tissue, uniform"
+    tables = ", ".join(
+        f'{{ name = "{layer.name}", thickness_mm = {layer.thickness_mm} }}' for layer in layers
+    )
+    return f"layers = [{tables}]   # uniform, over muscle"

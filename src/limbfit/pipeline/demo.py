@@ -15,7 +15,7 @@ from .store import read_json
 
 
 def make_phantom_study(
-    folder: Path, *, detail: str, seed: int, listener: Listener, workers: int = 0
+    folder: Path, *, detail: str, seed: int, fat: bool = False, listener: Listener, workers: int = 0
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
     with make_executor(workers) as executor:
@@ -23,6 +23,7 @@ def make_phantom_study(
             folder,
             detail=detail,
             seed=seed,
+            fat=fat,
             mapping=executor.map,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
         )
