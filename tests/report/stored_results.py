@@ -67,6 +67,13 @@ def add_fat(folder: Path) -> Path:
     told["verdict"] = {name: told["verdict"].get(name, "not determined") for name in names}
     file.write_text(json.dumps(content))
     truth.write_text(json.dumps({"parameters": with_fat(TRUTH, FAT)}))
+    meshes = json.loads((folder / "mesh" / "mesh.json").read_text())
+    for facts in meshes["sites"].values():
+        facts["layer_thickness_mm"] = {
+            "skin": {"mean": 1.5, "std": 0.01, "min": 1.4, "max": 1.6},
+            "fat": {"mean": 4.72, "std": 1.31, "min": 1.0, "max": 8.0},
+        }
+    (folder / "mesh" / "mesh.json").write_text(json.dumps(meshes))
     run = json.loads((folder / "run.json").read_text())
     layers = [
         {"name": "skin", "thickness_mm": 1.5},

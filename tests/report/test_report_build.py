@@ -143,6 +143,7 @@ def test_three_tissues_stand_in_every_table_and_curve(copy: Path) -> None:
     assert "first as one material, then as skin, fat and muscle." in text
     assert "three materials predict better." in text
     assert "Error, three materials (%)" in _section(text, "prediction")
+    assert "skin 1.50 ± 0.01, fat 4.72 ± 1.31" in _section(text, "meshes")
     assert "skin (1.5 mm) and fat (as thick as the segmented fat, at least 1.0 mm)" in text
     convergence = _section(text, "convergence")
     assert convergence.count("var(--third)") >= 4  # the third tissue's curve, a panel for each parameter

@@ -288,29 +288,39 @@ def mesh_table(store: Store) -> Table:
         "Nodes",
         "Elements",
         "Smallest dihedral (°)",
-        "Layer (mm)",
+        "Layers (mm)",
         "Bone trimmed (mm³)",
         "Time",
     )
     rows = tuple(_mesh_row(site, facts, site in store.fitted) for site, facts in store.mesh.items())
-    caption = "Meshes. The layer is the mean ± standard deviation of the skin–adipose thickness."
+    caption = "Meshes. Layers are the mean ± standard deviation of their thickness, outermost first."
     return Table("meshes", caption, head, rows)
 
 
 def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
     trimmed = [bone.get("volume_mm3", 0.0) for bone in (facts.get("trimmed_bone") or {}).values()]
-    layer = f"{fixed(facts.get('layer_mean_mm'), 2)} ± {fixed(facts.get('layer_std_mm'), 2)}"
     cells = (
         _h(site),
         Cell(str(facts.get("element", NOTHING))),
         _n(_count(facts.get("nodes"))),
         _n(_count(facts.get("cells"))),
         _n(fixed(facts.get("min_dihedral_deg"))),
-        _n(layer),
+        _n(_layers(facts)),
         _n(fixed(sum(trimmed), 0)),
         _n(duration(facts.get("seconds"))),
     )
     return Row(cells, marked)
+
+
+def _layers(facts: Json) -> str:
+    """Thickness of the layer, or of each by its name."""
+    each = facts.get("layer_thickness_mm") or {}
+    if len(each) < 2:
+        return f"{fixed(facts.get('layer_mean_mm'), 2)} ± {fixed(facts.get('layer_std_mm'), 2)}"
+    return ", ".join(
+        f"{name} {fixed(values.get('mean'), 2)} ± {fixed(values.get('std'), 2)}"
+        for name, values in each.items()
+    )
 
 
 def _count(value: Any) -> str:
