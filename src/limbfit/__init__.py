@@ -10,6 +10,8 @@ Everything the command line does is one call away:
 ``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
 ``limbfit status``        ``study_status(load_study(path))``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
+``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
+``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
 ``limbfit bench``         ``bench_febio_parity(tell=print)``, ``bench_forward(..)``, ``bench_scaling(..)``
@@ -34,6 +36,8 @@ _HOME = {
     "bench_scaling": "bench",
     "check_study": "pipeline",
     "describe_series": "anatomy.imaging",
+    "compare_site": "pipeline",
+    "export_study": "pipeline",
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",
     "run_demo": "pipeline",

@@ -26,6 +26,11 @@ class Detail(StrEnum):
     paper = "paper"
 
 
+class SolverName(StrEnum):
+    limbfit = "limbfit"
+    febio = "febio"
+
+
 class StageName(StrEnum):
     segment = "segment"
     surfaces = "surfaces"
@@ -138,6 +143,9 @@ def simulate(
     animation: Annotated[
         bool, typer.Option("--animation", help="also store the fields of every step, for ParaView")
     ] = False,
+    solver: Annotated[
+        SolverName | None, typer.Option(help="limbfit's own or FEBio; default: what the study says")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
@@ -148,15 +156,17 @@ def simulate(
             site,
             parameters=parse_parameters(parameters, checked.tissues),
             animation=animation,
+            solver=None if solver is None else solver.value,
             listener=listener,
         )
     if as_json:
         print_json(found)
     else:
+        deep = found["penetration_mm"]
         STDOUT.print(
             f"site {site}: peak force {found['peak_force_N']:.3f} N at {found['depth_mm']:.2f} mm, "
-            f"penetration {found['penetration_mm']:.3f} mm, "
-            f"{found['element']}, {found['unknowns']} unknowns\n"
+            + (f"penetration {deep:.3f} mm, " if deep is not None else f"{found['solver']}, ")
+            + f"{found['element']}, {found['unknowns']} unknowns\n"
             f"parameters: {found['parameters_from']}\n"
             f"curve: {found['curve']}\nfields: {found['fields']}"
         )

@@ -1,7 +1,8 @@
-"""``limbfit febio``: inputs of FEBio on limbfit's own solver."""
+"""Other solvers: FEBio's inputs on limbfit's own, a study's sites as their inputs, both side by side."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,20 @@ import typer
 
 import limbfit
 
+from .commands import StudyPath, parse_parameters
 from .console import STDERR, STDOUT, AsJson, listening, print_json
+
+Parameters = Annotated[
+    str | None,
+    typer.Option(help="as in limbfit simulate; default: identified, or the study's start where nothing is"),
+]
+
+
+class Format(StrEnum):
+    feb = "feb"
+    optimize = "febio-optimize"
+    inp = "inp"
+    calculix = "calculix"
 
 
 def febio(
@@ -41,4 +55,80 @@ def febio(
         raise typer.Exit(1)
 
 
-VERBS = (febio,)
+def export(
+    study: StudyPath,
+    to: Annotated[
+        Format,
+        typer.Option(
+            help="feb: FEBio 4; febio-optimize: FEBio's fit of the parameters; inp: Abaqus; calculix",
+            show_default=False,
+        ),
+    ],
+    site: Annotated[
+        str | None, typer.Option(help="name of the site; default: all, for febio-optimize all fitted ones")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="a folder; default: results/export")] = None,
+    parameters: Parameters = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write indentations as inputs of FEBio, Abaqus or CalculiX, with the numbers of limbfit simulate."""
+    checked = limbfit.load_study(study)
+    with listening() as listener:
+        found = limbfit.export_study(
+            checked,
+            to.value,
+            site=site,
+            output=output,
+            parameters=parse_parameters(parameters, checked.tissues),
+            listener=listener,
+        )
+    if as_json:
+        print_json(found)
+        return
+    for row in found["sites"]:
+        head = f"site {row['site']}, parameters {row['parameters_from']}"
+        STDOUT.print(f"{head}: {', '.join(row['files'])}", soft_wrap=True)
+    if to is Format.optimize:
+        STDOUT.print("run: febio4 -i SITE-model.feb -s SITE-optimize.feb; FEBio fits one site at a time")
+
+
+def compare(
+    study: StudyPath,
+    site: Annotated[str, typer.Option(help="name of the site", show_default=False)],
+    parameters: Parameters = None,
+    febio_log: Annotated[
+        Path | None,
+        typer.Option(help="the table that FEBio wrote elsewhere for the exported input; FEBio is not run"),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Solve a site by limbfit and by FEBio; curves and difference go to results/compare."""
+    checked = limbfit.load_study(study)
+    with listening() as listener:
+        found = limbfit.compare_site(
+            checked,
+            site,
+            parameters=parse_parameters(parameters, checked.tissues),
+            febio_log=febio_log,
+            listener=listener,
+        )
+    if as_json:
+        print_json(found)
+    else:
+        STDOUT.print(f"FEBio: peak force {found['febio']['peak_force_N']:.4g} N")
+        for key, words in (
+            ("limbfit", "limbfit"),
+            ("limbfit_matched", "limbfit with FEBio's contact penalty"),
+        ):
+            row = found[key]
+            most = row["difference"]["max_percent"]
+            gap = "-" if most is None else f"{most:.2f} % of FEBio's peak at most"
+            STDOUT.print(f"{words}: peak force {row['peak_force_N']:.4g} N, difference {gap}")
+        STDOUT.print(", ".join(found["files"].values()), soft_wrap=True)
+    partial = [found[key]["reason"] for key in ("febio", "limbfit", "limbfit_matched")]
+    if any(partial):
+        STDERR.print(f"error: site {site}: partial: {'; '.join(filter(None, partial))}", soft_wrap=True)
+        raise typer.Exit(1)
+
+
+VERBS = (export, febio, compare)

@@ -1,17 +1,37 @@
-"""FEBio beside limbfit: its inputs as problems, problems as its inputs, its logs as arrays."""
+"""FEBio beside limbfit: its inputs as problems, problems as its inputs, its runs and logs as results."""
 
+from .abaqus import write_inp
 from .logs import Log, read_log
-from .model import FebModel, read_feb
-from .problem import step_control, to_problem
+from .model import Contact, FebModel, read_feb
+from .optimising import Range, in_indenter_frame, write_optimisation
+from .problem import mean_penalty, step_control, to_problem
+from .program import FebioRun, axial_force, find_febio, result_of_log, run_febio
 from .running import FebRun, run_feb
+from .verdict import Verdict, judge
+from .writing import FebSettings, write_feb
 
 __all__ = [
+    "Contact",
     "FebModel",
     "FebRun",
+    "FebSettings",
+    "FebioRun",
     "Log",
+    "Range",
+    "Verdict",
+    "axial_force",
+    "find_febio",
+    "in_indenter_frame",
+    "judge",
+    "mean_penalty",
     "read_feb",
     "read_log",
+    "result_of_log",
     "run_feb",
+    "run_febio",
     "step_control",
     "to_problem",
+    "write_feb",
+    "write_inp",
+    "write_optimisation",
 ]

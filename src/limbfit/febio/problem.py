@@ -15,7 +15,7 @@ from ..fe.materials import prony_factors
 from ..mesh import Mesh
 from .controls import step_times
 from .geometry import boundary, refuse_part, triangles
-from .model import FebModel, Motion
+from .model import Contact, FebModel, Motion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -264,24 +264,23 @@ def step_control(model: FebModel, problem: Problem, **settings: Any) -> StepCont
     }
     contact = model.contact
     if contact is not None and not contact.augmented and contact.rule != "sliding-node-on-facet":
-        chosen |= {"penalty": mean_penalty(model, problem, float(times[0])), "penetration": 1.0}
+        chosen |= {"penalty": mean_penalty(contact, problem, float(times[0])), "penetration": 1.0}
     return StepControl(**{**chosen, **settings})
 
 
-def mean_penalty(model: FebModel, problem: Problem, dt: float) -> float:
-    """FEBio's penalty as `StepControl.penalty`, 1/mm.
+def mean_penalty(contact: Contact, problem: Problem, dt: float) -> float:
+    """FEBio's penalty of ``contact`` as `StepControl.penalty`, 1/mm.
 
     Automatic: ``penalty E A / V`` of each face and the element behind it, with Young's modulus
     ``9 k mu / (3 k + mu)`` over the first step of ``dt`` s; the mean over the faces.  ``sliding-elastic``
     acts over the current area, ``sliding-facet-on-facet`` over that at rest.
     """
-    assert model.contact is not None
     materials = [problem.materials[name] for name in problem.mesh.region_names]
     over = float(np.mean([material.instantaneous_modulus for material in materials]))
-    penalty = model.contact.penalty / over
-    if model.contact.rule == "sliding-elastic":
+    penalty = contact.penalty / over
+    if contact.rule == "sliding-elastic":
         penalty *= CURRENT_AREA
-    if not model.contact.automatic:
+    if not contact.automatic:
         return penalty
     mesh, faces = problem.mesh, np.asarray(problem.contact_faces)
     behind = _cells_behind(mesh, faces)

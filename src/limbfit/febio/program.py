@@ -91,9 +91,7 @@ def run_febio(
     except ProblemError as error:
         log = None
         if verdict.completed:
-            verdict = Verdict(
-                "no output", f"FEBio ended well, but {error}", verdict.reached_s, verdict.version
-            )
+            verdict = replace(verdict, kind="no output", reason=f"FEBio ended well, but {error}")
     return FebioRun(verdict, log, seconds, folder)
 
 

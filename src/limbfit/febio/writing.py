@@ -58,7 +58,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings) -> Tool
     RunError
         Where the file cannot be written.
     """
-    _check(problem)
+    check_exportable(problem, "FEBio")
     system = System(problem)
     assert system.indenter is not None
     tool = tool_mesh(system.indenter)
@@ -70,16 +70,17 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings) -> Tool
     return tool
 
 
-def _check(problem: Problem) -> None:
+def check_exportable(problem: Problem, program: str) -> None:
+    """Raise `ProblemError` where another program cannot be given the problem as it is."""
     name = problem.formulation.name
     if name not in _QUADRATURE:
         known = ", ".join(_QUADRATURE)
-        raise ProblemError(f"FEBio has no element {name!r}", remedy=f"export with one of {known}")
+        raise ProblemError(f"{program} has no element {name!r}", remedy=f"export with one of {known}")
     if problem.indenter is None or problem.supports:
-        raise ProblemError("only indentations with fixed nodes are written for FEBio")
+        raise ProblemError(f"only indentations with fixed nodes are written for {program}")
     if problem.friction != "frictionless":
         raise ProblemError(
-            "sticky contact of limbfit is none of FEBio's", remedy='export with friction = "frictionless"'
+            f"limbfit's sticky contact is none of {program}'s", remedy='export with friction = "frictionless"'
         )
     taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, HELD}
     if taken or INDENTER in problem.mesh.region_names:
@@ -174,7 +175,11 @@ def _mesh(problem: Problem, tool: Tool) -> Iterator[str]:
     for name, nodes in {HELD: problem.fixed, **mesh.node_sets}.items():
         if len(nodes):
             yield f"<NodeSet name={quoteattr(name)}>{_ids(nodes)}</NodeSet>"
-    surfaces = {PATCH: np.asarray(problem.contact_faces), FRONT: tool.front + count, **mesh.face_sets}
+    named = {  # FEBio makes an element set of every part
+        f"{name}_surface" if name in mesh.region_names else name: faces
+        for name, faces in mesh.face_sets.items()
+    }
+    surfaces = {PATCH: np.asarray(problem.contact_faces), FRONT: tool.front + count, **named}
     for name, faces in surfaces.items():
         yield from _surface(name, faces)
     yield f'<SurfacePair name="indentation"><primary>{PATCH}</primary><secondary>{FRONT}</secondary>'

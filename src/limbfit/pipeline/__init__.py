@@ -11,6 +11,8 @@ from .context import Listener, Progress
 _HOME = {
     "STAGE_NAMES": "run",
     "check_study": "check",
+    "compare_site": "compare",
+    "export_study": "export",
     "make_phantom_study": "demo",
     "report_study": "run",
     "run_demo": "demo",

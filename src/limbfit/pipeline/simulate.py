@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
 from ..execution import SerialExecutor
-from ..indentation import Parameters, simulate_fields
-from ..study import Study
+from ..fe import Problem, Result
+from ..febio import FebSettings, find_febio, result_of_log, run_febio, write_feb
+from ..indentation import Parameters, SiteModel, build_problem, simulate_fields, steps_of
+from ..mesh import read_vtu
+from ..study import Site, Study
 from .context import Context, Listener
 from .model_stages import write_curves
 from .run import keys, run_study
 from .simulations import CURVE_POINTS, planned_model, recorded_model
 from .store import Store, write_json
 
+FEB_NAME, FORCES = "model.feb", "forces.txt"
 
-def simulate_site(
-    study: Study,
-    name: str,
-    *,
-    parameters: Parameters | None = None,
-    animation: bool = False,
-    listener: Listener,
-) -> dict[str, Any]:
-    """Simulate one indentation: as recorded, or as the study plans it; meshes are made where missing.
 
-    Curve and fields at the deepest point go to ``results/simulate``.
+@dataclass(frozen=True)
+class Indentation:
+    """One site of a study, ready to be simulated: ``origin`` says where the parameters are from."""
+
+    context: Context
+    site: Site
+    model: SiteModel
+    parameters: Parameters
+    origin: str
+
+
+def prepare_site(
+    study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener
+) -> Indentation:
+    """A site as recorded, or as the study plans it; meshes are made where missing.
 
     Parameters
     ----------
     parameters : per tissue; by default the identified ones, or the study's start where none were identified.
-    animation : also the fields of every step, as a PVD collection.
 
     Raises
     ------
@@ -46,11 +56,49 @@ def simulate_site(
     run_study(study, until="mesh", listener=listener)
     context = Context(study, store, SerialExecutor(), listener)
     model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
-    folder = store["simulate"]
+    return Indentation(context, site, model, used, origin)
+
+
+def simulate_site(
+    study: Study,
+    name: str,
+    *,
+    parameters: Parameters | None = None,
+    animation: bool = False,
+    solver: str | None = None,
+    listener: Listener,
+) -> dict[str, Any]:
+    """Simulate one indentation (see `prepare_site`).
+
+    Curve and fields at the deepest point go to ``results/simulate``.
+
+    Parameters
+    ----------
+    parameters : as `prepare_site`.
+    animation : also the fields of every step, as a PVD collection.
+    solver : ``limbfit`` or ``febio``; by default what the study says.  FEBio's fields stay in its own file.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have, identified parameters that are stale, or any input of the
+        stages before.
+    """
+    by_febio = (solver or study.solver.solver) == "febio"
+    program = find_febio(study.febio.program) if by_febio else None
+    if program is not None and animation:
+        raise InputError("FEBio's fields are in its plot file", place="--animation", remedy="leave it out")
+    found = prepare_site(study, name, parameters=parameters, listener=listener)
+    context, model = found.context, found.model
+    folder = context.store["simulate"]
     folder.mkdir(exist_ok=True)
     context.tell("simulate", 0, 1, f"site {name}")
     played = folder / f"{name}.pvd" if animation else None
-    result = simulate_fields(model, used, folder / f"{name}.vtu", played)
+    if program is not None:
+        result, fields = run_febio_site(found, program, folder / f"{name}.febio")
+    else:
+        fields = folder / f"{name}.vtu"
+        result = simulate_fields(model, found.parameters, fields, played)
     context.tell("simulate", 1, 1, f"site {name}")
     times = np.linspace(0.0, model.knots_s[-1], CURVE_POINTS)
     curve = folder / f"{name}.csv"
@@ -60,23 +108,47 @@ def simulate_site(
         displacement_mm=np.interp(times, model.knots_s, model.knots_mm),
         force_N=result.force_at(times),
     )
-    found = {
+    summary = {
         "site": name,
-        "parameters": used,
-        "parameters_from": origin,
+        "solver": result.statistics["linear_solver"] if by_febio else "limbfit",
+        "parameters": found.parameters,
+        "parameters_from": found.origin,
         "peak_force_N": result.peak_force,
         "depth_mm": max(model.knots_mm),
-        "penetration_mm": float(result.penetration.max(initial=0.0)),
+        "penetration_mm": None if by_febio else float(result.penetration.max(initial=0.0)),
         "completed": result.completed,
         "reason": result.reason,
+        "warnings": list(result.warnings),
         "element": result.statistics["element"],
         "unknowns": result.statistics["unknowns"],
         "curve": str(curve),
-        "fields": str(folder / f"{name}.vtu") if result.states else None,
+        "fields": str(fields) if fields.is_file() and (by_febio or result.states) else None,
         "animation": None if played is None else str(played),
     }
-    write_json(folder / f"{name}.json", found)
-    return found
+    write_json(folder / f"{name}.json", summary)
+    return summary
+
+
+def site_problem(found: Indentation) -> Problem:
+    """The site's problem, as `simulate_site` solves it."""
+    return build_problem(found.model, read_vtu(found.model.mesh), found.parameters)
+
+
+def feb_settings(found: Indentation, force_file: str) -> FebSettings:
+    """What is written for FEBio beside the problem."""
+    study = found.context.study
+    title = f"{study.study.name}, site {found.site.name}, parameters: {found.origin}"
+    return FebSettings(study.febio.penalty, steps_of(found.model), force_file, title)
+
+
+def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Result, Path]:
+    """The site solved by FEBio in ``folder``, and its plot file; a failure is a result with its reason."""
+    problem, options = site_problem(found), found.context.study.febio
+    folder.mkdir(parents=True, exist_ok=True)
+    write_feb(problem, folder / FEB_NAME, feb_settings(found, FORCES))
+    end = float(problem.history.times[-1])
+    run = run_febio(program, folder, end, FORCES, threads=options.threads, time_limit_s=options.time_limit_s)
+    return result_of_log(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
 
 
 def known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
