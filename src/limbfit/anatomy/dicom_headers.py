@@ -42,6 +42,8 @@ _TAGS = [
     "SamplesPerPixel",
     "PhotometricInterpretation",
     "NumberOfFrames",
+    "RescaleSlope",
+    "RescaleIntercept",
     "SharedFunctionalGroupsSequence",
     "PerFrameFunctionalGroupsSequence",
 ]
@@ -55,7 +57,7 @@ class SliceHeader:
     """Where one slice lies; ``position``, ``orientation``, ``pixel_spacing`` are None where nothing says it.
 
     ``frame`` is the slice's index in a file of many frames, and None in a file of one image; ``rescale`` is
-    slope and intercept of such a frame (GDCM knows those of a single image).
+    slope and intercept of its stored values.
     """
 
     path: Path
@@ -163,7 +165,13 @@ def _single(tags: FileDataset, path: Path) -> SliceHeader:
         pixel_spacing=_numbers(tags.get("PixelSpacing"), 2),
         stated_spacing=_number(tags.get("SpacingBetweenSlices")),
         thickness=_number(tags.get("SliceThickness")),
+        rescale=_rescale(tags),
     )
+
+
+def _rescale(tags: Dataset) -> tuple[float, float]:
+    slope, intercept = _number(tags.get("RescaleSlope")), _number(tags.get("RescaleIntercept"))
+    return (1.0 if slope is None else slope, 0.0 if intercept is None else intercept)
 
 
 def _of_file(tags: FileDataset, path: Path) -> dict:
@@ -203,7 +211,6 @@ def _frames(tags: FileDataset, path: Path) -> list[SliceHeader]:
 def _frame(number: int, groups: tuple[Dataset, Dataset], file: dict) -> SliceHeader:
     measures = functional_group(groups, "PixelMeasuresSequence")
     values = functional_group(groups, "PixelValueTransformationSequence")
-    slope = _number(values.get("RescaleSlope"))
     return SliceHeader(
         **file,
         position=_numbers(functional_group(groups, "PlanePositionSequence").get("ImagePositionPatient"), 3),
@@ -214,7 +221,7 @@ def _frame(number: int, groups: tuple[Dataset, Dataset], file: dict) -> SliceHea
         stated_spacing=_number(measures.get("SpacingBetweenSlices")),
         thickness=_number(measures.get("SliceThickness")),
         frame=number,
-        rescale=(1.0 if slope is None else slope, _number(values.get("RescaleIntercept")) or 0.0),
+        rescale=_rescale(values),
     )
 
 

@@ -28,7 +28,7 @@ def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
         except ImageError:
             raise
         except Exception:  # its text may hold file names and tag values
-            raise _undecoded(slices[0].syntax) from None
+            raise _undecoded({one.syntax for one in slices}) from None
     if array.shape != (len(slices), slices[0].rows, slices[0].columns):
         raise ImageError("the pixels do not match the headers", remedy="export the series again")
     return array
@@ -53,14 +53,16 @@ def _of_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     return np.stack(planes)
 
 
-def _undecoded(syntax: str) -> ImageError:
+def _undecoded(syntaxes: set[str]) -> ImageError:
     """What is wrong with pixels that no decoder took."""
-    uid = UID(syntax)
-    if uid.is_valid and not uid.is_private and uid.is_transfer_syntax and uid.is_compressed:
+    names = sorted(UID(text).name for text in syntaxes if _is_compressed(UID(text)))
+    if names:
         return ImageError(
-            f"the pixels, compressed as {uid.name}, cannot be decoded",
-            remedy="export the series uncompressed, and again if it was",
+            f"the pixels, compressed as {', '.join(names)}, cannot be decoded",
+            remedy="export the series again, uncompressed",
         )
-    return ImageError(
-        "the pixels are cut short or cannot be decoded", remedy="export the series again, uncompressed"
-    )
+    return ImageError("the pixels are cut short or cannot be decoded", remedy="export the series again")
+
+
+def _is_compressed(uid: UID) -> bool:
+    return uid.is_valid and not uid.is_private and uid.is_transfer_syntax and uid.is_compressed

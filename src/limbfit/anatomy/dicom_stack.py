@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 _VOLUMES = ("MR", "CT", "PT")
 _PLACE_TOLERANCE = 0.02  # of the slice spacing
 _AXIS_TOLERANCE = 1e-4
+_FINEST_MM = 0.02
 
 
 def stacked(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Array]:
@@ -74,6 +75,15 @@ def _check_kind(slices: Sequence[SliceHeader]) -> None:
             )
         if np.any(one.pixel_spacing <= 0):
             raise ImageError("the pixel spacing is not positive", remedy="export the original series again")
+        if np.any(one.pixel_spacing < _FINEST_MM):
+            raise ImageError(
+                f"a pixel spacing of {one.pixel_spacing.min():.3g} mm",
+                remedy="it must be in millimetres; export the original series again",
+            )
+        if not np.all(np.isfinite(one.rescale)) or one.rescale[0] == 0:
+            raise ImageError(
+                "a rescale slope or intercept that is no usable number", remedy="export the series again"
+            )
         if one.samples != 1:
             raise ImageError("colour images", remedy="give the original grey-value series")
         if one.photometric == "MONOCHROME1":

@@ -24,9 +24,10 @@ from ..errors import ImageError, LabelError
 Array = NDArray[np.float64]
 
 SOFT_TISSUE = "soft tissue"
+FAT = "fat"  # under the skin, the skin included
 BONES = ("tibia", "fibula", "femur", "patella")
-DEFAULT_NAMES: Mapping[int, str] = {1: SOFT_TISSUE, **dict(enumerate(BONES, 2))}
-SOFT_NAMES = frozenset({SOFT_TISSUE, "skin", "fat", "muscle", "limb", "body"})
+DEFAULT_NAMES: Mapping[int, str] = {1: SOFT_TISSUE, **dict(enumerate(BONES, 2)), 6: FAT}
+SOFT_NAMES = frozenset({SOFT_TISSUE, "skin", FAT, "muscle", "limb", "body"})
 
 _ORTHONORMAL = 1e-4  # largest deviation of direction^T direction from the identity
 _SAME_POINT_MM = 0.01
@@ -120,11 +121,26 @@ class Grid:
         return replace(self, array=array, origin=self.index_to_point(last), direction=direction)
 
     def nearest_lps(self) -> Self:
-        """The same samples with index axes in the order and sense nearest to x, y, z.
+        """The same samples with right-handed index axes in the order and sense nearest to x, y, z.
 
         What is computed from them then does not depend on how the file stored them.
         """
-        return self.along(np.eye(3))
+        best, nearness = np.eye(3), -np.inf
+        for order in permutations(range(3)):
+            axes = self.direction[:, order]
+            signs = np.where(np.diag(axes) < 0, -1.0, 1.0)
+            if np.linalg.det(axes * signs) < 0:
+                signs[np.argmin(np.abs(np.diag(axes)))] *= -1
+            if np.trace(axes * signs) > nearness + 1e-6:
+                best, nearness = axes * signs, float(np.trace(axes * signs))
+        return self.along(best)
+
+    def in_own_frame(self) -> Self:
+        """The same samples with the first voxel at zero and axes along x, y, z; spacing to 1e-5 mm.
+
+        Rounding in files moves voxels by less than that, but remeshing turns it into other triangles.
+        """
+        return replace(self, spacing=np.round(self.spacing, 5), origin=np.zeros(3), direction=np.eye(3))
 
     def along(self, axes: Array) -> Self:
         """The same samples with index axes in the order and sense nearest to the columns of ``axes``."""

@@ -24,13 +24,13 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     """
     if labels.same_grid(like):
         return labels
-    labels = _cropped(labels.along(like.direction))
+    given, labels = labels, _cropped(labels.along(like.direction))
     offset = _offset(labels, like)
     if offset is None:
         raise LabelError(
             "the label map is on another grid than the image",
             file=path,
-            remedy=f"image {_shape(like)}, labels {_shape(labels)}: export it with the image as reference"
+            remedy=f"image {_shape(like)}, labels {_shape(given)}: export it with the image as reference"
             " geometry",
         )
     last = offset + np.array(labels.size)

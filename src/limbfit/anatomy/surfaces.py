@@ -107,6 +107,24 @@ def build_anatomy(
     labels = labels.nearest_lps()
     end = proximal_end(labels.limb, labels)
     point, normal = _default_cut(labels, end) if proximal_cut is None else _plane(*proximal_cut)
+    own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
+    own_normal = np.round(labels.direction.T @ normal, 6)
+    built = _built(labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal))
+    bones = {name: _placed(bone, labels) for name, bone in built.bones.items()}
+    return Anatomy(
+        _placed(built.skin, labels),
+        bones,
+        labels.direction @ built.cut_point + labels.origin,
+        labels.direction @ built.cut_normal,
+    )
+
+
+def _placed(surface: Surface, grid: LabelMap) -> Surface:
+    """A surface in the own frame of a right-handed grid, in patient space."""
+    return Surface(surface.points @ grid.direction.T + grid.origin, surface.faces)
+
+
+def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array) -> Anatomy:
     extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
     _check_sides(labels, end, point, normal)
     skin = _capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)

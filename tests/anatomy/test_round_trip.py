@@ -1,0 +1,144 @@
+"""One body, stored in every format with other axes, gives the same surfaces and mesh in patient space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import nrrd
+import numpy as np
+import pytest
+import pyvista as pv
+from damaging import write_rtstruct, write_seg
+from limbs import leg_image, rotation, write_dicom
+from scipy.spatial import cKDTree
+
+from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_labels, write_volume
+from limbfit.anatomy.meshing import MeshSettings, mesh_site
+from limbfit.anatomy.sites import indenter_axis
+from limbfit.anatomy.surfaces import Anatomy, build_anatomy, load_anatomy, save_anatomy, signed_distance
+from limbfit.mesh import write_vtu
+
+TOLERANCE_MM = 0.01
+OBLIQUE = rotation(2) @ np.diag([1.0, -1.0, 1.0])  # left-handed: rows run backward
+RAS = np.array([-1.0, -1.0, 1.0])
+
+
+def write_ras_nrrd(file: Path, image: Volume) -> None:
+    header = {
+        "space": "right-anterior-superior",
+        "kinds": ["domain"] * 3,
+        "space directions": (image.direction * image.spacing).T * RAS,
+        "space origin": image.origin * RAS,
+    }
+    nrrd.write(str(file), np.transpose(image.array, (2, 1, 0)), header)
+
+
+def write_ras_segmentation(file: Path, labels: LabelMap) -> None:
+    """As 3D Slicer does it, cropped to the segments."""
+    filled = np.argwhere(labels.array > 0)
+    low, high = filled.min(axis=0), filled.max(axis=0) + 1
+    header = {
+        "space": "right-anterior-superior",
+        "kinds": ["domain"] * 3,
+        "space directions": (labels.direction * labels.spacing).T * RAS,
+        "space origin": labels.index_to_point(low[::-1]) * RAS,
+    }
+    for n, (value, name) in enumerate(labels.names.items()):
+        header |= {f"Segment{n}_ID": f"S{n}", f"Segment{n}_Name": name, f"Segment{n}_LabelValue": str(value)}
+    crop = labels.array[tuple(slice(a, b) for a, b in zip(low, high))]
+    nrrd.write(str(file), np.transpose(crop, (2, 1, 0)), header)
+
+
+def turned(image: Volume) -> Volume:
+    return image.turned((1, 2, 0)).reversed([0, 2])
+
+
+IMAGES: dict[str, Callable[[Path, Volume], None]] = {
+    "dicom": write_dicom,
+    "image.nii": write_volume,
+    "image.nii.gz": lambda file, image: write_volume(file, turned(image)),
+    "image.nrrd": write_volume,
+    "ras.nrrd": write_ras_nrrd,
+    "image.mha": lambda file, image: write_volume(file, turned(image)),
+}
+LABELS: dict[str, Callable[[Path, LabelMap], None]] = {
+    "labels.seg.nrrd": write_labels,
+    "ras.seg.nrrd": write_ras_segmentation,
+    "labels.nii.gz": write_labels,
+    "seg.dcm": lambda file, labels: write_seg(file, labels, np.random.default_rng(1)),
+    "rt.dcm": write_rtstruct,
+}
+
+
+@pytest.fixture(scope="module")
+def body() -> tuple[Volume, LabelMap]:
+    image, labels = leg_image([2.013, 2.297, 3.1], (50, 56, 60), OBLIQUE)
+    return image.with_array(np.round(image.array)), labels
+
+
+@pytest.fixture(scope="module")
+def reference(body) -> Anatomy:
+    return build_anatomy(body[1], 6.0)
+
+
+def assert_same(found: Anatomy, wanted: Anatomy) -> None:
+    pairs = [(found.skin, wanted.skin), *((found.bones[name], wanted.bones[name]) for name in wanted.bones)]
+    for one, other in pairs:
+        assert np.array_equal(one.faces, other.faces)
+        assert np.abs(one.points - other.points).max() < TOLERANCE_MM
+    assert np.abs(found.cut_point - wanted.cut_point).max() < TOLERANCE_MM
+    assert np.abs(found.cut_normal - wanted.cut_normal).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_every_format_of_the_image_gives_the_same_surfaces(tmp_path, body, reference, name):
+    image, labels = body
+    IMAGES[name](tmp_path / name, image)
+    write_ras_segmentation(tmp_path / "labels.seg.nrrd", labels)
+    seen = read_volume(tmp_path / name)
+    inside = image.index_to_point(np.argwhere(labels.array > 1)[::97, ::-1])
+    there = np.rint(seen.point_to_index(inside)).astype(int)
+    assert np.abs(seen.index_to_point(there) - inside).max() < TOLERANCE_MM
+    grey = image.array[tuple(np.argwhere(labels.array > 1)[::97].T)]
+    assert np.allclose(seen.array[tuple(there[:, ::-1].T)], grey)
+    assert_same(build_anatomy(read_labels(tmp_path / "labels.seg.nrrd", seen), 6.0), reference)
+
+
+@pytest.mark.parametrize("name", LABELS)
+def test_every_format_of_the_labels_gives_the_same_surfaces(tmp_path, body, reference, name):
+    image, labels = body
+    LABELS[name](tmp_path / name, labels)
+    write_dicom(tmp_path / "dicom", image)
+    placed = read_labels(tmp_path / name, read_volume(tmp_path / "dicom"))
+    assert_same(build_anatomy(placed, 6.0), reference)
+
+
+def test_surfaces_and_mesh_keep_every_coordinate_on_disk(tmp_path, reference):
+    save_anatomy(tmp_path, reference)
+    stored = load_anatomy(tmp_path)
+    for one, other in ((stored.skin, reference.skin), (stored.bones["tibia"], reference.bones["tibia"])):
+        assert np.abs(one.triangles - _sorted_like(one.triangles, other.triangles)).max() < TOLERANCE_MM
+
+
+@pytest.mark.slow
+def test_the_mesh_on_disk_lies_where_the_body_lies(tmp_path, body, reference):
+    """Read by another program (VTK): nodes of the skin on the skin, none of them in a bone."""
+    site = reference.skin.points[np.argmin(np.abs(reference.height(reference.skin.points) + 60))]
+    settings = MeshSettings(element="tet4", edge_near_mm=8.0, edge_far_mm=20.0, flatness=1.6)
+    mesh, _ = mesh_site(reference, site, indenter_axis(reference.skin, site, 20.0), settings)
+    write_vtu(mesh, tmp_path / "mesh.vtu")
+    seen = pv.read(tmp_path / "mesh.vtu")
+    assert np.abs(seen.points - mesh.points).max() < TOLERANCE_MM
+    outer = seen.points[np.unique(mesh.face_sets["skin"])]
+    assert np.abs(signed_distance(reference.skin, outer)).max() < 1.0
+    for bone in reference.bones.values():
+        assert signed_distance(bone, seen.points).min() > -1.0
+
+
+def _sorted_like(triangles: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The other surface's triangle with the nearest centre, for each, its corners turned to fit."""
+    nearest = others[cKDTree(others.mean(axis=1)).query(triangles.mean(axis=1))[1]]
+    turns = np.stack([np.roll(nearest, n, axis=1) for n in range(3)])
+    best = np.abs(turns - triangles).max(axis=(2, 3)).argmin(axis=0)
+    return turns[best, np.arange(len(triangles))]
