@@ -6,7 +6,7 @@
 Every case is drawn from (seed, number) alone: body, site, depth, indenter, speed, and the eight material
 parameters over the whole bounds of the calibration.  Each runs in a worker process with a time limit; what
 came of it is ``completed``, ``partial`` (with the solver's reason), ``crash`` or ``hang``.  Completed
-simulations are then held against physics; see `broken_laws`.  Cases that are in the file of ``--json`` are not
+simulations are then held against physics; see `broken_laws`.  Cases in the file of ``--json`` are not
 run again, so that a run can be stopped and gone on with.
 """
 

@@ -86,7 +86,7 @@ class SimulationJob:
 class Simulation:
     """What came back: force (n,) N and its derivatives (n, 4 x tissues) at the job's times.
 
-    Derivatives are in flat order, per kPa, -, -, s.
+    Derivatives are in flat order, per kPa, -, -, s.  ``warnings``: what is doubtful about it.
     """
 
     site: str
@@ -96,6 +96,7 @@ class Simulation:
     reason: str
     penetration_mm: float
     facts: dict[str, Any]
+    warnings: tuple[str, ...] = ()
 
 
 def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
@@ -225,6 +226,7 @@ def simulate(job: SimulationJob) -> Simulation:
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
         facts=dict(result.statistics),
+        warnings=result.warnings,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
@@ -170,6 +171,7 @@ def simulate(
             f"parameters: {found['parameters_from']}\n"
             f"curve: {found['curve']}\nfields: {found['fields']}"
         )
+    show_warnings([found])
     if not found["completed"]:
         STDERR.print(f"error: site {site}: the simulation is partial: {found['reason']}")
         raise typer.Exit(1)
@@ -210,7 +212,15 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
         return
     show_parameters(summary)
     show_sites(summary)
+    show_warnings(summary["sites"])
     STDOUT.print(f"report: {summary['report']}")
+
+
+def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
+    """What is doubtful about the simulations of the sites."""
+    for site in sites:
+        for text in site["warnings"]:
+            STDERR.print(f"warning: site {site['site']}: {text}", soft_wrap=True)
 
 
 def show_parameters(summary: dict[str, Any]) -> None:

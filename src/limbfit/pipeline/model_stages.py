@@ -172,7 +172,10 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         state=State.from_dict(read_json(state_file)) if state_file.is_file() else None,
     )
     known = estimate_uncertainty(found.parameters, found.responses, measured, unknowns(study))
-    write_json(folder / "calibration.json", _calibration_record(context, found, known, folder))
+    ends = list(cache.run([record.job(found.parameters) for record in records], context.executor))
+    warnings = {end.site: list(end.warnings) for end in ends if end.warnings}
+    content = _calibration_record(context, found, known, folder) | {"warnings": warnings}
+    write_json(folder / "calibration.json", content)
     return {}
 
 
@@ -354,6 +357,7 @@ def _row(record: SiteRecord, ours: Simulation, one: Simulation | None) -> dict[s
         "penetration_mm": ours.penetration_mm,
         "completed": ours.completed,
         "reason": ours.reason,
+        "warnings": list(ours.warnings),
         "steps": ours.facts["steps"],
         "element": ours.facts["element"],
     }

@@ -206,7 +206,10 @@ def summarise(study: Study) -> dict[str, Any]:
     if (store["predict"] / "predict.json").is_file():
         predicted = store.read("predict", "predict.json")
         columns = ("site", "region", "fitted", "peak_force_N", "error_percent")
-        summary["sites"] = [{key: row[key] for key in columns} for row in predicted["sites"]]
+        summary["sites"] = [
+            {**{key: row[key] for key in columns}, "warnings": row.get("warnings", [])}
+            for row in predicted["sites"]
+        ]
         for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
             summary[key] = predicted[key]
     report = store["report"] / "report.html"

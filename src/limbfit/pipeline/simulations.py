@@ -73,6 +73,7 @@ class SimulationCache:
                 "reason": simulation.reason,
                 "penetration_mm": simulation.penetration_mm,
                 "facts": simulation.facts,
+                "warnings": list(simulation.warnings),
             }
             np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
 
@@ -81,7 +82,8 @@ def _load(file: Path) -> Simulation:
     with np.load(file, allow_pickle=False) as stored:
         facts: dict[str, Any] = json.loads(str(stored["facts"]))
         jacobian = stored.get("jacobian")
-        return Simulation(force_N=stored["force_N"], jacobian=jacobian, **facts)
+        warnings = tuple(facts.pop("warnings"))
+        return Simulation(force_N=stored["force_N"], jacobian=jacobian, warnings=warnings, **facts)
 
 
 def job_digest(job: SimulationJob) -> str:

@@ -264,10 +264,17 @@ def convergence(store: Store) -> Section:
     return Section("convergence", "Convergence of the identification", blocks)
 
 
+def _doubts(rows: Sequence[Json]) -> Bullets | None:
+    """The solver's warnings about the simulations of the sites; None where there are none."""
+    texts = tuple(f"Site {row['site']}: {text}" for row in rows for text in row.get("warnings") or ())
+    return Bullets(texts) if texts else None
+
+
 def simulated(store: Store) -> Section:
     """Indentations that were simulated one by one."""
     names = [str(row["site"]) for row in store.simulated][:4]
     blocks = _blocks(
+        _doubts(store.simulated),
         figures.simulated_figure(store),
         pictures.field_figure(store, names, "simulate", "field-simulated"),
         tables.simulated_table(store),
@@ -291,6 +298,7 @@ def solver(store: Store) -> Section:
     )
     blocks = _blocks(
         Note(warning) if warning else None,
+        _doubts(store.predicted),
         tables.solver_table(store) if store.predicted else None,
         tables.pair_table("solver-facts", "The identification's solver.", ("Fact", "Value"), known)
         if known
