@@ -45,12 +45,26 @@ class StudyTable(_Table):
 
 
 class ImageTable(_Table):
-    """The image: a DICOM folder, NIfTI, NRRD or MHA; ``markers`` is the same limb with skin markers on."""
+    """The image: a DICOM folder, NIfTI, NRRD or MHA.
+
+    ``markers`` is another one of the same limb with skin markers on, or ``"same"``: they are on in this one.
+    """
 
     path: Path
     series: str | None = None
-    markers: Path | None = None
+    markers: Literal["same"] | Path | None = None
     markers_series: str | None = None
+
+    @model_validator(mode="after")
+    def _series_of_an_image(self) -> ImageTable:
+        if self.markers_series is not None and self.marked is None:
+            raise ValueError("markers_series belongs to a second image: give its folder as markers")
+        return self
+
+    @property
+    def marked(self) -> Path | None:
+        """The second image, with markers on."""
+        return None if self.markers == "same" else self.markers
 
 
 class SegmentationTable(_Table):
@@ -328,7 +342,7 @@ class Study(_Table):
             **{f"sites.{site.name}.trace": site.trace for site in self.sites},
         }
         if self.image is not None:
-            named |= {"image.path": self.image.path, "image.markers": self.image.markers}
+            named |= {"image.path": self.image.path, "image.markers": self.image.marked}
         if self.surfaces is not None:
             named["surfaces.skin"] = self.surfaces.skin
             named |= {f"surfaces.bones.{name}": path for name, path in self.surfaces.bones.items()}

@@ -1,9 +1,7 @@
 """Skin markers from two surfaces of the same limb, with and without them (paper, section 2.1.1, figure 1).
 
-The limb may have moved a little between the two scans, so the surface with markers is first laid onto the
-other: point-to-plane iterative closest points with Tukey weights, which the markers themselves do not pull.
-What then stands out by more than a threshold is clustered; each cluster that is high and small enough is a
-marker. The flat proximal cap is no skin and takes part in neither step.
+What stands out of the skin by more than a threshold is clustered; each cluster that is high and small enough
+is a marker. The flat proximal cap is no skin and takes no part.
 """
 
 from __future__ import annotations
@@ -17,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from ..errors import SiteError
 from .triangles import Surface, half_edges
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
-ICP_POINTS, ICP_ROUNDS = 4000, 40
 CAP_MARGIN_MM = 6.0
+MIN_HEIGHT_MM, MAX_AREA_MM2 = 2.0, 500.0
 NORMAL_RADIUS_MM = 8.0
 
 
@@ -42,23 +40,31 @@ class Marker:
     direction: Array
 
 
+@dataclass(frozen=True)
+class Bump:
+    """Vertices of a surface that stand out together: all of them, and those of the upper half."""
+
+    feet: Indices
+    upper: Indices
+    height: float
+    area: float
+
+
 def find_markers(
     skin_with: Surface,
     skin_without: Surface,
     *,
-    min_height_mm: float = 2.0,
-    max_area_mm2: float = 500.0,
-    register: bool = True,
+    min_height_mm: float = MIN_HEIGHT_MM,
+    max_area_mm2: float = MAX_AREA_MM2,
 ) -> tuple[Marker, ...]:
     """Markers on a limb, from the distance between its surfaces with and without them.
 
     Parameters
     ----------
-    skin_with, skin_without : closed outward surfaces of the two scans, in the same coordinates up to a small
-        motion of the limb (some millimetres, some degrees).
+    skin_with, skin_without : closed outward surfaces of the limb in one place (``registration`` lays the
+        images of two scans onto each other).
     min_height_mm : the least height of a marker; half of it is where bumps are told apart.
     max_area_mm2 : what is larger is no marker (a cushion, a fold, a bandage).
-    register : lay the first surface onto the second before comparing.
 
     Returns
     -------
@@ -66,23 +72,36 @@ def find_markers(
         Highest first; empty where nothing stands out.
     """
     base = _Skin(skin_without)
-    points = skin_with.points
-    if register:
-        points = _registered(points, _off_cap_vertices(skin_with), base)
-    height = base.height(points)
-    height[base.near_cap(points)] = 0.0
-    labels = _clusters(height > min_height_mm / 2, skin_with.faces)
+    height = base.height(skin_with.points)
+    height[base.near_cap(skin_with.points)] = 0.0
     areas = _vertex_areas(skin_with)
     found = []
-    for label in range(labels.max(initial=-1) + 1):
-        members = np.flatnonzero(labels == label)
-        tallest = float(height[members].max())
-        members = members[height[members] > tallest / 2]  # terraces of the skin may touch a marker's foot
-        area = float(areas[members].sum())
-        if tallest >= min_height_mm and area <= max_area_mm2:
-            position, direction = base.foot(points[members], areas[members] * height[members])
-            found.append(Marker(position, tallest, area, direction))
+    for bump in bumps(skin_with, height, min_height_mm=min_height_mm, max_area_mm2=max_area_mm2):
+        weights = areas[bump.upper] * height[bump.upper]
+        position, direction = base.foot(skin_with.points[bump.upper], weights)
+        found.append(Marker(position, bump.height, bump.area, direction))
     return tuple(sorted(found, key=lambda marker: -marker.height))
+
+
+def bumps(
+    surface: Surface,
+    height: Array,
+    *,
+    min_height_mm: float = MIN_HEIGHT_MM,
+    max_area_mm2: float = MAX_AREA_MM2,
+) -> list[Bump]:
+    """What stands out high and small enough for a marker; ``height`` (n,) of each vertex, mm."""
+    labels = _clusters(height > min_height_mm / 2, surface.faces)
+    areas = _vertex_areas(surface)
+    found = []
+    for label in range(labels.max(initial=-1) + 1):
+        feet = np.flatnonzero(labels == label)
+        tallest = float(height[feet].max())
+        upper = feet[height[feet] > tallest / 2]  # terraces of the skin may touch a marker's foot
+        area = float(areas[upper].sum())
+        if tallest >= min_height_mm and area <= max_area_mm2:
+            found.append(Bump(feet, upper, tallest, area))
+    return found
 
 
 def match_markers(
@@ -110,8 +129,13 @@ def match_markers(
     cost = np.where(distance <= max_distance_mm, distance, 1e3 * (1 + max_distance_mm) * len(names))
     rows, columns = linear_sum_assignment(cost)
     pairs = {r: c for r, c in zip(rows, columns, strict=True) if distance[r, c] <= max_distance_mm}
-    _check_missing(names, pairs, distance, max_distance_mm)
-    _check_doubled(names, pairs, distance, max_distance_mm)
+    faults = [check(names, pairs, distance, max_distance_mm) for check in (_missing, _doubled)]
+    if any(faults):
+        raise SiteError(
+            "; ".join(filter(None, faults)),
+            place="sites",
+            remedy="correct 'near', or give the site's 'position' on the skin",
+        )
     return {names[r]: markers[c] for r, c in pairs.items()}
 
 
@@ -122,66 +146,47 @@ def _distances(markers: Sequence[Marker], hints: Array) -> Array:
     return np.linalg.norm(hints[:, None] - positions, axis=-1)
 
 
-def _check_missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> None:
+def _missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+    """What to say of places without a marker; empty where there are none."""
     missing = [r for r in range(len(names)) if r not in pairs]
-    if not missing:
-        return
     told = [
         f"{names[r]} (nearest at {distance[r].min():.1f} mm)" if distance.shape[1] else names[r]
         for r in missing
     ]
-    raise SiteError(
-        f"no marker of its own within {reach:g} mm for {', '.join(told)}",
-        place="sites",
-        remedy="correct 'near', or give the site's 'position' on the skin",
-    )
+    return f"no marker of its own within {reach:g} mm for {', '.join(told)}" if told else ""
 
 
-def _check_doubled(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> None:
+def _doubled(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+    """What to say of places with a spare marker near them; empty where there are none."""
     spare = np.setdiff1d(np.arange(distance.shape[1]), list(pairs.values()))
     doubled = [names[r] for r in pairs if (distance[r, spare] <= reach).any()]
-    if doubled:
-        raise SiteError(
-            f"more than one marker within {reach:g} mm of {', '.join(doubled)}",
-            place="sites",
-            remedy="move 'near' closer to the right one, or give the site's 'position' on the skin",
-        )
+    return f"more than one marker within {reach:g} mm of {', '.join(doubled)}" if doubled else ""
 
 
 class _Skin:
     """The skin without markers, asked for heights, closest points and normals; its cap set apart."""
 
     def __init__(self, surface: Surface) -> None:
+        self.surface = surface
         self.points, self.faces = np.ascontiguousarray(surface.points), np.ascontiguousarray(surface.faces)
         self.normals, self.areas = surface.face_normals, surface.face_areas
         self.centres = surface.triangles.mean(axis=1)
-        self.cap = _cap_faces(surface)
+        self.cap = cap_faces(surface)
         self.open_faces = np.ascontiguousarray(self.faces[~self.cap])
-        self.open_normals = self.normals[~self.cap]
 
     def height(self, points: Array) -> Array:
         """Signed distance (n,), positive outside."""
         sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
         return igl.signed_distance(np.ascontiguousarray(points), self.points, self.faces, sign)[0]
 
-    def closest(self, points: Array) -> tuple[Array, Array]:
-        """Closest points (n, 3) of the skin proper and the normals (n, 3) there."""
-        points = np.ascontiguousarray(points)
-        _, face, closest = igl.point_mesh_squared_distance(points, self.points, self.open_faces)
-        return closest, self.open_normals[face]
-
     def near_cap(self, points: Array) -> NDArray[np.bool_]:
         """Which points (n,) lie beyond the cap's plane or just under it."""
-        if not self.cap.any():
-            return np.zeros(len(points), bool)
-        normal = np.average(self.normals[self.cap], axis=0, weights=self.areas[self.cap])
-        normal /= np.linalg.norm(normal)
-        level = np.average(self.centres[self.cap] @ normal, weights=self.areas[self.cap])
-        return points @ normal > level - CAP_MARGIN_MM
+        return near_cap(self.surface, self.cap, points)
 
     def foot(self, points: Array, weights: Array) -> tuple[Array, Array]:
         """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
-        (foot,), _ = self.closest(np.average(points, axis=0, weights=weights)[None])
+        centre = np.average(points, axis=0, weights=weights)[None]
+        (foot,) = igl.point_mesh_squared_distance(centre, self.points, self.open_faces)[2]
         near = ~self.cap & (np.linalg.norm(self.centres - foot, axis=1) < NORMAL_RADIUS_MM)
         if not near.any():
             near = np.arange(len(self.faces)) == np.linalg.norm(self.centres - foot, axis=1).argmin()
@@ -189,7 +194,7 @@ class _Skin:
         return foot, normal / np.linalg.norm(normal)
 
 
-def _cap_faces(surface: Surface) -> NDArray[np.bool_]:
+def cap_faces(surface: Surface) -> NDArray[np.bool_]:
     """Faces of the one plane that holds more than 3 % of a surface: the cut; skin has no such plane."""
     normals, areas, centres = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
     levels = (normals * centres).sum(axis=1)
@@ -206,38 +211,15 @@ def _cap_faces(surface: Surface) -> NDArray[np.bool_]:
     return (normals @ normal > 0.98) & (np.abs(centres @ normal - level) < 1.0)
 
 
-def _off_cap_vertices(surface: Surface) -> NDArray[np.int64]:
-    cap = _cap_faces(surface)
-    return np.setdiff1d(surface.faces[~cap], surface.faces[cap])
-
-
-def _registered(points: Array, usable: NDArray[np.int64], base: _Skin) -> Array:
-    """Points (n, 3) after the rigid motion that lays the usable ones onto the skin."""
-    sample = points[usable[:: max(1, len(usable) // ICP_POINTS)]]
-    sample = sample[~base.near_cap(sample)]
-    centre = sample.mean(axis=0)
-    rotation, shift = Rotation.identity(), np.zeros(3)
-    for _ in range(ICP_ROUNDS):
-        moved = rotation.apply(sample - centre) + centre + shift
-        turn, step = _icp_step(moved, centre + shift, *base.closest(moved))
-        rotation, shift = Rotation.from_rotvec(turn) * rotation, shift + step
-        if np.linalg.norm(turn) < 1e-5 and np.linalg.norm(step) < 1e-3:
-            break
-    return rotation.apply(points - centre) + centre + shift
-
-
-def _icp_step(moved: Array, pivot: Array, closest: Array, normals: Array) -> tuple[Array, Array]:
-    """Rotation vector about ``pivot`` and translation of one weighted point-to-plane step."""
-    residual = ((closest - moved) * normals).sum(axis=1)
-    scale = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 0.05)
-    u = np.clip(np.abs(residual) / (4.685 * scale), 0, 1)
-    weight = (1 - u * u) ** 2
-    design = np.column_stack([np.cross(moved - pivot, normals), normals])
-    normal_matrix = design.T @ (design * weight[:, None])
-    # The limb is nearly a body of revolution: damping keeps single steps of the turn about its axis small.
-    damping = np.diag(1e-4 * np.diag(normal_matrix))
-    step = np.linalg.solve(normal_matrix + damping, design.T @ (weight * residual))
-    return step[:3], step[3:]
+def near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
+    """Which points (n,) lie beyond the plane of a surface's cap (faces of it) or just under it."""
+    if not cap.any():
+        return np.zeros(len(points), bool)
+    areas = surface.face_areas[cap]
+    normal = np.average(surface.face_normals[cap], axis=0, weights=areas)
+    normal /= np.linalg.norm(normal)
+    level = np.average(surface.triangles[cap].mean(axis=1) @ normal, weights=areas)
+    return points @ normal > level - CAP_MARGIN_MM
 
 
 def _clusters(raised: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.int64]:

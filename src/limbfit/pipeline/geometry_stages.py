@@ -10,30 +10,26 @@ from typing import Any
 import numpy as np
 
 from ..anatomy.amputation import amputate
-from ..anatomy.body import limb_mask, smoothed
-from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
+from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..anatomy.layers import LayerSpec
 from ..anatomy.markers import find_markers, match_markers
 from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from ..anatomy.segmentation import segment
 from ..anatomy.sites import indenter_axis, project_to_skin
 from ..anatomy.surfaces import (
     Anatomy,
     build_anatomy,
     check_anatomy,
-    check_closed,
-    extract_surface,
     load_anatomy,
     read_surface,
     save_anatomy,
-    write_surface,
 )
 from ..anatomy.thickness import fat_depth, read_thickness, write_thickness
 from ..errors import SiteError
 from ..mesh import write_vtu
 from ..study import Site, Study
 from .context import Context
-from .inputs import marked_image, naming, study_image, study_labels
+from .inputs import automatic_labels, labelled_file, naming, study_image, study_labels
+from .marked_images import MARKED_SKIN, second_skin, without_own_markers
 from .store import read_json, write_json
 
 THICKNESS = "fat-depth.vtp"
@@ -44,7 +40,7 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     assert study.image is not None
     context.tell("segment", 0, 3, "reading the image")
-    volume = study_image(study)
+    volume, removed = without_own_markers(study, study_image(study), folder)
     context.tell("segment", 1, 3, "labelling tissues")
     given = study_labels(study, volume)
     if given is not None:
@@ -52,28 +48,12 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
         for note in notes:
             context.tell("segment", 1, 3, f"label map: {note}")
     else:
-        with naming(study.path(study.image.path)):
-            labels = segment(
-                volume,
-                bias_correction=study.segmentation.bias_correction,
-                min_bone_volume_mm3=study.segmentation.min_bone_volume_mm3,
-            )
-        notes, method = [], "automatic"
+        labels, notes, method = automatic_labels(study, volume), [], "automatic"
     write_labels(folder / "labels.seg.nrrd", labels)
-    marked = marked_image(study)
-    if marked is not None:
-        context.tell("segment", 2, 3, "outlining the image with markers")
-        write_labels(folder / "markers.seg.nrrd", outline(marked))
-    write_json(
-        folder / "segment.json", {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
-    )
+    context.tell("segment", 2, 3, "outlining the skin with markers")
+    facts = {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
+    write_json(folder / "segment.json", facts | removed | second_skin(study, volume, labels, folder))
     return {}
-
-
-def outline(volume: Volume) -> LabelMap:
-    """The limb of an image as one label, markers included."""
-    limb = limb_mask(volume, smoothed(volume))
-    return LabelMap(limb.astype(np.uint8), volume.spacing, volume.origin, volume.direction, {1: "limb"})
 
 
 def label_volumes(labels: LabelMap) -> dict[str, float]:
@@ -97,11 +77,6 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
         if any(layer.thickness == "map" for layer in study.geometry.model_layers):
             depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
             write_thickness(folder / THICKNESS, anatomy.skin, depth)
-        if study.image is not None and study.image.markers is not None:
-            context.tell("surfaces", 1, 2, "skin with markers")
-            marked = read_labels(context.store["segment"] / "markers.seg.nrrd")
-            write_surface(folder / "skin-markers.stl", extract_surface(marked, None))
-    check_anatomy(anatomy)
     save_anatomy(folder, anatomy)
     return {}
 
@@ -119,30 +94,31 @@ def _limb_labels(context: Context) -> LabelMap:
 def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
     geometry = study.geometry
     cut = geometry.proximal_cut
-    return build_anatomy(
-        labels,
-        edge_mm=geometry.surface_edge_mm,
-        proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
-    )
+    with naming(labelled_file(study)):
+        anatomy = build_anatomy(
+            labels,
+            edge_mm=geometry.surface_edge_mm,
+            proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
+        )
+        check_anatomy(anatomy)
+    return anatomy
 
 
 def given_anatomy(study: Study) -> Anatomy:
-    """The anatomy from closed surfaces; without a stated cut the highest (z) face of the skin."""
+    """The checked anatomy of given surfaces; without a stated cut its end is the highest (z) of the skin."""
     assert study.surfaces is not None
     tables = study.surfaces
-    files = {"skin": tables.skin, **tables.bones}
-    surfaces = {
-        name: read_surface(study.path(path), tables.coordinates, tables.unit) for name, path in files.items()
-    }
-    for name, surface in surfaces.items():
-        check_closed(surface, name, study.path(files[name]))
+    files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
+    surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
     skin = surfaces.pop("skin")
     cut = study.geometry.proximal_cut
     if cut is not None:
         point, normal = np.array(cut.point), np.array(cut.normal)
     else:
         point, normal = np.array([0.0, 0.0, skin.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
-    return Anatomy(skin=skin, bones=surfaces, cut_point=point, cut_normal=normal / np.linalg.norm(normal))
+    anatomy = Anatomy(skin=skin, bones=surfaces, cut_point=point, cut_normal=normal)
+    check_anatomy(anatomy, files)
+    return anatomy
 
 
 def run_sites(context: Context, folder: Path) -> dict[str, Any]:
@@ -162,7 +138,7 @@ def _matched_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
     hints = {site.name: np.array(site.near) for site in context.study.sites if site.near is not None}
     if not hints:
         return {}
-    marked = read_surface(context.store["surfaces"] / "skin-markers.stl")
+    marked = read_surface(context.store["segment"] / MARKED_SKIN)
     return dict(match_markers(find_markers(marked, anatomy.skin), hints))
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from ..anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
 from ..anatomy.one_limb import check_one_limb
+from ..anatomy.placement import on_grid_of
+from ..anatomy.segmentation import segment
 from ..errors import InputError
 from ..study import Study
 
@@ -23,11 +25,11 @@ def study_image(study: Study) -> Volume:
 
 
 def marked_image(study: Study) -> Volume | None:
-    """The image of the same limb with markers on, if the study has one."""
+    """The second image of the limb, with markers on, if the study has one."""
     assert study.image is not None
-    if study.image.markers is None:
+    if study.image.marked is None:
         return None
-    return _image(study.path(study.image.markers), study.image.markers_series)
+    return _image(study.path(study.image.marked), study.image.markers_series)
 
 
 def _image(path: Path, series: str | None) -> Volume:
@@ -42,6 +44,32 @@ def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | N
         return None
     path = study.path(study.segmentation.labels)
     return cleaned(read_labels(path, volume), path)
+
+
+def automatic_labels(study: Study, volume: Volume) -> LabelMap:
+    """The automatic segmentation, on the image's grid.
+
+    It is made in a frame that does not depend on the order of the axes in the file nor on its rounding: near
+    a threshold either would decide about voxels.
+    """
+    assert study.image is not None
+    path, table = study.path(study.image.path), study.segmentation
+    near = volume.nearest_lps()
+    with naming(path):
+        found = segment(
+            near.in_own_frame(),
+            bias_correction=table.bias_correction,
+            min_bone_volume_mm3=table.min_bone_volume_mm3,
+        )
+    return on_grid_of(
+        LabelMap(found.array, near.spacing, near.origin, near.direction, found.names), volume, path
+    )
+
+
+def labelled_file(study: Study) -> Path:
+    """What the labels of a study come from: its label map, or the image."""
+    assert study.image is not None
+    return study.path(study.segmentation.labels or study.image.path)
 
 
 @contextmanager

@@ -72,7 +72,7 @@ def input_files(study: Study) -> dict[str, list[Path]]:
     """The study's input files and folders by the stage that reads them."""
     files: dict[str, list[Path]] = {"segment": [], "surfaces": [], "traces": []}
     if study.image is not None:
-        files["segment"] += [study.image.path, *filter(None, [study.image.markers])]
+        files["segment"] += [study.image.path, *filter(None, [study.image.marked])]
     if study.segmentation.labels is not None:
         files["segment"].append(study.segmentation.labels)
         names = sidecar(study.segmentation.labels)

@@ -162,7 +162,7 @@ def surface_figure(store: Store) -> Figure | None:
 @_without_display_warning()
 def marker_figure(store: Store) -> Figure | None:
     """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
-    marked_file, plain_file = store.folder / "surfaces" / "skin-markers.stl", store.surface_files.get("skin")
+    marked_file, plain_file = store.folder / "segment" / "skin-markers.stl", store.surface_files.get("skin")
     if plain_file is None or not marked_file.is_file():
         return None
     plain = pv.read(plain_file)
