@@ -161,3 +161,39 @@ def test_planned_indentation_is_simulated_without_a_record(coarse):
     assert curve["force_N"].max() == pytest.approx(found["peak_force_N"], rel=0.02)
     fields = read_vtu(coarse / "results/simulate/2.vtu")
     assert len(fields.points) > 100
+
+
+LAYERS = """
+[geometry]
+layers = [{ name = "skin", thickness_mm = 2.0 }, { name = "fat", thickness_mm = 6.0 }]
+core = "calf"
+[material.tissues.fat]
+start = { c_kPa = 3.0 }
+"""
+
+
+@pytest.mark.slow
+def test_three_tissues_from_surfaces_to_report(coarse):
+    file = coarse / "study.toml"
+    file.write_text(file.read_text() + LAYERS)
+    summary = run_study(load_study(coarse), listener=quiet)
+    tissues = ("skin", "fat", "calf")
+    assert tuple(summary["parameters"]) == tuple(summary["intervals_95"]) == tissues
+    assert summary["mean_error_fitted_percent"] < 10.0
+    results = coarse / "results"
+    assert read_vtu(results / "mesh/1.vtu").region_names == tissues
+    calibration = json.loads((results / "calibrate/calibration.json").read_text())
+    assert [stage["name"] for stage in calibration["stages"]] == ["one material", "three materials"]
+    assert calibration["stages"][0]["start"]["fat"]["c_kPa"] == 3.0
+    assert set(calibration["uncertainty"]["correlation"]["names"]) == set(
+        calibration["uncertainty"]["verdict"]
+    )
+    report = (results / "report/report.html").read_text()
+    assert "first as one material, then as skin, fat and calf." in report
+    assert "skin (2.0 mm) and fat (6.0 mm)" in report
+    before = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
+    assert set(before.values()) == {"done"}
+    file.write_text(file.read_text().replace('"calf"', '"muscle"'))
+    after = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
+    assert {after[stage] for stage in ("mesh", "calibrate", "predict", "report")} == {"stale"}
+    assert after["traces"] == "done"
