@@ -76,10 +76,13 @@ def test_results_travel_between_processes(result):
     assert copy.system is None
 
 
-def test_linear_solvers_give_the_same_simulation(problem, result):
-    other = solve(problem, StepControl(linear_solver="superlu"))
+@pytest.mark.parametrize("name", ["superlu", "multigrid"])
+def test_linear_solvers_give_the_same_simulation(problem, result, name):
+    other = solve(problem, StepControl(linear_solver=name), sensitivities=True)
     np.testing.assert_allclose(other.force, result.force, atol=1e-4 * result.peak_force)
-    assert other.statistics["linear_solver"] == "superlu"
+    assert other.statistics["linear_solver"] == name
+    most = np.abs(result.force_sensitivity).max(axis=0)
+    np.testing.assert_allclose(other.force_sensitivity / most, result.force_sensitivity / most, atol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,11 @@ def newton_direction(system: System, at: Evaluation, factor: Factor, tolerance: 
     Where the model is not convex it is only a direction of descent.
     """
     b = -at.residual.ravel()[system.free][:, None]
-    if not factor.ready:
+    if not factor.ready and factor.lasting:
         _begin(system, at, factor)
     if at.touch is None:
+        if not factor.lasting:
+            factor.factorise(at.tangent)
         found = factor.solve(at.tangent, b, None, tolerance)
         if not found.converged and found.convex:
             found = factor.solve_anew(at.tangent, b, None, tolerance, found.x)
@@ -52,9 +54,17 @@ def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> Spri
     return factor.springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
 
 
+def _matched(factor: Factor, at: Evaluation, touch: Touch, closed: Bools, data: Array) -> SpringChange | None:
+    """`_change`; what does not last is made anew for ``data``, the tangent with those springs, instead."""
+    if factor.lasting:
+        return _change(factor, at, touch, closed)
+    factor.factorise(data, touch.under(closed)[0])
+    return None
+
+
 def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> Solution:
     """Without foresight: the closed points stay closed."""
-    return factor.solve(at.tangent, b, _change(factor, at, touch, touch.closed), tolerance)
+    return factor.solve(at.tangent, b, _matched(factor, at, touch, touch.closed, at.tangent), tolerance)
 
 
 def _with_contact(
@@ -62,16 +72,18 @@ def _with_contact(
 ) -> Solution:
     found, closed = Solution(np.zeros_like(b), True, True), touch.closed
     for _ in range(ROUNDS):
-        guess, closed = _foresee(system, at, touch, factor, b, found.x, closed)
-        springs = _change(factor, at, touch, closed)
+        guess = found.x
+        if factor.lasting:
+            guess, closed = _foresee(system, at, touch, factor, b, guess, closed)
         blocks, change = touch.under(closed)
         data = system.with_springs(at.tangent, blocks - touch.blocks)
+        springs = _matched(factor, at, touch, closed, data)
         right = b - system.at_springs(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
             found = factor.solve_anew(data, right, blocks, tolerance, found.x)
         foreseen = _closed(touch, system.springs_of(found.x[:, 0]))
-        if (foreseen == closed).all() or springs is None or not found.convex:
+        if (foreseen == closed).all() or (factor.lasting and springs is None) or not found.convex:
             break
         closed = foreseen
     return found
@@ -109,6 +121,8 @@ def _foresee(
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
     """Solution (n, r) of the tangent at an equilibrium for ``b (n, r)``, from the guess ``x``."""
+    if not factor.ready:
+        renew(at, factor)
     springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
     found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:

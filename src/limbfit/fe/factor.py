@@ -1,4 +1,4 @@
-"""One factorisation, used as long as it pays, as the preconditioner of conjugate gradients.
+"""One factorisation, used as long as it pays, as the preconditioner of conjugate gradients; or multigrid.
 
 The factor is in single precision, half the price; the iteration runs in double.  Contact changes are few
 but stiff, and would spoil an old factor at once.  They are local springs, so the preconditioner takes them
@@ -17,6 +17,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
+from .multigrid import Multigrid
 from .springs import SpringChange, SpringColumns
 from .system import System
 
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 # A factor in single precision that needs more iterations at its own matrix has too few digits.
 MOST_REFINEMENTS = 12
 MOST_MINRES, MOST_RESTARTS = 100, 8
+# With fewer unknowns a factor costs no more than multigrid; with more cycles than this it is given up.
+FEWEST_MULTIGRID, MOST_CYCLES = 30_000, 150
 # Smallest shift of a tangent that is not positive definite, relative to each entry of its diagonal: tissues
 # differ in stiffness by up to a hundredfold, and a common shift would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 1e-2, 1e6
@@ -41,11 +44,17 @@ class Solution:
 class Factor:
     """The linear algebra of one simulation: a factor of some earlier tangent and what to do with it.
 
-    ``counts`` and ``seconds`` tell what was done.
+    ``counts`` and ``seconds`` tell what was done.  ``name`` auto is `Multigrid` for quadratic tetrahedra,
+    unless they are few or the factor is to be ``lasting``.
     """
 
-    def __init__(self, system: System, name: str = "auto", threads: int = 1) -> None:
+    def __init__(
+        self, system: System, name: str = "auto", threads: int = 1, lasting: bool = False
+    ) -> None:  # fmt: skip
         self._system, self._choice, self._threads = system, name, threads
+        suits = system.cells.shape[1] == 10 and system.unknowns >= FEWEST_MULTIGRID
+        if name == "auto" and suits and not lasting:
+            self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float)
@@ -57,22 +66,35 @@ class Factor:
 
     def _use(self, single: bool) -> None:
         started = time.perf_counter()
-        system = self._system
-        self._solver: LinearSolver = linear_solver(
-            system.indptr, system.indices, self._choice, self._threads, single
-        )
+        self._solver = self._made(single)
         self._single = single
         self.counts["double_precision"] = int(not single)
         self.seconds["factor"] += time.perf_counter() - started
+
+    def _made(self, single: bool) -> LinearSolver:
+        system, threads = self._system, self._threads
+        if self._choice == Multigrid.name:
+            return Multigrid(system, threads)
+        return linear_solver(system.indptr, system.indices, self._choice, threads, single)
+
+    def _give_up_multigrid(self) -> None:
+        """From here on with a factor."""
+        self._choice = "auto"
+        self._use(single=True)
 
     @property
     def name(self) -> str:
         return self._solver.name
 
     @property
+    def lasting(self) -> bool:
+        """Whether what was factorised is worth keeping for other matrices."""
+        return self._solver.lasting
+
+    @property
     def limit(self) -> int:
         """Products after which a new factorisation would have been cheaper."""
-        return int(self._solver.worth)
+        return int(self._solver.worth) if self.lasting else MOST_CYCLES
 
     def worn(self) -> bool:
         """Whether another step with this factor costs more than the steps since it was made did on average.
@@ -80,7 +102,7 @@ class Factor:
         The optimal time to replace a machine whose running cost rises (Barlow and Proschan 1965).
         """
         steps = self._costs
-        return len(steps) > 1 and steps[-1] * len(steps) > self._solver.worth + sum(steps)
+        return self.lasting and len(steps) > 1 and steps[-1] * len(steps) > self._solver.worth + sum(steps)
 
     def next_step(self) -> None:
         """From here the cost counts for another step."""
@@ -94,7 +116,7 @@ class Factor:
 
         ``blocks (c, 3, 3)``: the contact springs that are in ``data``.
         """
-        if not self.ready:
+        if not self.ready and self.lasting:
             self._choose_precision(data)
         started = time.perf_counter()
         shift = 0.1 * self._shift if self._shift > FIRST_SHIFT else 0.0
@@ -109,7 +131,7 @@ class Factor:
         self.seconds["factor"] += time.perf_counter() - started
 
     def _factorised(self, data: Array, shift: float) -> bool:
-        self.counts["factorisations"] += 1
+        self.counts["factorisations" if self.lasting else "multigrids"] += 1
         if shift:
             data = data.copy()
             data[self._diagonal] += shift * np.abs(data[self._diagonal])
@@ -178,6 +200,8 @@ class Factor:
             fresh = np.einsum("ij,ij->j", r, z)
             p = z + fresh / np.where(rz > 0.0, rz, 1.0) * p
             rz = fresh
+            if (rz < 0.0).any():  # multigrid of a matrix that is not positive definite need not be either
+                return Solution(x if x.any() else r, False, False)
             Ap = self.product(data, p)
             curvature = np.einsum("ij,ij->j", p, Ap)
             live = rz > 0.0
@@ -192,7 +216,10 @@ class Factor:
         """`solve` with a factor of this very matrix, whose springs are ``blocks (c, 3, 3)``.
 
         Where even that does not converge, single precision is too little for the matrix, and is given up.
+        Multigrid that has not converged is given up for a factor.
         """
+        if not self.lasting:
+            self._give_up_multigrid()
         self.factorise(data, blocks)
         found = self.solve(data, b, None, tolerance, x)
         if self._single and self._shift == 0.0 and found.convex and not found.converged:
@@ -206,6 +233,9 @@ class Factor:
 
         Columns that do not get within ``tolerance`` are counted as ``inexact``.
         """
+        if not self.lasting:
+            self._give_up_multigrid()
+            self.factorise(data)
         shape = (len(b), len(b))
         A = spla.LinearOperator(shape, matvec=lambda v: self.product(data, v.reshape(-1, 1)).ravel())
         M = spla.LinearOperator(shape, matvec=lambda v: self.apply(v.ravel()))

@@ -39,11 +39,13 @@ class NotPositiveDefiniteError(ArithmeticError):
 class LinearSolver(Protocol):
     """Analyse once, factorise often, solve oftener.
 
-    ``worth``: the cost of a factorisation over that of one solution and one product with the matrix,
-    estimated from the factor's operations and entries (not timed: a run must be repeatable).
+    ``lasting``: whether a factorisation is worth keeping for other matrices; ``worth``: its cost over that of
+    one solution and one product with the matrix, estimated from the factor's operations and entries (not
+    timed: a run must be repeatable).
     """
 
     name: str
+    lasting: bool
     worth: float
 
     def factorise(self, data: Array) -> None:
@@ -60,6 +62,7 @@ class Pardiso:
     """
 
     name = "pardiso"
+    lasting = True
 
     def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
         self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)
@@ -158,6 +161,7 @@ class Cholmod:
     """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
 
     name = "cholmod"
+    lasting = True
     worth = 20.0
 
     def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
@@ -183,6 +187,7 @@ class SuperLU:
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
+    lasting = True
     worth = 40.0
 
     def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
@@ -238,6 +243,15 @@ def symmetric_product(indptr: Index, indices: Index, data: Array, x: Array, thre
 def _rows_product(indptr, indices, data, x, start, stop):  # type: ignore[no-untyped-def]
     """What rows ``start`` to ``stop`` of the triangle add to the product."""
     y = np.zeros_like(x)
+    if x.shape[1] == 1:
+        flat, out = x[:, 0], y[:, 0]
+        for i in range(start, stop):
+            xi, total = flat[i], data[indptr[i]] * flat[i]
+            for p in range(indptr[i] + 1, indptr[i + 1]):
+                total += data[p] * flat[indices[p]]
+                out[indices[p]] += data[p] * xi
+            out[i] += total
+        return y
     for i in range(start, stop):
         for r in range(x.shape[1]):
             y[i, r] += data[indptr[i]] * x[i, r]

@@ -57,7 +57,8 @@ class Result:
     states : kept steps.
     completed, reason : False and why where the end of the history was not reached.
     warnings : what is doubtful about the kept states.
-    statistics : steps, newton_iterations, factorisations, linear_solver, element, unknowns, seconds by part.
+    statistics : steps, newton_iterations, factorisations, multigrids (made, one for each matrix), solves,
+        linear_solver, element, unknowns, seconds by part.
     """
 
     problem: Problem

@@ -47,7 +47,7 @@ class StepControl:
     max_cuts : how often a step may be halved.
     penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
     penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
-    linear_solver : name in the solver table, or auto.
+    linear_solver : name in the solver table, multigrid (``tet10`` only), or auto.
     threads : of assembly and linear algebra.
     """
 
@@ -110,6 +110,9 @@ class Simulation:
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self.factor = Factor(self.system, control.linear_solver, control.threads)
+        # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
+        apart = sensitivities and not self.factor.lasting
+        self.slopes = Factor(self.system, threads=control.threads, lasting=True) if apart else self.factor
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
@@ -213,13 +216,13 @@ class Simulation:
         started = time.perf_counter()
         u, at = found.u, found.at
         after = self.memory.advanced(self.system, self.laws, u, dt)
-        worn = self.factor.worn()
+        worn = self.slopes.worn()
         if at.data is None and (worn or self.slope is not None):
             at = self.system.evaluate(u, self.laws, increment)
             found = replace(found, at=at)
         if worn:
-            renew(at, self.factor)
-        self.factor.next_step()
+            renew(at, self.slopes)
+        self.slopes.next_step()
         du = force_slope = None
         if self.slope is not None:
             du, force_slope = self._differentiate(self.slope, found, increment, dt, stiffness)
@@ -255,7 +258,7 @@ class Simulation:
         guess = sum(w * s.sensitivity for w, s in zip(weights, self.states) if s.sensitivity is not None)
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
         du = np.zeros((u.size, laws.count))
-        du[system.free] = solve_at(at, self.factor, b, x, SENSITIVITY_TOLERANCE)
+        du[system.free] = solve_at(at, self.slopes, b, x, SENSITIVITY_TOLERANCE)
         d_force = at.force * d_penalty + d_reaction
         if at.advance is not None:
             d_force = d_force - at.advance.ravel() @ du
@@ -391,7 +394,7 @@ def _result(
 
 def _inexact(run: Simulation) -> tuple[str, ...]:
     """A warning where sensitivities of an unstable equilibrium could not be solved for."""
-    count = run.factor.counts["inexact"]
+    count = run.slopes.counts["inexact"]
     return (f"{count} sensitivities at unstable equilibria are inexact",) if count else ()
 
 
@@ -414,13 +417,18 @@ def _folded(problem: Problem, states: Sequence[State]) -> tuple[str, ...]:
 
 
 def _statistics(run: Simulation, seconds: float) -> dict[str, Any]:
-    parts = {name: float(value) for name, value in (run.seconds | run.factor.seconds).items()}
+    used = [run.factor, *([run.slopes] if run.slopes is not run.factor else [])]
+    parts = dict(run.seconds)
+    for factor in used:
+        for name, value in factor.seconds.items():
+            parts[name] = parts.get(name, 0.0) + value
     return {
         "steps": run.counts["steps"],
         "cuts": run.counts["cuts"],
         "newton_iterations": run.counts["newton_iterations"],
-        "factorisations": run.factor.counts["factorisations"],
-        "solves": run.factor.counts["solves"],
+        "factorisations": sum(factor.counts["factorisations"] for factor in used),
+        "multigrids": run.factor.counts["multigrids"],
+        "solves": sum(factor.counts["solves"] for factor in used),
         "linear_solver": run.factor.name,
         "element": run.system.element.name,
         "unknowns": run.system.unknowns,

@@ -128,15 +128,8 @@ class System:
             raise ProblemError("every node is held: nothing is left to solve")
 
     def _build_pattern(self) -> None:
-        m, k = self.cells.shape
-        incidence = sp.csr_matrix(
-            (np.ones(m * k, dtype=np.int32), self.cells.ravel(), np.arange(0, m * k + 1, k)),
-            shape=(m, len(self.points)),
-        )
-        graph = (incidence.T @ incidence).tocsr()
-        graph.sort_indices()
-        numbers = self.numbers
-        self.indptr, self.indices = _upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
+        graph, numbers = node_graph(self.cells, len(self.points)), self.numbers
+        self.indptr, self.indices = upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
         self.cell_positions = _positions(self.cells, numbers, self.indptr, self.indices)
 
     @property
@@ -261,8 +254,19 @@ class System:
         return sp.csr_matrix(entries, shape=(self.unknowns, 3 * f * q))
 
 
+def node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
+    """Which nodes share a cell, themselves included; rows sorted."""
+    m, k = cells.shape
+    incidence = sp.csr_matrix(
+        (np.ones(m * k, dtype=np.int32), cells.ravel(), np.arange(0, m * k + 1, k)), shape=(m, nodes)
+    )
+    graph = (incidence.T @ incidence).tocsr()
+    graph.sort_indices()
+    return graph
+
+
 @njit(cache=True)
-def _upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
+def upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
     """Upper triangle of the unknowns' graph, rows sorted, from the sorted graph of the nodes."""
     indptr = np.zeros(n + 1, dtype=np.int32)
     for sweep in range(2):
