@@ -77,7 +77,7 @@ def test_small_bones_are_left_out_and_no_bone_is_an_error():
     ("array", "expected"),
     [
         (np.full(SHAPE, 7.0), "constant"),
-        (np.random.default_rng(0).normal(0, 300, SHAPE) - 500, "CT"),
+        (np.random.default_rng(0).normal(0, 300, SHAPE) - 500, "no bone"),
         (np.pad(np.full((6, 6, 6), 100.0), 20), "no limb"),
     ],
 )

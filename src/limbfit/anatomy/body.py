@@ -18,6 +18,7 @@ from scipy.ndimage import label as connected
 from ..errors import ImageError
 from .ends import longest_axis
 from .grid import Volume
+from .supports import without_supports
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -39,14 +40,14 @@ def smoothed(volume: Volume) -> Field:
 
 
 def check_contrast(volume: Volume) -> None:
-    """Refuse what this segmentation was not made for."""
+    """Refuse what the search for markers was not made for."""
     low, high = float(volume.array.min()), float(volume.array.max())
     if high <= low:
         raise ImageError("the image is constant", remedy="check the series")
     if low < -200:
         raise ImageError(
-            "the image has the grey values of CT; bones are found automatically in MRI only",
-            remedy="give a label map (segmentation.labels in study.toml)",
+            "the image has the grey values of CT; markers are found in MRI only",
+            remedy="give the sites' positions (position in study.toml)",
         )
 
 
@@ -67,7 +68,7 @@ def limb_mask(volume: Volume, smooth: Field) -> Mask:
     """
     tissue = float(np.median(smooth[smooth > _otsu(smooth)]))
     rough = _largest(smooth > _TISSUE * tissue)
-    rough = _solid(rough, volume)
+    rough = _largest(without_supports(_solid(rough, volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb is to be seen in the image", remedy="check the series and its contrast")
     size = 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 1

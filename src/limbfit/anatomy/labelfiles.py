@@ -27,6 +27,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "fibula": (0.56, 0.74, 0.86),
     "femur": (0.62, 0.80, 0.55),
     "patella": (0.78, 0.62, 0.86),
+    "fat": (0.98, 0.90, 0.55),
 }
 _OTHER_COLOURS = ((0.9, 0.6, 0.2), (0.4, 0.6, 0.9), (0.5, 0.8, 0.7), (0.8, 0.5, 0.6))
 _SPACES = {

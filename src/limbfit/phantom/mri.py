@@ -1,8 +1,11 @@
-"""The MRI of a phantom: ultra-short-echo-like contrast, and real DICOM series of it.
+"""The image of a phantom: ultra-short-echo-like, T1-like or CT contrast, and real DICOM series of it.
 
-Signal levels are relative to fat. Partial volume is the exact box average over a voxel of a locally flat
+Signal levels of MRI are relative to fat, those of CT are Hounsfield units.
+
+Partial volume is the exact box average over a voxel of a locally flat
 interface, blurred to a Gaussian: ``Phi(-sqrt(12) d / w)`` with ``d`` the distance to the interface and ``w``
-the voxel's extent along its normal. Noise is Rician: the magnitude of a signal with complex Gaussian noise.
+the voxel's extent along its normal. Noise of MRI is Rician: the magnitude
+of a signal with complex Gaussian noise.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from pydicom.uid import UID, ExplicitVRLittleEndian, MRImageStorage, generate_ui
 from pydicom.valuerep import format_number_as_ds
 from scipy.special import ndtr
 
+from ..anatomy.grid import Volume
 from .geometry import BONES, PROXIMAL_CUT_MM, Limb, rotation_about
 
 FAT, MUSCLE, MARROW, CORTEX, MARKER = 1.0, 0.5, 0.8, 0.12, 1.15
@@ -28,6 +32,29 @@ BIAS = 0.2
 FULL_SCALE, RESCALE_SLOPE = 1200.0, 0.5
 SLAB = 12
 REACH_MM = 85.0  # no tissue or marker lies further from the limb's axis
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Levels of the tissues, the standard deviation of the noise and the amplitude of the bias."""
+
+    air: float
+    fat: float
+    muscle: float
+    marrow: float
+    cortex: float
+    marker: float
+    noise: float
+    bias: float
+    rician: bool = True
+
+
+CONTRASTS = {
+    "UTE": Contrast(0.0, FAT, MUSCLE, MARROW, CORTEX, MARKER, NOISE, BIAS),
+    "T1": Contrast(0.0, 1.0, 0.35, 0.95, 0.03, 1.15, 0.02, BIAS),
+    "CT": Contrast(-1000.0, -100.0, 50.0, 60.0, 1300.0, 400.0, 25.0, 0.0, rician=False),
+}
+UTE = CONTRASTS["UTE"]
 
 
 @dataclass(frozen=True)
@@ -95,13 +122,15 @@ def _occupancy(
     return [ndtr(-np.sqrt(12.0, dtype=field.dtype) * (distance + offset) / width) for offset in offsets]
 
 
-def _tissue(limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float]) -> tuple:
+def _tissue(
+    limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float], levels: Contrast
+) -> tuple:
     """Noise-free signal of a block and the share of each voxel inside the skin."""
     skin, inner = _occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
-    signal = FAT * skin + (MUSCLE - FAT) * inner
+    signal = levels.air + (levels.fat - levels.air) * skin + (levels.muscle - levels.fat) * inner
     for name in BONES:
         bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, CORTEX_MM[name]))
-        signal = signal * (1 - bone) + CORTEX * bone + (MARROW - CORTEX) * marrow
+        signal = signal * (1 - bone) + levels.cortex * bone + (levels.marrow - levels.cortex) * marrow
     return signal, skin
 
 
@@ -111,6 +140,7 @@ def _add_marker(
     points: NDArray[np.floating],
     spacing: tuple[float, float, float],
     marker: SkinMarker,
+    levels: Contrast,
 ) -> None:
     """Add a marker's signal in place, in the small box of voxels around it."""
     near = np.linalg.norm(points - marker.position.astype(points.dtype), axis=-1) < 14.0
@@ -120,7 +150,7 @@ def _add_marker(
     if min(signal[box].shape) < 2:
         return
     (share,) = _occupancy(marker.field(points[box]), spacing, (0.0,))
-    signal[box] += MARKER * share * (1 - skin[box])
+    signal[box] += (levels.marker - levels.air) * share * (1 - skin[box])
 
 
 def _limb_window(grid: Grid, limb: Limb, k: slice) -> tuple[slice, slice]:
@@ -138,11 +168,11 @@ def _limb_window(grid: Grid, limb: Limb, k: slice) -> tuple[slice, slice]:
     return window[0], window[1]
 
 
-def _bias_field(seed: int) -> Callable[[Grid, slice], NDArray[np.float32]]:
-    """A smooth receive profile within 1 +- ``BIAS`` over the whole image."""
+def _bias_field(seed: int, amplitude: float) -> Callable[[Grid, slice], NDArray[np.float32]]:
+    """A smooth receive profile within 1 +- ``amplitude`` over the whole image."""
     random = np.random.default_rng([seed, 4])
     linear, quadratic = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
-    scale = BIAS / (np.abs(linear).sum() + np.abs(quadratic).sum())
+    scale = amplitude / (np.abs(linear).sum() + np.abs(quadratic).sum())
 
     def profile(grid: Grid, k: slice) -> NDArray[np.float32]:
         terms = []
@@ -156,25 +186,47 @@ def _bias_field(seed: int) -> Callable[[Grid, slice], NDArray[np.float32]]:
 
 
 def slabs(
-    limb: Limb, grid: Grid, markers: Sequence[SkinMarker], seed: int, noise: float = NOISE
+    limb: Limb,
+    grid: Grid,
+    markers: Sequence[SkinMarker],
+    seed: int,
+    noise: float | None = None,
+    levels: Contrast = UTE,
 ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """The image slab by slab: slices and signal (nk, nj, ni) relative to fat, with bias and noise."""
+    """The image slab by slab: slices and signal (nk, nj, ni), with bias and noise (the contrast's, or given)."""
     random = np.random.default_rng([seed, 5, len(markers)])
-    bias = _bias_field(seed)
+    bias = _bias_field(seed, levels.bias)
+    deviation = levels.noise if noise is None else noise
     for start in range(0, grid.shape[0], SLAB):
         k = slice(start, min(start + SLAB, grid.shape[0]))
         padded = slice(k.start - 1, k.stop + 1)
         rows, columns = _limb_window(grid, limb, padded)
         points = grid.points(padded, rows, columns)
-        tissue, skin = _tissue(limb, points, grid.spacing)
+        tissue, skin = _tissue(limb, points, grid.spacing, levels)
         for marker in markers:
-            _add_marker(tissue, skin, points, grid.spacing, marker)
-        signal = np.zeros((k.stop - k.start, *grid.shape[1:]), np.float32)
+            _add_marker(tissue, skin, points, grid.spacing, marker, levels)
+        signal = np.full((k.stop - k.start, *grid.shape[1:]), levels.air, np.float32)
         signal[:, rows, columns] = tissue[1:-1]
         signal *= bias(grid, k)
-        real = signal + noise * random.standard_normal(signal.shape, dtype=np.float32)
-        imaginary = noise * random.standard_normal(signal.shape, dtype=np.float32)
-        yield k, np.hypot(real, imaginary)
+        signal += deviation * random.standard_normal(signal.shape, dtype=np.float32)
+        if levels.rician:
+            imaginary = deviation * random.standard_normal(signal.shape, dtype=np.float32)
+            signal = np.hypot(signal, imaginary)
+        yield k, signal
+
+
+def image_of(
+    limb: Limb,
+    grid: Grid,
+    markers: Sequence[SkinMarker] = (),
+    *,
+    seed: int = 0,
+    noise: float | None = None,
+    levels: Contrast = UTE,
+) -> Volume:
+    """The whole image in memory, without a detour by files; ``levels`` is one of ``CONTRASTS``."""
+    array = np.concatenate([signal for _, signal in slabs(limb, grid, markers, seed, noise, levels)])
+    return Volume(array, np.array(grid.spacing), grid.origin, grid.direction)
 
 
 def write_series(

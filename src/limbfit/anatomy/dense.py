@@ -1,0 +1,66 @@
+"""Bones in CT: whatever is dense, with the marrow that it encloses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, binary_opening, find_objects, grey_dilation
+from scipy.ndimage import label as connected
+
+from .body import ball, fill_slices
+from .contrast import MUSCLE_HU
+
+Mask = NDArray[np.bool_]
+Field = NDArray[np.float32]
+Spacing = NDArray[np.float64]
+
+_DENSE_HU = 200.0  # cancellous bone is denser, muscle and contrast-free vessels are not
+_COMPACT_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
+_RIM_MM = 2.5  # the outline is at half of the densest bone this near
+_CLOSE_MM = 2.0  # gaps in thin cortex
+_SMOOTH_MM = 1.0
+
+
+def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Spacing, smallest_mm3: float) -> list[Mask]:
+    """Masks of the bones, largest first; bones that touch are one.
+
+    Parameters
+    ----------
+    hounsfield : ``[k, j, i]``, k along the limb.
+    limb : everything inside the skin.
+    spacing : mm along i, j, k.
+    smallest_mm3 : bones smaller than this are left out.
+    """
+    compact = np.minimum(hounsfield, _COMPACT_HU)
+    size = 2 * np.ceil(_RIM_MM / spacing[::-1]).astype(int) + 1
+    half = (grey_dilation(compact, size=tuple(size)) + MUSCLE_HU) / 2
+    dense = limb & (compact > _DENSE_HU)
+    sharp = dense & (compact > half)
+    parts, _ = connected(sharp | (dense & _inner(sharp, dense, spacing)))
+    voxel = float(np.prod(spacing))
+    found = []
+    for value, box in enumerate(find_objects(parts), start=1):
+        if (parts[box] == value).sum() * voxel < 0.1 * smallest_mm3:
+            continue
+        bone = np.zeros(limb.shape, dtype=bool)
+        bone[box] = _filled(parts[box] == value, spacing)
+        bone &= limb
+        if bone.sum() * voxel >= smallest_mm3:
+            found.append(bone)
+    return sorted(found, key=lambda bone: -int(bone.sum()))
+
+
+def _inner(sharp: Mask, dense: Mask, spacing: Spacing) -> Mask:
+    """Dense voxels that sharp ones enclose: cancellous bone, which is below half of the cortex beside it."""
+    return _filled(sharp, spacing) & dense
+
+
+def _filled(part: Mask, spacing: Spacing) -> Mask:
+    """Closed over gaps of the cortex, filled slice by slice, without spikes."""
+    reach = np.ceil(_CLOSE_MM / spacing[::-1]).astype(int) + 1
+    inner = tuple(slice(r, -r) for r in reach)
+    padded = np.pad(part, [(reach[0], reach[0])] + [(r, r) for r in reach[1:]], mode="constant")
+    padded[: reach[0]], padded[-reach[0] :] = padded[reach[0]], padded[-reach[0] - 1]
+    closed = fill_slices(binary_closing(padded, ball(_CLOSE_MM, spacing)) | padded)
+    opened = binary_opening(closed, ball(_SMOOTH_MM, spacing)) | (closed & padded)
+    return np.asarray(opened[inner])

@@ -1,0 +1,131 @@
+"""Subcutaneous fat: what is bright and joined to the skin over more than a thin septum.
+
+The skin itself belongs to it, as in the skin–adipose layer of the model. Marrow, fat between muscles and
+the septa of fat that reach in from the skin do not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_propagation, distance_transform_edt, gaussian_filter
+from scipy.ndimage import label as connected
+
+Mask = NDArray[np.bool_]
+Field = NDArray[np.float32]
+Spacing = NDArray[np.float64]
+
+SKIN_MM = 1.5  # skin is darker than fat; so deep everything counts as skin
+SEPTUM_MM = 1.5  # sheets of fat thinner than twice this are septa
+FAT_HU = (-200.0, -25.0)
+_FAINTEST = 1.5  # of muscle: fat is at least this bright
+_BRIGHTEST = 2.0  # where nothing tells how bright fat is
+_RIND_MM = 20.0  # tissue so near to the skin shows both fat and muscle
+_NEAR_MM, _STEP_MM = 14.0, 8.0  # half the edge of a neighbourhood, and how far apart they are
+_LOW, _HIGH = 25, 93  # percentiles between which the level is looked for
+_ROUNDS = 10
+_FEWEST = 50  # samples in a neighbourhood
+_SAMPLE_MM = 2.5
+_NOISE_MM = 0.9
+
+
+def bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
+    """Voxels nearer to fat than to muscle in MRI, as bright as these are in their neighbourhood.
+
+    ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`depth_below`). What a coil sees
+    less of is darker, fat and muscle alike, and N4 leaves some of that.
+    """
+    rind = limb & ~bones & (depth < _RIND_MM)
+    return np.asarray(limb & (_denoised(levels, limb, spacing) > _half_way(levels, rind, spacing)))
+
+
+def _denoised(levels: Field, limb: Mask, spacing: Spacing) -> Field:
+    """The mean of the neighbourhood inside the limb."""
+    sigma = _NOISE_MM / spacing[::-1]
+    weight = gaussian_filter(limb.astype(np.float32), sigma, mode="nearest")
+    total = gaussian_filter(np.where(limb, levels, 0).astype(np.float32), sigma, mode="nearest")
+    return np.asarray(total / np.maximum(weight, 1e-3))
+
+
+def _half_way(levels: Field, rind: Mask, spacing: Spacing) -> Field:
+    """Half-way between muscle and fat around each voxel."""
+    every = np.maximum((_SAMPLE_MM / spacing[::-1]).astype(int), 1)
+    thinned = tuple(slice(None, None, n) for n in every)
+    values, inside = levels[thinned], rind[thinned]
+    sampling = spacing[::-1] * every
+    half = np.maximum(np.round(_NEAR_MM / sampling).astype(int), 1)
+    centres = [_centres(n, step) for n, step in zip(values.shape, _STEP_MM / sampling)]
+    found = np.full([len(c) for c in centres], np.nan)
+    for place in np.ndindex(*found.shape):
+        middle = [int(c[n]) for c, n in zip(centres, place)]
+        box = tuple(slice(max(m - h, 0), m + h + 1) for m, h in zip(middle, half))
+        near = values[box][inside[box]]
+        if len(near) >= _FEWEST:
+            found[place] = _between(near)
+    if np.isfinite(found).any():
+        nearest = distance_transform_edt(np.isnan(found), return_distances=False, return_indices=True)
+        found = found[tuple(nearest)]
+    else:
+        found[:] = (1 + _BRIGHTEST) / 2
+    whole = [
+        np.interp(np.arange(n) / e, c, np.arange(len(c))) for n, e, c in zip(levels.shape, every, centres)
+    ]
+    return _resampled(found, whole)
+
+
+def _between(values: Field) -> float:
+    """The level half-way between two kinds of tissue (isodata); not a number where there is one kind."""
+    level = float(np.mean(np.percentile(values, (_LOW, _HIGH))))
+    for _ in range(_ROUNDS):
+        above = values > level
+        if above.all() or not above.any():
+            return np.nan
+        low, high = float(values[~above].mean()), float(values[above].mean())
+        level = (low + high) / 2
+    return level if high > _FAINTEST * low else np.nan
+
+
+def _centres(count: int, step: float) -> NDArray[np.float64]:
+    return np.linspace(0, count - 1, max(2, round(count / max(step, 1.0)) + 1))
+
+
+def _resampled(coarse: NDArray[np.float64], places: list[NDArray[np.float64]]) -> Field:
+    """Linear interpolation axis by axis at fractional indices."""
+    for axis, place in enumerate(places):
+        low = np.minimum(place.astype(int), coarse.shape[axis] - 2)
+        part = (place - low).reshape([-1 if n == axis else 1 for n in range(3)]).astype(np.float32)
+        coarse = np.take(coarse, low, axis) * (1 - part) + np.take(coarse, low + 1, axis) * part
+    return coarse.astype(np.float32)
+
+
+def subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
+    """The part of ``bright`` that belongs to the skin's layer, skin included; all masks ``[k, j, i]``.
+
+    The image's ends (first and last k) do not count as skin.
+    """
+    outer = ~limb | (depth < SKIN_MM)
+    layer = (bright | outer) & ~bones
+    opened = _opened(layer, spacing)
+    joined = binary_propagation(outer & opened, mask=opened) | outer
+    # Vessels and nerves within the layer belong to it: what it parts from the inner limb.
+    parts, count = connected(limb & ~joined)
+    if count > 1:
+        joined |= (parts > 0) & (parts != int(np.argmax(np.bincount(parts.ravel())[1:])) + 1)
+    return np.asarray(joined & limb & ~bones)
+
+
+def depth_below(limb: Mask, spacing: Spacing) -> Field:
+    """Distance to the outline, mm; the image's ends do not count as outline."""
+    padded = np.pad(limb, ((1, 1), (1, 1), (1, 1)))
+    padded[0], padded[-1] = padded[1], padded[-2]
+    found = distance_transform_edt(padded, sampling=spacing[::-1])[1:-1, 1:-1, 1:-1]
+    return np.asarray(found, dtype=np.float32)
+
+
+def _opened(mask: Mask, spacing: Spacing) -> Mask:
+    """Opened by a ball of ``SEPTUM_MM``; beyond the image everything goes on as at its border."""
+    reach = np.ceil(2 * SEPTUM_MM / spacing[::-1]).astype(int) + 1
+    padded = np.pad(mask, [(r, r) for r in reach], mode="edge")
+    inner = distance_transform_edt(padded, sampling=spacing[::-1]) > SEPTUM_MM
+    opened = distance_transform_edt(~inner, sampling=spacing[::-1]) <= SEPTUM_MM
+    return np.asarray(opened[tuple(slice(r, -r) for r in reach)])
