@@ -113,7 +113,7 @@ def _lines(
 def _material(name: str, material: Material) -> Iterator[str]:
     """Ogden with long-term moduli ``c/2``, exponents and ``D``; relaxation over the instantaneous moduli."""
     table = material.table()
-    prony = [(g, tau) for g, tau in table.prony if g != 0.0]
+    prony = [(float(g), float(tau)) for g, tau in table.prony if g != 0.0]
     yield f"*SOLID SECTION, ELSET={name}, MATERIAL={name}_law\n*MATERIAL, NAME={name}_law"
     moduli = ", MODULI=LONG TERM" if prony else ""
     yield f"*HYPERELASTIC, OGDEN, N={len(table.terms)}{moduli}"
@@ -124,7 +124,7 @@ def _material(name: str, material: Material) -> Iterator[str]:
     if prony:
         yield "*VISCOELASTIC, TIME=PRONY"
         total = 1.0 + sum(g for g, _ in prony)
-        yield from (f"{g / total!r}, 0., {tau!r}" for g, tau in np.array(prony).tolist())
+        yield from (f"{g / total!r}, 0., {tau!r}" for g, tau in prony)
 
 
 def _sides(name: str, mesh: Mesh, faces: NDArray[np.int64], numbers: NDArray[np.int64]) -> Iterator[str]:
@@ -166,7 +166,7 @@ def _step(problem: Problem, system: System, handle: int, settings: FebSettings) 
     first, largest = (history.peak or end) / 64.0, (history.peak or end) / 16.0
     yield f"{first!r}, {end!r}, {end * 1e-8!r}, {largest!r}"
     yield "*BOUNDARY, AMPLITUDE=advance"
-    yield from (f"handle, {i}, {i}, {float(axis[i])!r}" for i in range(3))
+    yield from (f"handle, {i}, {i}, {float(axis[i - 1])!r}" for i in (1, 2, 3))
     yield "*NODE PRINT, NSET=handle\nU, RF\n*NODE FILE\nU\n*EL FILE\nS\n*END STEP"
 
 

@@ -34,7 +34,7 @@ def read_requests(section: Node | None) -> tuple[tuple[Request, ...], tuple[str,
     requests, notes = [], list[str]()
     for output in section or ():
         if output.tag != "logfile":
-            notes.append(f"{output.place}: not written; fields are written as VTU")
+            notes.append(f"{output.place}: not written")
             continue
         for entry in output:
             if entry.tag not in KNOWN or {"node_set", "elem_set"} & set(entry.attributes):

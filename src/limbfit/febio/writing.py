@@ -256,9 +256,10 @@ def _load_curves(problem: Problem, settings: FebSettings) -> Iterator[str]:
 def _output(number: int, settings: FebSettings) -> Iterator[str]:
     variables = ("displacement", "stress", "relative volume", "contact pressure", "contact gap")
     yield '<Output><plotfile type="febio">' + "".join(f'<var type="{name}"/>' for name in variables)
+    yield "</plotfile><logfile>"
     file = quoteattr(settings.force_file)
-    yield f'</plotfile><logfile><rigid_body_data data="Fx;Fy;Fz;x;y;z" file={file} delim=",">{number}'
-    yield "</rigid_body_data></logfile></Output>"
+    data = f'<rigid_body_data data="Fx;Fy;Fz;x;y;z" file={file} delim=",">'
+    yield f"{data}{number}</rigid_body_data></logfile></Output>"
 
 
 def _row(values: Iterable[float]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from ..fe import Step
 from ..febio import run_feb
+from ..fields import write_fields
 from .context import Listener, Progress
 
 
@@ -15,7 +16,8 @@ def simulate_feb(
 ) -> dict[str, Any]:
     """Solve a FEBio 3 or 4 input; the tables that it asks for go to ``output``, by default beside it.
 
-    A table of the same name, FEBio's own result for example, is never written over: give ``output``.
+    The fields at the deepest point go there too, as VTU.  Without ``output`` a table that is there already,
+    FEBio's own for example, is not written over but refused.
 
     Raises
     ------
@@ -35,6 +37,9 @@ def simulate_feb(
     folder = Path(file).parent if output is None else output
     found = run_feb(file, folder, tell, keep=output is None, threads=threads)
     result = found.result
+    fields = Path(folder) / f"{Path(file).stem}-peak.vtu"
+    if result.states:
+        write_fields(result.system, result.problem, result.states[0], fields)
     pushed = result.problem.indenter is not None
     return {
         "file": str(file),
@@ -50,5 +55,6 @@ def simulate_feb(
         "element": result.statistics["element"],
         "unknowns": result.statistics["unknowns"],
         "steps": result.statistics["steps"],
+        "fields": str(fields) if result.states else None,
         "files": [str(path) for path in found.files],
     }

@@ -1,0 +1,288 @@
+"""What is written for FEBio and Abaqus is the same problem, read by limbfit itself and by others."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limbfit.bench.blocks import punched_block
+from limbfit.errors import ProblemError
+from limbfit.fe import Indenter, Ogden, OgdenQLV, RigidSurface, StepControl, System, solve
+from limbfit.fe.stepping import schedule
+from limbfit.febio import (
+    FebSettings,
+    Range,
+    Verdict,
+    find_febio,
+    in_indenter_frame,
+    read_feb,
+    read_log,
+    result_of_log,
+    run_feb,
+    run_febio,
+    step_control,
+    to_problem,
+    write_feb,
+    write_inp,
+    write_optimisation,
+)
+from limbfit.mesh import Mesh, node_jacobians
+
+AXIS = np.array([0.1, -0.05, -1.0])
+BOX = np.array([[x, y, z] for z in (-6.0, 0.0) for y in (-4.0, 4.0) for x in (-4.0, 4.0)])
+BOX_FACES = np.array(
+    [
+        [0, 2, 3],
+        [0, 3, 1],
+        [4, 5, 7],
+        [4, 7, 6],
+        [0, 1, 5],
+        [0, 5, 4],
+        [2, 6, 7],
+        [2, 7, 3],
+        [0, 4, 6],
+        [0, 6, 2],
+        [1, 3, 7],
+        [1, 7, 5],
+    ]
+)
+INDENTERS = {
+    "square": Indenter("square", 20.0, 2.0, (0, 0, 5), AXIS),
+    "sharp": Indenter("square", 20.0, 0.0, (0, 0, 5), AXIS, edge=(1.0, 1.0, 0.0)),
+    "cylinder": Indenter("cylinder", 16.0, 1.0, (1, 2, 5), AXIS),
+    "sphere": Indenter("sphere", 18.0, 0.0, (1, 2, 5), AXIS),
+    "stl": Indenter("stl", centre=(0, 0, 5), axis=AXIS, surface=RigidSurface(BOX, BOX_FACES)),
+}
+
+
+def block(element="tet10", shape="square", divisions=4):
+    return replace(punched_block(element, divisions), indenter=INDENTERS[shape])
+
+
+def exported(problem, folder, **settings):
+    file = folder / "model.feb"
+    tool = write_feb(problem, file, FebSettings(**settings))
+    return file, tool
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10", "tet10g8", "hex8"])
+def test_it_is_read_back_as_it_was(tmp_path, element):
+    problem = block(element)
+    file, _ = exported(problem, tmp_path)
+    model = read_feb(file)
+    found = to_problem(model)
+    order = np.argsort(problem.mesh.regions, kind="stable")  # parts one after the other
+    np.testing.assert_array_equal(found.mesh.points, problem.mesh.points)
+    np.testing.assert_array_equal(found.mesh.cells, problem.mesh.cells[order])
+    np.testing.assert_array_equal(found.mesh.regions, problem.mesh.regions[order])
+    assert found.mesh.region_names == problem.mesh.region_names
+    np.testing.assert_array_equal(found.mesh.node_sets["bottom"], problem.mesh.node_sets["bottom"])
+    np.testing.assert_array_equal(found.fixed, np.unique(problem.fixed))
+    np.testing.assert_array_equal(found.contact_faces, problem.contact_faces)
+    np.testing.assert_array_equal(found.history.times, problem.history.times)
+    np.testing.assert_allclose(found.history.displacement, problem.history.displacement, rtol=1e-14)
+    assert found.formulation.name == element
+    for name in problem.mesh.region_names:
+        mine, back = problem.materials[name].table(), found.materials[name].table()
+        np.testing.assert_array_equal(back.terms, mine.terms)
+        np.testing.assert_array_equal(back.prony, mine.prony)
+        assert back.kappa == pytest.approx(mine.kappa, rel=1e-14)
+    times = step_control(model, found).times
+    assert set(np.round(schedule(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
+
+
+@pytest.mark.parametrize("shape", INDENTERS)
+def test_the_indenter_is_where_it_touches(tmp_path, shape):
+    """The faceted body has the distance of limbfit's own in front of it, to the sagitta of the facets."""
+    problem = block("tet4", shape)
+    file, tool = exported(problem, tmp_path)
+    start = System(problem).indenter
+    found = to_problem(read_feb(file)).indenter
+    assert start is not None
+    assert found is not None
+    np.testing.assert_allclose(found.axis, start.frame[2], atol=1e-14)
+    surface = start.signed_distance(tool.points[np.unique(tool.front)])
+    rounding = start.kernel[2] if shape == "stl" else 1e-9  # an stl is written with its sharp edges
+    assert np.abs(surface).max() <= rounding
+    ahead = np.random.default_rng(1).uniform([-7, -7, 0.1], [7, 7, 3], (200, 3)) @ start.frame
+    ahead += np.asarray(start.centre)
+    gap = found.signed_distance(ahead) - start.signed_distance(ahead)
+    assert np.abs(gap).max() < (0.1 if shape in ("sphere", "stl") else 0.05)
+
+
+@pytest.mark.parametrize("shape", INDENTERS)
+def test_structure(tmp_path, shape):
+    """Numbers from 1 without gaps, faces outward, rigid elements upright, names that exist."""
+    problem = block("tet10", shape)
+    file, tool = exported(problem, tmp_path, title='a "title" -- with <marks> & all')
+    root = ET.parse(file).getroot()
+    assert root.attrib == {"version": "4.0"}
+    assert [section.tag for section in root] == [
+        "Module", "Control", "Globals", "Material", "Mesh", "MeshDomains", "Boundary", "Rigid", "Contact",
+        "LoadData", "Output",
+    ]  # fmt: skip
+    for tag in ("Mesh/Nodes/node", "Mesh/Elements/elem", "Material/material", "LoadData/load_controller"):
+        ids = [int(node.attrib["id"]) for node in root.iterfind(tag)]
+        assert ids == list(range(1, len(ids) + 1))
+    assert (
+        len({e.attrib["name"] for e in root.iterfind("Mesh/*") if e.tag != "Nodes"})
+        == len(root.findall("Mesh/*")) - 1
+    )
+    frame = problem.indenter.frame
+    normals = np.cross(
+        tool.points[tool.front[:, 1]] - tool.points[tool.front[:, 0]],
+        tool.points[tool.front[:, 2]] - tool.points[tool.front[:, 0]],
+    )
+    assert (normals @ frame[2] > 0).all()
+    if tool.cell_type == "hex8":
+        whole = Mesh(tool.points, tool.cells, "hex8", np.zeros(len(tool.cells), int), ("tool",))
+        assert (node_jacobians(whole) > 0).all()
+    patch = problem.mesh.points[problem.contact_faces]
+    up = np.cross(patch[:, 1] - patch[:, 0], patch[:, 2] - patch[:, 0])
+    assert (up @ frame[2] < 0).all()
+    rigid = root.find("Output/logfile/rigid_body_data")
+    assert rigid.text == root.findall("Material/material")[-1].attrib["id"]
+
+
+def test_another_reader_understands_it(tmp_path):
+    """pyfebio's schemas of the sections that it can read back.
+
+    Its Ogden takes no negative exponent, and what it writes as 0 or 1 (degrees of freedom, contact) it does
+    not read.
+    """
+    pytest.importorskip("pyfebio")
+    from pyfebio import control, loaddata, mesh, meshdomains, output
+
+    problem = block("tet10")
+    file, tool = exported(problem, tmp_path)
+    root = ET.parse(file).getroot()
+    schemas = {
+        "Control": control.Control,
+        "Mesh": mesh.Mesh,
+        "MeshDomains": meshdomains.MeshDomains,
+        "LoadData": loaddata.LoadData,
+        "Output": output.Output,
+    }
+    found = {name: kind.from_xml(ET.tostring(root.find(name))) for name, kind in schemas.items()}
+    nodes = found["Mesh"].nodes[0].all_nodes
+    points = np.array([[float(v) for v in node.text.split(",")] for node in nodes])
+    np.testing.assert_array_equal(points, np.vstack([problem.mesh.points, tool.points]))
+    assert [len(part.all_elements) for part in found["Mesh"].elements] == [
+        *np.bincount(problem.mesh.regions), len(tool.cells)
+    ]  # fmt: skip
+    assert {domain.elem_type for domain in found["MeshDomains"].solid_domains} == {"TET10G4", None}
+    curve = found["LoadData"].load_controllers[0]
+    assert len(curve.points.points) == len(problem.history.times)
+
+
+@pytest.mark.parametrize("shape", ["square", "sphere"])
+def test_it_pushes_as_hard(tmp_path, shape):
+    """Solved from the file, with limbfit's own penalty, the facets are all that differs."""
+    problem = block("tet4", shape, divisions=10)
+    file, _ = exported(problem, tmp_path)
+    steps = StepControl(load_steps=4, unload_steps=2)
+    times = tuple(schedule(problem.history, steps))
+    direct = solve(problem, steps, store="none")
+    run = run_feb(
+        file, tmp_path / "out", times=times, penalty=2000.0 / problem.indenter.width, penetration=0.01
+    )
+    assert run.result.completed
+    at = [np.isin(result.times, times) for result in (run.result, direct)]  # where both stepped
+    limit = 0.01 * direct.peak_force
+    np.testing.assert_allclose(run.result.force[at[0]], direct.force[at[1]], atol=limit)
+    log = read_log(run.files[0])
+    found = result_of_log(problem, log, Verdict("normal", "", float(times[-1]), ""))
+    np.testing.assert_allclose(found.force, run.result.force, atol=1e-3 * limit)
+
+
+def test_what_febio_has_not_is_refused(tmp_path):
+    for change, words in (
+        ({"friction": "sticky"}, "sticky"),
+        ({"element": "tet10v"}, "no element 'tet10v'"),
+        ({"indenter": None}, "fixed nodes"),
+    ):
+        with pytest.raises(ProblemError, match=words):
+            write_feb(replace(block(), **change), tmp_path / "x.feb", FebSettings())
+    many = Ogden(((0.004, 6.0),), prony=tuple((0.1, float(t)) for t in range(1, 8)))
+    with pytest.raises(ProblemError, match="more than 6 terms"):
+        write_feb(block().with_materials({"skin": many, "muscle": many}), tmp_path / "x.feb", FebSettings())
+
+
+def test_in_the_frame_of_the_indenter(tmp_path):
+    problem = block("tet4", "sharp", divisions=6)
+    steps = StepControl(load_steps=3, unload_steps=2)
+    turned = in_indenter_frame(problem)
+    np.testing.assert_allclose(turned.indenter.frame, np.eye(3), atol=1e-14)
+    forces = [solve(p, steps, store="none").force for p in (problem, turned)]
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-3, atol=1e-4)
+
+
+def test_optimisation(tmp_path):
+    """Ties hold at the start, bounds enclose it, and the data are those given."""
+    start = {"c": 0.004, "m": 6.0, "gamma": 2.0, "tau": 0.5}
+    lower, upper = ({k: f * v for k, v in start.items()} for f in (0.1, 3.0))
+    tissues = {name: Range(start, lower, upper, 100.0) for name in ("skin", "fat", "muscle")}
+    times, force = np.linspace(0.0, 10.0, 21), np.linspace(-0.01, 3.0, 21)
+    write_optimisation(tmp_path / "o.feb", tissues, times, force)
+    root = ET.parse(tmp_path / "o.feb").getroot()
+    rows = np.array([[float(v) for v in p.text.split(",")] for p in root.iterfind("Parameters/param")])
+    assert rows.shape == (21, 4)
+    assert (rows[:, 1] <= rows[:, 0]).all()
+    assert (rows[:, 0] <= rows[:, 2]).all()
+    ties = np.array([[float(v) for v in c.text.split(",")] for c in root.iterfind("Constraints/constraint")])
+    np.testing.assert_allclose(ties[:, :-1] @ rows[:, 0], ties[:, -1], atol=1e-12)
+    assert np.linalg.matrix_rank(ties) == 9  # 21 parameters, 12 of them free
+    data = np.array([[float(v) for v in p.text.split(",")] for p in root.iterfind("Objective/data/pt")])
+    np.testing.assert_array_equal(data, np.column_stack([times, np.maximum(force, 0.0)]))
+    with pytest.raises(ProblemError, match="64 parameters"):
+        write_optimisation(tmp_path / "o.feb", dict.fromkeys("abcdefghij", tissues["fat"]), times, force)
+
+
+def test_abaqus(tmp_path):
+    """meshio reads mesh and sets; moduli and relaxation are Abaqus' own combinations."""
+    meshio = pytest.importorskip("meshio")
+    problem = block("tet10")
+    file = tmp_path / "m.inp"
+    tool = write_inp(problem, file, "abaqus", FebSettings())
+    mesh = meshio.read(file)
+    count = len(problem.mesh.points)
+    np.testing.assert_allclose(mesh.points[:count], problem.mesh.points)
+    tets = np.vstack([cells.data for cells in mesh.cells if cells.type == "tetra10"])
+    order = np.argsort(problem.mesh.regions, kind="stable")
+    np.testing.assert_array_equal(tets, problem.mesh.cells[order])
+    assert sum(len(cells.data) for cells in mesh.cells if cells.type == "hexahedron") == len(tool.cells)
+    lines = file.read_text().split("\n")
+    at = lines.index("*HYPERELASTIC, OGDEN, N=2, MODULI=LONG TERM")
+    skin = problem.materials["skin"]
+    values = [float(v) for v in lines[at + 1].split(",")]
+    np.testing.assert_allclose(values, [skin.c / 2, skin.m, skin.c / 2, -skin.m, 2 / (100 * skin.c), 0])
+    g, _, tau = (float(v) for v in lines[at + 3].split(","))
+    assert (g, tau) == (skin.gamma / (1 + skin.gamma), skin.tau)
+    sides = lines[lines.index("*SURFACE, NAME=contact_patch, TYPE=ELEMENT") + 1 :]
+    assert sum("S" in line for line in sides[: len(problem.contact_faces)]) == len(problem.contact_faces)
+
+
+def test_calculix_says_no_to_relaxation(tmp_path):
+    with pytest.raises(ProblemError, match=r"relaxes, which CalculiX cannot.*gamma is 0"):
+        write_inp(block(), tmp_path / "m.inp", "calculix", FebSettings())
+    elastic = {name: OgdenQLV(0.004, 4.0, 0.0, 1.0) for name in ("skin", "muscle")}
+    write_inp(block().with_materials(elastic), tmp_path / "m.inp", "calculix", FebSettings())
+    assert "*VISCO" not in (tmp_path / "m.inp").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("FEBIO_CMD" not in os.environ, reason="FEBIO_CMD names no FEBio")
+@pytest.mark.parametrize("shape", INDENTERS)
+def test_febio_itself_runs_it(tmp_path, shape):
+    problem = block("tet4", shape, divisions=10)
+    write_feb(problem, tmp_path / "model.feb", FebSettings())
+    end = float(problem.history.times[-1])
+    run = run_febio(find_febio(), tmp_path, end, "forces.txt", time_limit_s=600.0)
+    assert run.verdict.completed, run.verdict.reason
+    found = result_of_log(problem, run.log, run.verdict)
+    mine = run_feb(tmp_path / "model.feb", tmp_path / "out").result
+    np.testing.assert_allclose(mine.force_at(found.times), found.force, atol=0.02 * found.peak_force)
