@@ -64,7 +64,10 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Kind:
-    """A way to damage inputs and what must come of it; ``says`` is in the error or in the repair."""
+    """A way to damage inputs and what must come of it; ``says`` is in the error or in the repair.
+
+    ``by_check`` is whether ``limbfit check`` refuses it too, which builds no surfaces.
+    """
 
     name: str
     room: str
@@ -72,18 +75,19 @@ class Kind:
     make: Callable[[np.random.Generator, Whole, Path], Inputs]
     says: str = ""
     within_mm: float = SAME_MM
-    quick: bool = True
+    by_check: bool = True
 
 
 KINDS: dict[str, Kind] = {}
 
 
-def kind(room: str, expected: str, says: str = "", within_mm: float = SAME_MM, name: str = "") -> Callable:
+def kind(
+    room: str, expected: str, says: str = "", within_mm: float = SAME_MM, by_check: bool = True
+) -> Callable:
     """Register a function as a kind under its name."""
 
     def register(make: Callable) -> Callable:
-        known = name or make.__name__
-        KINDS[known] = Kind(known, room, expected, make, says, within_mm)
+        KINDS[make.__name__] = Kind(make.__name__, room, expected, make, says, within_mm, by_check)
         return make
 
     return register

@@ -234,7 +234,7 @@ def two_series(random: Random, whole: Whole, folder: Path) -> Inputs:
 
 @kind("dicom", "refused", "scout")
 def scout_in_series(random: Random, whole: Whole, folder: Path) -> Inputs:
-    file = whole.copy_series(folder)[random.integers(100)]
+    file = whole.copy_series(folder)[random.integers(20)]
     scout = file.with_name("scout")
     shutil.copy(file, scout)
     axes = decimals(whole.image.direction[:, [0, 2]].T.ravel())

@@ -108,7 +108,7 @@ def sheared(random: Random, whole: Whole, folder: Path) -> Inputs:
 @kind("file", "refused", "three dimensions")
 def wrong_dimension(random: Random, whole: Whole, folder: Path) -> Inputs:
     suffix = drawn(random)
-    image = sitk.GetImageFromArray(whole.image.array[60])
+    image = sitk.GetImageFromArray(whole.image.array[20])
     if random.random() < 0.5:
         image = sitk.JoinSeries([whole.image.to_sitk(), whole.image.to_sitk()])
     sitk.WriteImage(image, str(folder / f"image{suffix}"))

@@ -30,9 +30,9 @@ def written(random: Random, folder: Path, found: Surfaces, suffix: str = "", sta
 
 
 def save(poly: pv.PolyData, file: Path) -> None:
-    """OBJ is written here: the writer of VTK rounds to six digits."""
+    """As it is: pyvista would turn faces of STL and PLY, and VTK's writer of OBJ rounds to six digits."""
     if file.suffix != ".obj":
-        poly.save(file)
+        poly.save(file, recompute_normals=False)
         return
     points = "\n".join(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in poly.points)
     faces = "\n".join(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in poly.regular_faces)
@@ -221,7 +221,7 @@ def not_a_surface(random: Random, whole: Whole, folder: Path) -> Inputs:
 def ascii_stl(random: Random, whole: Whole, folder: Path) -> Inputs:
     inputs = written(random, folder, surfaces(whole), ".stl")
     for name, surface in surfaces(whole).items():
-        surface.to_pyvista().save(folder / f"{name}.stl", binary=False)
+        surface.to_pyvista().save(folder / f"{name}.stl", binary=False, recompute_normals=False)
     return inputs
 
 

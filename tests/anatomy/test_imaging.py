@@ -84,13 +84,15 @@ def test_sheared_axes_are_refused(tmp_path):
         read_volume(tmp_path / "tilted.nrrd")
 
 
-def test_voxels_that_are_not_numbers_are_refused(tmp_path):
+@pytest.mark.parametrize("name", ["nan.nrrd", "nan.nii", "nan.nii.gz", "nan.mha"])
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_voxels_that_are_not_numbers_are_refused(tmp_path, name, value):
     image = volume(np.eye(3))
     array = image.array.copy()
-    array[2, 3, 1] = np.nan
-    write_volume(tmp_path / "nan.nrrd", image.with_array(array))
+    array[2, 3, 1] = value
+    write_volume(tmp_path / name, image.with_array(array))
     with pytest.raises(ImageError, match="1 voxels are not numbers"):
-        read_volume(tmp_path / "nan.nrrd")
+        read_volume(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["none.nii.gz", "cut.nii.gz", "cut.nii", "cut.nrrd", "cut.mha", "words.txt"])

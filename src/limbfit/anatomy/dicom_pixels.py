@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import pydicom
@@ -39,7 +42,26 @@ def _of_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames([str(one.path) for one in slices])
     reader.SetOutputPixelType(sitk.sitkFloat32)
-    return sitk.GetArrayFromImage(reader.Execute())
+    with _mute():
+        return sitk.GetArrayFromImage(reader.Execute())
+
+
+@contextmanager
+def _mute() -> Iterator[None]:
+    """Keep the C libraries of GDCM from writing to the terminal, which they do past every setting."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [(stream, os.dup(stream)) for stream in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream, _ in kept:
+            os.dup2(nowhere, stream)
+        yield
+    finally:
+        for stream, copy in kept:
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(nowhere)
 
 
 def _of_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:

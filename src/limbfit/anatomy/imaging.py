@@ -6,9 +6,6 @@ RTSTRUCT.
 
 from __future__ import annotations
 
-import gzip
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +24,7 @@ from .labelfiles import (
     write_sidecar,
     wrong_file,
 )
+from .nifti import check_nifti
 from .placement import on_grid_of
 
 __all__ = [
@@ -46,8 +44,6 @@ __all__ = [
     "write_volume",
 ]
 
-_CHUNK = 1 << 22
-_NIFTI_HEADER = 348  # bytes
 _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 
@@ -157,7 +153,8 @@ def _read_image(path: Path) -> sitk.Image:
     if not path.is_file():
         raise ImageError("no such image", file=path, remedy="give a DICOM folder or an image file")
     _check_suffix(path)
-    _check_nifti(path)
+    if path.name.lower().endswith((".nii", ".nii.gz")):
+        check_nifti(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     try:
@@ -167,34 +164,6 @@ def _read_image(path: Path) -> sitk.Image:
         raise _unreadable(path, str(error)) from None
     _check_stated_geometry(reader, path)
     return image
-
-
-def _check_nifti(path: Path) -> None:
-    """ITK reads a truncated NIfTI without a word and leaves the rest as it was in memory."""
-    if not path.name.lower().endswith((".nii", ".nii.gz")):
-        return
-    try:
-        with gzip.open(path, "rb") if path.name.lower().endswith(".gz") else path.open("rb") as stream:
-            header = stream.read(_NIFTI_HEADER)
-            length = len(header)
-            while chunk := stream.read(_CHUNK):
-                length += len(chunk)
-        whole = length >= _nifti_length(header)
-    except (OSError, EOFError, zlib.error, struct.error):
-        whole = False
-    if not whole:
-        raise ImageError("the image is cut short or damaged", file=path, remedy="copy or export it again")
-
-
-def _nifti_length(header: bytes) -> float:
-    """Bytes that a NIfTI-1 file of this header holds (dim at 40, bitpix at 72, vox_offset at 108)."""
-    order = "<" if header[:4] == struct.pack("<i", _NIFTI_HEADER) else ">"
-    if struct.unpack(f"{order}i", header[:4])[0] != _NIFTI_HEADER:
-        return 0.0  # NIfTI-2 or not NIfTI at all: for ITK to say
-    dim = struct.unpack(f"{order}8h", header[40:56])
-    bits = struct.unpack(f"{order}h", header[72:74])[0]
-    offset = struct.unpack(f"{order}f", header[108:112])[0]
-    return offset + float(np.prod(dim[1 : 1 + max(dim[0], 0)], dtype=float)) * bits / 8
 
 
 def _unreadable(path: Path, text: str) -> ImageError:

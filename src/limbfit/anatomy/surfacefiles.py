@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import pyvista as pv
+from vtkmodules.vtkCommonCore import vtkObject
 
 from ..errors import SurfaceError
 from .triangles import Surface, compacted, from_pyvista
@@ -73,14 +74,18 @@ def _check_suffix(path: Path) -> None:
 
 
 def _read_poly(path: Path) -> pv.PolyData:
+    shown = vtkObject.GetGlobalWarningDisplay()
+    vtkObject.SetGlobalWarningDisplay(0)  # the error below says it
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the error below says it
+            warnings.simplefilter("ignore")
             poly = pv.read(str(path))
     except Exception:  # VTK readers raise many kinds; all mean the same to the user
         raise SurfaceError(
             "the surface cannot be read", file=path, remedy="export the surface again"
         ) from None
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
     if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
         raise SurfaceError("the file holds no triangles", file=path, remedy="export the surface again")
     return poly
@@ -98,4 +103,4 @@ def write_surface(path: str | Path, surface: Surface) -> None:
     """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
     path = Path(path)
     _check_suffix(path)
-    surface.to_pyvista().save(str(path))
+    surface.to_pyvista().save(str(path), recompute_normals=False)

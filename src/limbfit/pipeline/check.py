@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..anatomy.imaging import Volume
-from ..anatomy.surfaces import check_anatomy
 from ..indentation import read_indenter
 from ..study import Study
 from .context import Listener, Progress
@@ -70,7 +69,6 @@ def _sampling(name: str, volume: Volume) -> str:
 
 def _surface_facts(study: Study) -> list[str]:
     anatomy = given_anatomy(study)
-    check_anatomy(anatomy)
     facts = [
         f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
         for name, surface in {"skin": anatomy.skin, **anatomy.bones}.items()

@@ -1,0 +1,230 @@
+"""Nothing that identifies a patient leaves the inputs: not in what is stored, not in what is said."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+from limbs import leg_image, rotation, write_dicom
+
+from limbfit import load_study
+from limbfit.cli import main
+from limbfit.pipeline.run import run_record
+from limbfit.pipeline.store import write_json
+
+IN_TAGS = {
+    "PatientName": "QUIXOTE^ALONSO^MARKERX1",
+    "PatientID": "PIDMARKERX2",
+    "PatientBirthDate": "19470911",
+    "PatientAddress": "MARKERX3 street",
+    "InstitutionName": "MARKERX4 hospital",
+    "InstitutionAddress": "MARKERX5",
+    "ReferringPhysicianName": "MARKERX6^DR",
+    "OperatorsName": "MARKERX7",
+    "StationName": "MARKERX8",
+    "DeviceSerialNumber": "MARKERX9",
+    "AccessionNumber": "MARKERXA",
+    "SeriesDescription": "MARKERXB",
+    "StudyDescription": "MARKERXC",
+    "ProtocolName": "MARKERXD",
+    "PatientComments": "MARKERXE",
+    "ImageComments": "MARKERXF",
+    "StudyDate": "20310203",
+    "SeriesDate": "20310204",
+    "AcquisitionDate": "20310205",
+    "StudyInstanceUID": "1.2.840.7777001",
+    "FrameOfReferenceUID": "1.2.840.7777002",
+}
+SERIES_UID = "1.2.840.7777003"
+PRIVATE = ("MARKERXG", "MARKERXH")
+IN_PATHS = ("MARKERXP", "MARKERXQ", "MARKERXR", "MARKERXS")
+TAG_SECRETS = [
+    *(part for value in IN_TAGS.values() for part in value.replace("^", " ").split() if len(part) > 6),
+    *PRIVATE,
+]
+STUDY = """
+[study]
+name = "leg"
+[image]
+path = "mri-MARKERXQ"
+series = "{uid}"
+{labels}
+[geometry]
+surface_edge_mm = 8.0
+[[sites]]
+name = "1"
+depth_mm = 5.0
+position = {place}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A study whose image carries an identity in tags, private tags, and names of files and folders."""
+    folder = tmp_path_factory.mktemp("data") / "study-MARKERXP"
+    image, labels = leg_image([2.3, 2.3, 2.9], (54, 56, 54), rotation(1))
+    write_dicom(folder / "mri-MARKERXQ", image, prefix="MARKERXR", uid=SERIES_UID, **IN_TAGS)
+    for file in (folder / "mri-MARKERXQ").iterdir():
+        plant(file)
+    middle = np.array(labels.size) // 2
+    first = np.flatnonzero(labels.limb[middle[2], middle[1]])[0]
+    skin = labels.index_to_point([first - 0.5, middle[1], middle[2]])
+    text = STUDY.format(uid=SERIES_UID, labels="", place=[round(float(x), 2) for x in skin])
+    (folder / "study.toml").write_text(text)
+    return folder
+
+
+def plant(file: Path) -> None:
+    data = pydicom.dcmread(file)
+    data.file_meta.SourceApplicationEntityTitle = PRIVATE[0]
+    block = data.private_block(0x0011, "maker MARKERXG", create=True)
+    block.add_new(0x01, "LO", PRIVATE[1])
+    block.add_new(0x02, "PN", "QUIXOTE^ALONSO^MARKERX1")
+    data.save_as(file)
+
+
+def call(words: list[str], monkeypatch, capfd) -> tuple[int, str]:
+    """Exit code and everything that was printed, by C libraries too."""
+    monkeypatch.setattr("sys.argv", ["limbfit", *words])
+    try:
+        main()
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    shown = capfd.readouterr()
+    return code, shown.out + shown.err
+
+
+def contents(folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Every file below a folder as it is, and unpacked where something in it is packed."""
+    for file in folder.rglob("*"):
+        yield str(file.relative_to(folder)), b""
+        if not file.is_file():
+            continue
+        raw = file.read_bytes()
+        yield str(file.relative_to(folder)), raw
+        if file.suffix == ".nrrd":
+            _, _, packed = raw.partition(b"\n\n")
+            yield f"{file.name} (voxels)", gzip.decompress(packed)
+        if zipfile.is_zipfile(file):
+            with zipfile.ZipFile(file) as archive:
+                for name in archive.namelist():
+                    yield f"{file.name}/{name}", archive.read(name)
+
+
+def leaks(text: bytes, secrets: list[str]) -> list[str]:
+    low = text.lower()
+    return [
+        secret
+        for secret in secrets
+        if secret.lower().encode() in low or secret.lower().encode("utf-16-le") in low
+    ]
+
+
+def assert_private(folder: Path) -> None:
+    secrets = [*TAG_SECRETS, *IN_PATHS, SERIES_UID, "7777001", "7777002"]
+    found = {name: leaks(name.encode() + raw, secrets) for name, raw in contents(folder)}
+    assert len(found) > 5
+    assert {name: told for name, told in found.items() if told} == {}
+
+
+def test_the_search_finds_what_is_planted(folder):
+    """Of each kind of secret at least one is in the inputs where the search looks."""
+    found = {secret for name, raw in contents(folder) for secret in leaks(name.encode() + raw, TAG_SECRETS)}
+    assert found == set(TAG_SECRETS)
+
+
+def test_nothing_of_it_is_stored_or_said(folder, monkeypatch, capfd):
+    for words in (
+        ["series", str(folder)],
+        ["check", str(folder)],
+        ["run", str(folder), "--until", "sites"],
+        ["status", str(folder), "--json"],
+    ):
+        code, told = call(words, monkeypatch, capfd)
+        assert code == 0, told
+        assert leaks(told.encode(), TAG_SECRETS) == []
+    study = load_study(folder)
+    write_json(study.results / "run.json", run_record(study))
+    assert_private(study.results)
+    record = json.loads((study.results / "run.json").read_text())
+    assert record["settings"]["image"]["path"].startswith("sha256:")
+    assert set(record["inputs"]) == {"image.path"}
+
+
+def spoil_modality(data):
+    data.Modality = "MARKERX1"
+
+
+def spoil_number(data):
+    data.SeriesNumber = "77"
+    data.Modality = "OT"
+
+
+def spoil_spacing(data):
+    del data.PixelSpacing
+
+
+def spoil_axes(data):
+    data.ImageOrientationPatient = [1, 0, 0, 0.5, 0.5, 0]
+
+
+def spoil_colour(data):
+    data.SamplesPerPixel = 3
+
+
+def spoil_pixels(data):
+    data.PixelData = data.PixelData[:100]
+
+
+def spoil_rows(data):
+    data.Rows = 7
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [spoil_modality, spoil_number, spoil_spacing, spoil_axes, spoil_colour, spoil_pixels, spoil_rows],
+)
+def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, spoil):
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    (copy / "study.toml").write_text((folder / "study.toml").read_text())
+    (copy / "mri-MARKERXQ").mkdir()
+    for n, file in enumerate(sorted((folder / "mri-MARKERXQ").iterdir())):
+        data = pydicom.dcmread(file)
+        if n == 3:
+            spoil(data)
+        data.save_as(copy / "mri-MARKERXQ" / file.name)
+    check_silent(copy, monkeypatch, capfd)
+
+
+@pytest.mark.parametrize(
+    "old",
+    [b"MARKERX1", b"DS\x10\x00", b"UI\x0e\x00", b"7777003", b"PN\x18\x00", b"19470911", b"CS\x02\x00MR"],
+)
+def test_damaged_tags_tell_no_value_either(folder, tmp_path, monkeypatch, capfd, old):
+    """Bytes of values and of their lengths overwritten, which makes pydicom and GDCM complain of them."""
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    (copy / "study.toml").write_text((folder / "study.toml").read_text())
+    (copy / "mri-MARKERXQ").mkdir()
+    for n, file in enumerate(sorted((folder / "mri-MARKERXQ").iterdir())):
+        raw = file.read_bytes()
+        new = bytes(reversed(old)) if n == 3 else old
+        (copy / "mri-MARKERXQ" / file.name).write_bytes(raw.replace(old, new, 1))
+    check_silent(copy, monkeypatch, capfd)
+
+
+def check_silent(folder: Path, monkeypatch, capfd) -> None:
+    for words in (["series", str(folder)], ["check", str(folder)]):
+        code, told = call(words, monkeypatch, capfd)
+        assert code in (0, 2), told
+        assert leaks(told.replace("mri-MARKERXQ", "").encode(), [*TAG_SECRETS, "MARKERXR"]) == []
+        assert "Traceback" not in told
+    assert not list(folder.glob("results/*"))
