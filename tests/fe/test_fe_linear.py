@@ -124,3 +124,20 @@ def test_multigrid_is_symmetric_and_positive():
     v, w = np.random.default_rng(0).standard_normal((2, system.unknowns))
     assert v @ multigrid.solve(w) == pytest.approx(w @ multigrid.solve(v), rel=1e-4)
     assert v @ multigrid.solve(v) > 0.0
+
+
+def test_where_multigrid_does_not_converge_a_factor_takes_over():
+    """As with a bulk modulus a million times the shear modulus."""
+    problem = punched_block("tet10", 4)
+    stiff = {name: replace(m, kappa_ratio=1e6) for name, m in problem.materials.items()}
+    system, laws = System(problem), Laws.build([stiff[name] for name in problem.mesh.region_names])
+    increment = Memory.rest(system, laws).increment(system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus)
+    data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    factor = Factor(system, "multigrid")
+    factor.factorise(data)
+    b = np.random.default_rng(0).standard_normal((system.unknowns, 1))
+    short = factor.solve(data, b, None, 1e-6)
+    assert short.convex
+    assert not short.converged
+    assert factor.solve_anew(data, b, None, 1e-6, short.x).converged
+    assert factor.lasting

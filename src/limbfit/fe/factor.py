@@ -233,9 +233,6 @@ class Factor:
 
         Columns that do not get within ``tolerance`` are counted as ``inexact``.
         """
-        if not self.lasting:
-            self._give_up_multigrid()
-            self.factorise(data)
         shape = (len(b), len(b))
         A = spla.LinearOperator(shape, matvec=lambda v: self.product(data, v.reshape(-1, 1)).ravel())
         M = spla.LinearOperator(shape, matvec=lambda v: self.apply(v.ravel()))
