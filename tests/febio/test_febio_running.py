@@ -1,0 +1,148 @@
+"""FEBio inputs solved by limbfit: held to FEBio's own results through the files, and to simple truths."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from febfiles import written
+
+from limbfit import simulate_feb
+from limbfit.errors import InputError
+from limbfit.febio import read_log, run_feb
+
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
+recorded = pytest.mark.skipif(
+    not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
+)
+CUBES = ("skin", "muscle", "bosboom", "lim", "lim_par")
+PUNCHED = ("block/block_hex8", "block/block_tet4", "block/block_tet10", "residuum/posterior_tet4",
+           "residuum/posterior_tet10")  # fmt: skip
+
+
+def both(case, folder):
+    """FEBio's table of a case and limbfit's for the same file."""
+    (table,) = run_feb(REFERENCE / f"{case}.feb", folder).files
+    assert table.name == f"{Path(case).name}.txt"
+    return read_log(REFERENCE / f"{case}.txt"), read_log(table)
+
+
+@recorded
+@pytest.mark.parametrize("tissue", CUBES)
+def test_cube(tmp_path, tissue):
+    """Axial stress and volume ratio, step by step; the side stresses are zero in both."""
+    febio, mine = both(f"cube/cube_{tissue}", tmp_path)
+    assert mine.names == febio.names
+    np.testing.assert_allclose(mine.times, febio.times, rtol=1e-9)
+    peak = np.abs(febio.column("sz")).max()
+    np.testing.assert_allclose(mine.column("sz"), febio.column("sz"), atol=1e-6 * peak)
+    np.testing.assert_allclose(mine.column("J"), febio.column("J"), rtol=1e-6)
+    for side in ("sx", "sy"):
+        assert np.abs(mine.column(side)).max() < 1e-6 * peak
+
+
+@recorded
+@pytest.mark.slow
+@pytest.mark.parametrize("case", PUNCHED)
+def test_punch(tmp_path, case):
+    """Force along the axis over the whole curve within 1 %; FEBio's steps are foreseen."""
+    febio, mine = both(case, tmp_path)
+    assert abs(len(mine.times) - len(febio.times)) <= 1
+    travel = {x: np.ptp(febio.column(x)) for x in "xyz" if x in febio.names}
+    strongest = "F" + max(travel, key=lambda x: travel[x])  # the axes lie within 1 degree of x, y or z
+    theirs = febio.column(strongest)
+    ours = np.interp(febio.times, mine.times, mine.column(strongest))
+    assert np.abs(ours - theirs).max() < 0.01 * np.abs(theirs).max()
+
+
+CUBE = """<?xml version="1.0"?>
+<febio_spec version="4.0"><Module type="solid"/>
+<Control><analysis>STATIC</analysis><time_steps>4</time_steps><step_size>0.25</step_size>
+<solver type="solid"><dtol>1e-9</dtol></solver></Control>
+<Material><material id="1" name="gel" type="incomp neo-Hookean"><G>0.01</G><k>100</k></material></Material>
+<Mesh><Nodes name="all"><node id="1">0,0,0</node><node id="2">10,0,0</node><node id="3">10,10,0</node>
+<node id="4">0,10,0</node><node id="5">0,0,10</node><node id="6">10,0,10</node><node id="7">10,10,10</node>
+<node id="8">0,10,10</node></Nodes>
+<Elements type="hex8" name="part"><elem id="5">1,2,3,4,5,6,7,8</elem></Elements>
+<NodeSet name="x0">1,4,5,8</NodeSet><NodeSet name="y0">1,2,5,6</NodeSet><NodeSet name="z0">1:4</NodeSet>
+<Surface name="top"><quad4 id="1">5,6,7,8</quad4></Surface></Mesh>
+<MeshDomains><SolidDomain name="part" mat="gel"/></MeshDomains>
+<Boundary><bc node_set="x0" type="zero displacement"><x_dof>1</x_dof></bc>
+<bc node_set="y0" type="zero displacement"><y_dof>1</y_dof></bc>
+<bc node_set="z0" type="zero displacement"><z_dof>1</z_dof></bc>
+<bc node_set="@surface:top" type="prescribed displacement"><dof>z</dof><value lc="1">-1</value></bc>
+</Boundary>
+<LoadData><load_controller id="1" type="loadcurve"><interpolate>LINEAR</interpolate>
+<points><pt>0,0</pt><pt>1,3</pt></points></load_controller></LoadData>
+<Output><plotfile type="febio"><var type="stress"/></plotfile><logfile>
+<node_data data="z;uz;vx" file="nodes.txt" delim=",">5:7</node_data>
+<element_data data="sz;s3;s1;J;x;y;z" file="cells.txt"></element_data></logfile></Output></febio_spec>
+"""
+
+
+def test_an_incompressible_cube(tmp_path):
+    """sigma = G (lambda^2 - 1/lambda) in one direction, none across; tables as the input asks."""
+    run = run_feb(written(tmp_path, CUBE), tmp_path / "out")
+    assert run.result.completed
+    nodes, cells = (read_log_of(tmp_path / "out" / name, "," if "n" in name[0] else " ") for name in
+                    ("nodes.txt", "cells.txt"))  # fmt: skip
+    assert nodes[0] == ["z", "uz"]  # velocities are left out, and said to be
+    assert any("'vx'" in note for note in run.notes)
+    assert any("plotfile" in note for note in run.notes)
+    stretch = 1.0 - 0.3 * np.arange(5) / 4
+    for step, rows in enumerate(nodes[1]):
+        assert [row[0] for row in rows] == [5.0, 6.0, 7.0]
+        np.testing.assert_allclose([row[1] for row in rows], 10.0 * stretch[step])
+    stress = np.array([rows[0][1] for rows in cells[1]])
+    np.testing.assert_allclose(stress, 0.01 * (stretch**2 - 1.0 / stretch), rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose([rows[0][2] for rows in cells[1]], stress, atol=1e-12)
+    np.testing.assert_allclose([rows[0][3] for rows in cells[1]], 0.0, atol=1e-6)
+    np.testing.assert_allclose([rows[0][4] for rows in cells[1]], 1.0, atol=1e-3)
+    middle = np.array([rows[0][5:] for rows in cells[1]])
+    np.testing.assert_allclose(middle[:, 2], 5.0 * stretch)
+    assert rows_of_element(cells) == {5.0}
+
+
+def rows_of_element(cells):
+    return {row[0] for rows in cells[1] for row in rows}
+
+
+def read_log_of(file, delimiter):
+    """Names, and per step the rows with the item's number first."""
+    names, steps = [], []
+    for line in file.read_text().splitlines():
+        if line.startswith("*Data"):
+            names = line.partition("=")[2].strip().split(";")
+            steps.append([])
+        elif not line.startswith("*"):
+            steps[-1].append([float(value) for value in line.split(delimiter)])
+    return names, steps
+
+
+def test_tables_are_not_written_over(tmp_path):
+    file = written(tmp_path, CUBE)
+    (tmp_path / "cells.txt").write_text("FEBio's own")
+    with pytest.raises(InputError, match="is there already"):
+        simulate_feb(file, listener=lambda _: None)
+    assert (tmp_path / "cells.txt").read_text() == "FEBio's own"
+    found = simulate_feb(file, tmp_path / "out", listener=lambda _: None)
+    assert Path(found["fields"]).is_file()
+
+
+def test_command(tmp_path):
+    file = written(tmp_path, CUBE)
+    command = [sys.executable, "-m", "limbfit", "febio", str(file), "--output", str(tmp_path / "o"), "--json"]
+    shown = subprocess.run(command, capture_output=True, text=True)
+    assert shown.returncode == 0, shown.stderr
+    found = json.loads(shown.stdout)
+    assert found["completed"]
+    assert found["steps"] == 4
+    assert found["peak_force_N"] is None
+    file.write_text(CUBE.replace("incomp neo-Hookean", "Arruda-Boyce"))
+    shown = subprocess.run(command, capture_output=True, text=True)
+    assert shown.returncode == 2
+    assert shown.stderr.strip().split("\n")[-1].startswith(f"error: {file}: line 5, <material>: ")
