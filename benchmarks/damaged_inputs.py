@@ -152,12 +152,13 @@ def summary(outcomes: list[Outcome]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--start", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", choices=sorted(KINDS), default=None)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     names = list(KINDS)
-    cases = [(n, KINDS[names[n % len(names)]]) for n in range(options.cases)]
+    cases = [(n, KINDS[names[n % len(names)]]) for n in range(options.start, options.cases)]
     outcomes = []
     with tempfile.TemporaryDirectory() as place:
         whole = _whole(Path(place) / "whole", options.seed)

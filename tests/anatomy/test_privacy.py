@@ -17,6 +17,7 @@ from limbfit import load_study
 from limbfit.cli import main
 from limbfit.pipeline.run import run_record
 from limbfit.pipeline.store import write_json
+from test_pipeline import COARSE
 
 IN_TAGS = {
     "PatientName": "QUIXOTE^ALONSO^MARKERX1",
@@ -228,3 +229,20 @@ def check_silent(folder: Path, monkeypatch, capfd) -> None:
         assert leaks(told.replace("mri-MARKERXQ", "").encode(), [*TAG_SECRETS, "MARKERXR"]) == []
         assert "Traceback" not in told
     assert not list(folder.glob("results/*"))
+
+
+@pytest.mark.slow
+def test_no_path_is_in_the_results_of_a_whole_run(study, tmp_path, monkeypatch, capfd):
+    """Calibration, predictions, report and a single simulation of a study with names in its paths."""
+    place = study.rename(tmp_path / "study-MARKERXP")
+    names = {"skin.stl": "MARKERXQ.stl", "tibia.stl": "b-MARKERXR.stl", "1.csv": "MARKERXS-1.csv"}
+    text = (place / "study.toml").read_text() + COARSE
+    for old, new in names.items():
+        (place / old).rename(place / new)
+        text = text.replace(f'"{old}"', f'"{new}"')
+    (place / "study.toml").write_text(text)
+    for words in (["run", str(place)], ["simulate", str(place), "--site", "2"]):
+        code, told = call(words, monkeypatch, capfd)
+        assert code == 0, told
+    assert (place / "results" / "report" / "report.html").is_file()
+    assert_private(place / "results")
