@@ -9,6 +9,7 @@ Everything the command line does is one call away:
 ``limbfit check``         ``check_study(load_study(path), listener=print)``
 ``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
 ``limbfit status``        ``study_status(load_study(path))``
+``limbfit surfaces``      ``show_stage(load_study(path), "surfaces", listener=print)``; so ``segment``, ``sites``, ``mesh``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
@@ -33,6 +34,7 @@ _HOME = {
     "Progress": "pipeline",
     "bench_febio_parity": "bench",
     "bench_forward": "bench",
+    "bench_meshing": "bench",
     "bench_scaling": "bench",
     "check_study": "pipeline",
     "describe_series": "anatomy.imaging",
@@ -42,6 +44,7 @@ _HOME = {
     "report_study": "pipeline",
     "run_demo": "pipeline",
     "run_study": "pipeline",
+    "show_stage": "pipeline",
     "simulate_feb": "pipeline",
     "simulate_site": "pipeline",
     "study_status": "pipeline",

@@ -32,14 +32,13 @@ from .extrusion import guarded, projected
 from .layered import core_mesh, curved_target, with_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
-from .smoothing import improved
+from .smoothing import polished
 from .surfaces import Anatomy
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SURFACES = (PLANE, LAYER, BONE, FAR)
-SMOOTHED_BELOW_DEG = 10.0
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
 LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
@@ -70,7 +69,7 @@ class MeshSettings:
     curved: bool = True
     local_radius_mm: float | None = None
     flatness: float = 1.0
-    engine: Literal["mmg"] = "mmg"
+    engine: str = "mmg"
 
     @property
     def regions(self) -> tuple[str, ...]:
@@ -173,8 +172,9 @@ def mesh_site(
         grid = _near(grid, site, settings.local_radius_mm)
         limit = size_limit(fields, grid, settings)
     task = _task(grid, site_size(grid.points, limit, site, inward, settings), settings)
-    core = _on_surfaces(ENGINES[settings.engine](task, settings.time_limit_s), fields)
+    core = _snapped(ENGINES[settings.engine](task, settings.time_limit_s), fields)
     mesh, stack = with_layers(core, fields, settings.regions)
+    mesh = polished(mesh, fields, stack)
     if settings.element == "tet10":
         mesh = to_tet10(mesh)
         if settings.curved:
@@ -241,12 +241,8 @@ def _near(grid: TetGrid, site: Array, radius: float) -> TetGrid:
     return grid.kept(label == np.bincount(label).argmax())
 
 
-def _on_surfaces(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
-    """Boundary nodes put on cut plane, layer and bone, and poor elements improved, as far as they allow."""
-    return _snapped(_smoothed(_snapped(core, fields), fields), fields)
-
-
 def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
+    """Boundary nodes put on cut plane, layer and bone as far as their elements allow."""
     in_plane = _nodes_on(core, PLANE)
     target = core.points.copy()
     target[in_plane, 2] = 0.0
@@ -256,21 +252,6 @@ def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
         target[nodes] = projected(level, target[nodes], free[nodes])
     points = guarded(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
     points[in_plane, 2] = 0.0
-    return replace(core, points=points)
-
-
-def _smoothed(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
-    """Inner nodes of poor elements move freely, those on one surface along it, those on two not at all.
-
-    Where the limb was cut off about the site, the boundary has no shape to keep.
-    """
-    normals = np.zeros_like(core.points)
-    on = {surface: _nodes_on(core, surface) for surface in (PLANE, LAYER, BONE)}
-    normals[on[PLANE], 2] = 1.0
-    for surface, level in ((LAYER, fields.layer), (BONE, fields.void)):
-        normals[on[surface]] = level(core.points[on[surface]])[1]
-    movable = np.sum(list(on.values()), axis=0) < 2
-    points = improved(core.points, core.tets, SMOOTHED_BELOW_DEG, normals, movable)
     return replace(core, points=points)
 
 

@@ -5,16 +5,44 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import dihedral_angles
+from ..mesh import Mesh, dihedral_angles
 from .background import volumes
+from .columns import Columns
+from .extrusion import guarded, projected
+from .layers import LimbFields
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+GOOD_DEG = 9.0
+WORKED_BELOW_DEG = 11.0
 SWEEPS = 6
 STEPS = (0.3, 0.15, 0.05)  # of the shortest edge at the node
 DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
 DIRECTIONS = DIRECTIONS[np.any(DIRECTIONS != 0, axis=1)]
+
+
+def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
+    """A tet4 mesh with its poor elements improved and its boundary nodes put back on the smooth surfaces.
+
+    Inner nodes move freely, those of the layers along the skin, those on bone or cut along these, nodes on
+    two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
+    """
+    points = mesh.points
+    on_plane = points[:, 2] == 0.0
+    in_layers, on_bone = np.zeros((2, len(points)), dtype=bool)
+    in_layers[stack.base], in_layers[stack.top[0] :] = True, True
+    on_bone[mesh.node_sets["fixed_bone"]] = True
+    normals = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(points), 3)))
+    for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void)):
+        normals[chosen] = level(points[chosen])[1]
+    movable = on_plane.astype(int) + in_layers + on_bone < 2
+    points = improved(points, mesh.cells, WORKED_BELOW_DEG, normals, movable)
+    target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
+    bone = np.flatnonzero(on_bone & movable)
+    for nodes, level in ((bone, fields.void), (stack.base, fields.layer), (stack.top, fields.depth)):
+        target[nodes] = projected(level, target[nodes], free[nodes])
+    return mesh.with_points(guarded(points, target, mesh.cells, GOOD_DEG))
 
 
 def improved(points: Array, tets: Ints, goal_deg: float, normals: Array, movable: NDArray[np.bool_]) -> Array:

@@ -1,4 +1,4 @@
-"""``limbfit bench``: the solver against FEBio's results, and its time and memory."""
+"""``limbfit bench``: the solver against FEBio's results, its time and memory, and meshes of many sites."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import limbfit
 from ..execution import usable_cores
 from .console import STDOUT, AsJson, listening, print_json
 
-app = typer.Typer(help="Benchmarks of the solver.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(help="Benchmarks of solver and meshes.", no_args_is_help=True, rich_markup_mode=None)
 
 Reference = Annotated[
     Path | None,
@@ -87,6 +87,28 @@ def scaling(
         )  # fmt: skip
     STDOUT.print(table)
     STDOUT.print(f"seconds grow as unknowns^{found['seconds_exponent']:.2f}")
+
+
+@app.command()
+def meshing(
+    shared: Annotated[
+        Path | None, typer.Option(help="folder with the real limbs; default: shared, here or above")
+    ] = None,
+    sites: Annotated[int, typer.Option(min=1, help="of each of the five limbs")] = 20,
+    engine: Annotated[str, typer.Option(help="name of the mesher")] = "mmg",
+    as_json: AsJson = False,
+) -> None:
+    """Mesh random sites of five limbs: failures, angles, thickness, volume, time."""
+    with listening() as listener:
+        found = limbfit.bench_meshing(shared, sites, engine, tell=teller(listener, "meshing"))
+    if as_json:
+        print_json(found)
+        return
+    of_limbs = found.pop("limbs")
+    show_facts(found)
+    for name, facts in of_limbs.items():
+        STDOUT.print(name)
+        show_facts(facts)
 
 
 def teller(listener: Callable[[limbfit.Progress], None], stage: str) -> Callable[[int, int, str], None]:
