@@ -68,11 +68,31 @@ class ImageTable(_Table):
 
 
 class SegmentationTable(_Table):
-    """``labels``: a label map (``.seg.nrrd``, image, DICOM-SEG, RTSTRUCT); it wins over the automatic one."""
+    """``labels``: a label map (``.seg.nrrd``, image, DICOM-SEG, RTSTRUCT); it wins over the automatic one.
+
+    ``contours`` is a file of contours that does so; ``seeds`` are points (LPS mm) in each bone to be found.
+    """
 
     labels: Path | None = None
+    contours: Path | None = None
+    contrast: Literal["auto", "T1", "UTE", "CT"] = "auto"
+    seeds: dict[BoneName, tuple[Vector, ...]] = Field(default_factory=dict)
     bias_correction: bool = True
     min_bone_volume_mm3: Positive = 1000.0
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SegmentationTable:
+        if self.labels is not None and self.contours is not None:
+            raise ValueError("give either labels or contours")
+        empty = [name for name, points in self.seeds.items() if not points]
+        if empty:
+            raise ValueError(f"seeds.{empty[0]}: give at least one point")
+        return self
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the study brings its own labels."""
+        return self.labels is not None or self.contours is not None
 
 
 class SurfacesTable(_Table):
@@ -338,6 +358,7 @@ class Study(_Table):
         """Every file and folder that the study names, by its key."""
         named: dict[str, Path | None] = {
             "segmentation.labels": self.segmentation.labels,
+            "segmentation.contours": self.segmentation.contours,
             "indenter.file": self.indenter.file,
             **{f"sites.{site.name}.trace": site.trace for site in self.sites},
         }

@@ -32,8 +32,8 @@ _NOISE_MM = 0.9
 def bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
     """Voxels nearer to fat than to muscle in MRI, as bright as these are in their neighbourhood.
 
-    ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`depth_below`). What a coil sees
-    less of is darker, fat and muscle alike, and N4 leaves some of that.
+    ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`depth_below`). What a coil
+    sees less of is darker, fat and muscle alike, and N4 leaves some of that.
     """
     rind = limb & ~bones & (depth < _RIND_MM)
     return np.asarray(limb & (_denoised(levels, limb, spacing) > _half_way(levels, rind, spacing)))

@@ -193,7 +193,7 @@ def slabs(
     noise: float | None = None,
     levels: Contrast = UTE,
 ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """The image slab by slab: slices and signal (nk, nj, ni), with bias and noise (the contrast's, or given)."""
+    """The image slab by slab: slices and signal (nk, nj, ni), with bias and noise (None: the contrast's)."""
     random = np.random.default_rng([seed, 5, len(markers)])
     bias = _bias_field(seed, levels.bias)
     deviation = levels.noise if noise is None else noise

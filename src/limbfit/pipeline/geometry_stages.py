@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..anatomy.amputation import amputate
+from ..anatomy.contours import write_contours
 from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..anatomy.layers import LayerSpec
 from ..anatomy.markers import find_markers, match_markers
 from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.quality import assess
+from ..anatomy.sheet import draw_sheet
 from ..anatomy.sites import indenter_axis, project_to_skin
 from ..anatomy.surfaces import (
     Anatomy,
@@ -28,9 +31,10 @@ from ..errors import SiteError
 from ..mesh import write_vtu
 from ..study import Site, Study
 from .context import Context
+from .corrections import DIGEST, LABELS
 from .inputs import automatic_labels, labelled_file, naming, study_image, study_labels
 from .marked_images import MARKED_SKIN, second_skin, without_own_markers
-from .store import read_json, write_json
+from .store import file_digest, read_json, write_json
 
 THICKNESS = "fat-depth.vtp"
 
@@ -49,9 +53,14 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
             context.tell("segment", 1, 3, f"label map: {note}")
     else:
         labels, notes, method = automatic_labels(study, volume), [], "automatic"
-    write_labels(folder / "labels.seg.nrrd", labels)
+    write_labels(folder / LABELS, labels)
+    write_contours(folder / "contours.csv", labels)
+    quality = assess(labels)
+    write_json(folder / "quality.json", quality.as_json())
+    draw_sheet(folder / "quality.png", volume, labels, quality)
     context.tell("segment", 2, 3, "outlining the skin with markers")
     facts = {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
+    facts[DIGEST] = file_digest(folder / LABELS)
     write_json(folder / "segment.json", facts | removed | second_skin(study, volume, labels, folder))
     return {}
 

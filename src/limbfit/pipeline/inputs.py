@@ -6,19 +6,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
+from ..anatomy.contours import read_contours
 from ..anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
 from ..anatomy.one_limb import check_one_limb
 from ..anatomy.placement import on_grid_of
 from ..anatomy.segmentation import segment
 from ..errors import InputError
 from ..study import Study
+from .corrections import hand_labels
 
 
 def study_image(study: Study) -> Volume:
     """The study's image; of one limb, unless its labels are given too."""
     assert study.image is not None
     volume = _image(study.path(study.image.path), study.image.series)
-    if study.segmentation.labels is None:
+    if not study.segmentation.is_given:
         with naming(study.path(study.image.path)):
             check_one_limb(volume)
     return volume
@@ -39,10 +43,18 @@ def _image(path: Path, series: str | None) -> Volume:
 
 
 def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | None:
-    """The label map that the study gives, on the image's grid, and what was repaired in it."""
-    if study.segmentation.labels is None:
+    """The label map or contours that the study gives, on the image's grid, and what was repaired in it.
+
+    A label map that was corrected by hand in the results counts, unless the study names one of its own.
+    """
+    table = study.segmentation
+    if table.contours is not None:
+        path = study.path(table.contours)
+        return cleaned(read_contours(path, volume), path)
+    given = table.labels or hand_labels(study)
+    if given is None:
         return None
-    path = study.path(study.segmentation.labels)
+    path = study.path(given)
     return cleaned(read_labels(path, volume), path)
 
 
@@ -60,6 +72,11 @@ def automatic_labels(study: Study, volume: Volume) -> LabelMap:
             near.in_own_frame(),
             bias_correction=table.bias_correction,
             min_bone_volume_mm3=table.min_bone_volume_mm3,
+            contrast=table.contrast,
+            seeds={
+                name: (np.array(points) - near.origin) @ near.direction
+                for name, points in table.seeds.items()
+            },
         )
     return on_grid_of(
         LabelMap(found.array, near.spacing, near.origin, near.direction, found.names), volume, path
@@ -69,7 +86,8 @@ def automatic_labels(study: Study, volume: Volume) -> LabelMap:
 def labelled_file(study: Study) -> Path:
     """What the labels of a study come from: its label map, or the image."""
     assert study.image is not None
-    return study.path(study.segmentation.labels or study.image.path)
+    table = study.segmentation
+    return study.path(table.labels or table.contours or hand_labels(study) or study.image.path)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from typing import Any
 from .. import __version__
 from ..anatomy.labelfiles import sidecar
 from ..study import Study
+from .corrections import hand_labels
 from .store import digest, file_digest
 
 PACKAGE = Path(__file__).parents[1]
@@ -73,6 +74,7 @@ def input_files(study: Study) -> dict[str, list[Path]]:
     files: dict[str, list[Path]] = {"segment": [], "surfaces": [], "traces": []}
     if study.image is not None:
         files["segment"] += [study.image.path, *filter(None, [study.image.marked])]
+    files["segment"] += [path for path in (study.segmentation.contours, hand_labels(study)) if path]
     if study.segmentation.labels is not None:
         files["segment"].append(study.segmentation.labels)
         names = sidecar(study.segmentation.labels)

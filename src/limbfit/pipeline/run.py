@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..execution import make_executor
 from ..study import Study
 from .context import Context, Listener
+from .corrections import keep_corrections
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
 from .model_stages import run_calibrate, run_predict, run_traces
 from .provenance import code_digest, input_digests, input_files, machine, settings_record, versions
@@ -145,6 +146,9 @@ def run_study(study: Study, *, until: str | None = None, listener: Listener) -> 
     store = Store(study.results)
     with lock(study.results), make_executor(study.execution.workers) as executor:
         context = Context(study, store, executor, listener)
+        kept = keep_corrections(study)
+        if kept is not None:
+            context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
         for stage, key in keys(study).items():
             if store.state(stage, key).state != "done":
                 _do(context, stage, key)
