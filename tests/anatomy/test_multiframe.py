@@ -13,6 +13,7 @@ from pydicom.dataset import Dataset
 from pydicom.uid import EnhancedCTImageStorage
 
 from limbfit.anatomy.imaging import describe_series, read_volume
+from limbfit.cli import main
 from limbfit.errors import ImageError
 
 ORDER = [4, 0, 6, 2, 5, 1, 3]
@@ -80,6 +81,21 @@ def test_series_are_listed_with_what_is_wrong_and_without_identity(tmp_path):
     assert (found["1.2.9"]["modality"], found["1.2.9"]["slices"], found["1.2.9"]["whole"]) == ("CT", 7, True)
     told = json.dumps(found)
     assert not [secret for secret in [*IDENTITY.values(), "DOEJANE"] if secret in told]
+
+
+def test_the_command_lists_them_too(tmp_path, monkeypatch, capsys):
+    uid = write_dicom(tmp_path, volume(DIRECTIONS["oblique"]), number=4)
+    monkeypatch.setattr("sys.argv", ["limbfit", "series", str(tmp_path), "--json"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    assert json.loads(capsys.readouterr().out) == {"series": describe_series(tmp_path)}
+    monkeypatch.setattr("sys.argv", ["limbfit", "series", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        main()
+    told = capsys.readouterr().out
+    assert "series 4: MR, 7 slices of 6 x 5, 0.7 x 1.3 x 2.9 mm, whole" in told
+    assert uid in told
 
 
 def test_text_in_the_place_of_a_uid_is_not_told(tmp_path):

@@ -18,9 +18,10 @@ from ..errors import SurfaceError
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-# Diagonals of the bounding box: a limb and a bone are larger; in inches or centimetres they are not.
-_SMALLEST_MM = {"skin": 60.0}
-_SMALLEST_BONE_MM = 15.0
+# Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
+# not. What is left of a bone after a virtual amputation may be small.
+_SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
+_SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
 
 
@@ -161,7 +162,7 @@ def _check_size(surface: Surface, name: str, file: str | Path | None) -> None:
     if len(surface.faces) < 4:
         raise SurfaceError(f"{name}: only {len(surface.faces)} faces", file=file)
     diagonal = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
-    smallest = _SMALLEST_MM.get(name, _SMALLEST_BONE_MM)
+    smallest = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
     if diagonal < smallest or diagonal > _LARGEST_MM:
         units = "metres, centimetres or inches" if diagonal < smallest else "another unit"
         raise SurfaceError(
