@@ -78,7 +78,7 @@ def make_phantom(
     detail : ``coarse`` (2.4 mm voxels, 6 sites) or ``paper`` (the paper's voxels, 18 sites).
     seed : which patient; the same seed gives the same files.
     sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
-    fat : three tissues, skin of 1.5 mm over fat of 4.5 mm over muscle, instead of two.
+    fat : three tissues, skin of 2 mm over fat of 4 mm over muscle, instead of two.
     mapping : like ``map``; given one that works in several processes, sites are simulated side by side.
     progress : called with what is being done, how much of it is done, and of how much.
 

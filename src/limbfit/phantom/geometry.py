@@ -21,7 +21,7 @@ BONES = ("tibia", "fibula", "patella", "femur")
 PROXIMAL_CUT_MM = 250.0
 # Tissue over the muscle, outermost first: as in the paper, or with fat of its own.
 SKIN_LAYER = (LayerSpec("skin", 3.0),)
-SKIN_AND_FAT = (LayerSpec("skin", 1.5), LayerSpec("fat", 4.5))
+SKIN_AND_FAT = (LayerSpec("skin", 2.0), LayerSpec("fat", 4.0))
 
 
 @dataclass(frozen=True)
