@@ -161,6 +161,26 @@ def simulated_figure(store: Store) -> Figure | None:
     return Figure("simulated", svg_text, "Force of the simulated indentations.")
 
 
+def compared_figure(store: Store) -> Figure | None:
+    """Force by FEBio and by limbfit, a panel for each site where both were run."""
+    pairs = [(row["site"], store.curves("compare", row["site"])) for row in store.compared]
+    found = [(site, curves) for site, curves in pairs if curves is not None]
+    if not found:
+        return None
+    drawing, axes = _panels(len(found), 3, 2.5)
+    with matplotlib.rc_context(STYLE):
+        for ax, (site, curves) in zip(axes, found, strict=True):
+            at = curves["time_s"]
+            ax.plot(at, curves["febio_N"], "o", ms=3, mfc="none", color=MEASURED, label="FEBio")
+            ax.plot(at, curves["limbfit_N"], color=SIMULATED, label="limbfit")
+            ax.plot(at, curves["limbfit_matched_N"], "--", color=TRUTH, label="with FEBio's contact penalty")
+            ax.set(title=f"Site {site}", xlabel="Time (s)", ylabel="Force (N)")
+        _legend(drawing, axes[0])
+    names = ", ".join(site for site, _ in found)
+    text = svg(drawing, "compared", f"Force by FEBio and by limbfit against time, sites {names}")
+    return Figure("compared", text, "Force of the same indentation by FEBio and by limbfit.")
+
+
 def convergence_figure(store: Store) -> Figure | None:
     """The error and the parameters over the accepted iterates, stage after stage."""
     stages = [stage for stage in store.stages if stage.get("iterations")]

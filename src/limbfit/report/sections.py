@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Callable, Sequence
 
 from . import figures, pictures, tables
+from .comparison import comparison
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
 from .store import PARAMETERS, Json, Store
 
@@ -28,19 +29,24 @@ def make_page(store: Store) -> Page:
         parameters,
         convergence,
         simulated,
+        comparison,
         solver,
         method,
         timing,
         settings,
         provenance,
     )
+    absent: dict[Callable[[Store], Section], bool] = {
+        simulated: not store.simulated,
+        comparison: not store.compared,
+    }
     version = store.run.get("limbfit", "unknown version")
     return Page(
         title=name,
         subtitle=str(study.get("description") or ""),
         key_numbers=key_numbers(store),
         summary=summary(store),
-        sections=tuple(make(store) for make in makers if make is not simulated or store.simulated),
+        sections=tuple(make(store) for make in makers if not absent.get(make)),
         footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
     )
 

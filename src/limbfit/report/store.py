@@ -32,6 +32,7 @@ class Store:
     calibration: Json
     predict: Json
     simulated: tuple[Json, ...]
+    compared: tuple[Json, ...]
     truth: Json
 
     @property
@@ -107,6 +108,7 @@ def load_store(results: Path) -> Store:
         calibration=_read_json(results / "calibrate" / "calibration.json"),
         predict=_read_json(results / "predict" / "predict.json"),
         simulated=tuple(_read_json(file) for file in sorted((results / "simulate").glob("*.json"))),
+        compared=tuple(_read_json(file) for file in sorted((results / "compare").glob("*.json"))),
         truth=_read_json(results / "truth.json"),
     )
 
