@@ -93,7 +93,7 @@ def _step_coefficients(laws: Laws, dt: float) -> tuple[Array, ...]:
     return on_prony, on_elastic, d_on_prony, d_scale
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def explicit_forces(  # type: ignore[no-untyped-def]
     cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u, out
 ):
@@ -167,7 +167,7 @@ def explicit_forces(  # type: ignore[no-untyped-def]
                     out[cells[el, a], i, p] += fe[a, i, p]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, du, out):  # type: ignore[no-untyped-def]
     """Total derivative (m, q, 6, p) of Se: explicit in the parameters, and through ``du (n, 3, p)``."""
     m, k = cells.shape
