@@ -58,7 +58,8 @@ class Result:
     completed, reason : False and why where the end of the history was not reached.
     warnings : what is doubtful about the kept states.
     statistics : steps, newton_iterations, factorisations, multigrids (made, one for each matrix), solves,
-        linear_solver, element, unknowns, seconds by part.
+        linear_solver, whether its factors had to be in ``double_precision``, element, unknowns, seconds by
+        part.
     """
 
     problem: Problem

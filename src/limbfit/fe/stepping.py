@@ -429,6 +429,7 @@ def _statistics(run: Simulation, seconds: float) -> dict[str, Any]:
         "factorisations": sum(factor.counts["factorisations"] for factor in used),
         "multigrids": run.factor.counts["multigrids"],
         "solves": sum(factor.counts["solves"] for factor in used),
+        "double_precision": any(factor.counts["double_precision"] for factor in used),
         "linear_solver": run.factor.name,
         "element": run.system.element.name,
         "unknowns": run.system.unknowns,
