@@ -183,6 +183,7 @@ class MeshTable(_Table):
     near_radius_mm: Positive = 16.0
     growth: Positive = 0.35
     flatness: Annotated[float, Field(ge=1, le=2)] = 1.0
+    engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
 
 

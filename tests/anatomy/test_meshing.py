@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 
 import igl
 import numpy as np
@@ -272,3 +273,26 @@ def test_real_mean_limb(name: str) -> None:
     assert abs(report.volume_error) < 0.005
     assert report.layer_mean_mm == pytest.approx(3.0, abs=0.1)
     assert report.nodes < 12_000
+
+
+@pytest.mark.skipif(find_spec("netgen") is None, reason="netgen-mesher is not installed")
+def test_netgen_makes_the_same_limb(oblique: Anatomy, meshed: tuple) -> None:
+    position, axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)
+    mesh, report = mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"))
+    conforms(mesh)
+    assert quality(mesh).inverted == 0
+    assert report.engine == "netgen"
+    assert report.min_dihedral_deg >= 7.0
+    assert report.layer_mean_mm == pytest.approx(3.0, abs=0.05)
+    assert abs(report.volume_error) < 0.005
+    assert report.volume_mm3 == pytest.approx(meshed[1].volume_mm3, rel=0.003)
+    for name, nodes in meshed[0].node_sets.items():
+        found = mesh.points[mesh.node_sets[name]]
+        assert np.abs(found.mean(axis=0) - meshed[0].points[nodes].mean(axis=0)).max() < 3.0
+
+
+def test_a_mesher_that_is_not_installed_is_named(oblique: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engines, "find_spec", lambda name: None)
+    position, axis = site_of(oblique, np.array([1.0, 0, 0]), -35.0)
+    with pytest.raises(MeshingError, match=r"Netgen is not installed; install it with  pip install"):
+        mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"))

@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 
 from ..errors import MeshingError
 
-WORKER = Path(__file__).with_name("_mmg_worker.py")
+MMG_WORKER = Path(__file__).with_name("_mmg_worker.py")
+NETGEN_WORKER = Path(__file__).with_name("_netgen_worker.py")
 
 
 @dataclass(frozen=True)
@@ -60,12 +62,32 @@ def mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     MeshingError
         When MMG crashes, gives nothing or exceeds the time limit.
     """
+    return _in_worker(MMG_WORKER, "MMG", task, time_limit_s)
+
+
+def netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+    """Remesh the surface with MMG and fill it with Netgen (Schoeberl 1997, Comput Visual Sci 1, 41-52).
+
+    Raises
+    ------
+    MeshingError
+        When Netgen is not installed, crashes, gives nothing or exceeds the time limit.
+    """
+    if find_spec("netgen") is None:
+        raise MeshingError(
+            "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "
+            'or choose mesh.engine = "mmg"'
+        )
+    return _in_worker(NETGEN_WORKER, "Netgen", task, time_limit_s)
+
+
+def _in_worker(worker: Path, name: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     with tempfile.TemporaryDirectory(prefix="limbfit-mesh-") as folder:
         source, target = Path(folder, "task.npz"), Path(folder, "mesh.npz")
         np.savez(source, **{name: getattr(task, name) for name in task.__dataclass_fields__})
-        run_worker([sys.executable, str(WORKER), str(source), str(target)], time_limit_s)
+        run_worker([sys.executable, str(worker), str(source), str(target)], time_limit_s)
         if not target.is_file():
-            raise MeshingError("the mesher MMG gave no mesh; choose a larger edge_near_mm or skin_layer_mm")
+            raise MeshingError(f"the mesher {name} gave no mesh; choose larger edges or thicker layers")
         with np.load(target) as stored:
             return VolumeMesh(**{name: stored[name] for name in VolumeMesh.__dataclass_fields__})
 
@@ -89,4 +111,4 @@ def run_worker(command: list[str], time_limit_s: float) -> None:
         )
 
 
-ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {"mmg": mmg}
+ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {"mmg": mmg, "netgen": netgen}

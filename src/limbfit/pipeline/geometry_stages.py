@@ -225,6 +225,7 @@ def mesh_settings(study: Study) -> MeshSettings:
         near_radius_mm=table.near_radius_mm,
         growth=table.growth,
         flatness=table.flatness,
+        engine=table.engine,
         time_limit_s=table.time_limit_s,
         layers=tuple(
             LayerSpec(layer.name, layer.thickness_mm, layer.min_thickness_mm)
