@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import matplotlib.image
 import numpy as np
 import pytest
 import pyvista as pv
@@ -107,6 +108,61 @@ def test_sites_lie_on_the_skin_with_inward_axes(limbfit, study):
         outward = np.array([x * radius / 42.0**2, y * radius / 42.0**2, (z - 120) / 150**2])
         np.testing.assert_allclose(site["axis"], -outward / np.linalg.norm(outward), atol=0.03)
         assert np.hypot(*site["position_mm"][:2]) == pytest.approx(radius, abs=0.5)
+
+
+def picture_size(file: str) -> tuple[int, int]:
+    pixels = matplotlib.image.imread(file)
+    assert pixels[..., :3].std() > 0.05  # something is drawn
+    return pixels.shape[1], pixels.shape[0]
+
+
+def test_surfaces_are_shown(limbfit, study):
+    """Volumes of the spheroids, and the thinnest tissue between them, with a picture."""
+    code, out, _ = limbfit("surfaces", study, "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert found["closed_bodies"] == 2
+    volume = 2 / 3 * np.pi * np.array([42.0**2 * 150.0, 13.0**2 * 125.0]) / 1000
+    assert list(found["volumes_cm3"].values()) == pytest.approx(volume.tolist(), rel=0.02)
+    angle = np.linspace(0, np.pi / 2, 400)
+    skin = np.column_stack([42.0 * np.cos(angle), 120 - 150 * np.sin(angle)])
+    bone = np.column_stack([13.0 * np.cos(angle), 126 - 125 * np.sin(angle)])
+    least = np.linalg.norm(skin[:, None] - bone, axis=-1).min()
+    assert found["thinnest_mm"]["tibia"]["tissue_mm"] == pytest.approx(least, abs=0.3)
+    assert min(picture_size(found["picture"])) > 400
+    code, out, _ = limbfit("surfaces", study)
+    assert code == 0
+    assert "2 closed bodies" in out
+    assert found["picture"] in out
+
+
+def test_sites_are_shown(limbfit, study):
+    code, out, _ = limbfit("sites", study, "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert [site["site"] for site in found["sites"]] == ["1", "2"]
+    assert min(picture_size(found["picture"])) > 400
+    assert not (study / "results/traces").exists()
+
+
+@pytest.mark.slow
+def test_meshes_are_shown(limbfit, study):
+    edit(study, "[study]", "[mesh]\nedge_near_mm = 6.0\nedge_far_mm = 30.0\n[study]")
+    code, out, _ = limbfit("mesh", study, "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert set(found["sites"]) == {"1", "2"}
+    assert all(row["min_dihedral_deg"] > 5 for row in found["sites"].values())
+    assert min(picture_size(found["picture"])) > 400
+    assert limbfit("run", study, "--until", "mesh")[0] == 0
+    assert not (study / "results/calibrate").exists()
+
+
+def test_nothing_to_segment(limbfit, study):
+    code, out, err = limbfit("segment", study)
+    assert code == 2
+    assert out == ""
+    assert "nothing to segment" in err
 
 
 @pytest.mark.parametrize("name", ["skin.stl", "tibia.stl", "1.csv"])

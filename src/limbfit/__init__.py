@@ -9,7 +9,7 @@ Everything the command line does is one call away:
 ``limbfit check``         ``check_study(load_study(path), listener=print)``
 ``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
 ``limbfit status``        ``study_status(load_study(path))``
-``limbfit surfaces``      ``show_stage(load_study(path), "surfaces", listener=print)``; so ``segment``, ``sites``, ``mesh``
+``limbfit surfaces``      ``show_stage(load_study(path), "surfaces", listener=print)``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``

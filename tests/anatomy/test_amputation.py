@@ -80,11 +80,34 @@ def test_the_stump_becomes_surfaces(plane, stump):
         (500, 1, PAD, "misses the limb"),
         (0, 0, PAD, "normal .* is zero"),
         (0, 1, -1, "thicker"),
-        (-66, 1, PAD, "less than 16 mm distal"),
-        (60, -1, PAD, "less than 16 mm distal|no bone is left"),
+        (-66, 1, PAD, "less than 16 mm distal|cuts nothing off"),
+        (60, -1, PAD, "points distally; turn it round"),
+        (0, -1, PAD, "points distally; turn it round"),
     ],
 )
 def test_impossible_planes_are_refused(leg, plane, shift, factor, pad, expected):
     point, normal = plane
     with pytest.raises(LabelError, match=expected):
         amputate(leg, point + shift * normal, factor * normal, pad)
+
+
+def test_a_plane_along_the_limb_is_refused(leg, plane):
+    with pytest.raises(LabelError, match=r"does not cross the limb: its normal is 8[0-9] degrees"):
+        amputate(leg, plane[0], np.cross(plane[1], [0.3, 0.1, 0.5]), PAD)
+
+
+def test_a_plane_that_cuts_nothing_off_is_refused(stump):
+    """The stump's bones end at its plane; a plane in the pad below them leaves all of them."""
+    low = stump.heights(*_below(stump)) < 0
+    assert low.any()
+    with pytest.raises(LabelError, match="cuts nothing off"):
+        amputate(stump, *_below(stump), 4.0)
+
+
+def _below(stump) -> tuple[np.ndarray, np.ndarray]:
+    """A plane across the limb, 5 mm beyond the lowest bone."""
+    normal = stump.direction[:, 2]
+    index = np.argwhere((stump.array > 0) & (stump.array != stump.soft_value))[:, ::-1]
+    points = stump.index_to_point(index)
+    lowest = points[(points @ normal).argmin()]
+    return lowest - 5.0 * normal, normal

@@ -14,6 +14,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.ndimage import label as connected
 
 from ..errors import LabelError
+from .ends import proximal_end
 from .extraction import signed_distance_to
 from .grid import LabelMap
 
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 _STEP_MM = 0.5  # of the cross-section
 _SMOOTH_MM = 1.0  # of its outline
 _THICKEST_MM = 1.5  # of a slice; thicker ones would make steps of the rounded end
+_MOST_OBLIQUE_DEG = 60.0  # of the plane's normal to the limb
 _ROUNDING = 2.0  # the end is flat only further from the outline than this many pads
 
 
@@ -46,14 +48,17 @@ def amputate(
     Raises
     ------
     LabelError
-        For a plane that misses the limb or its bones, or an image too short for the pad.
+        For a plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too
+        short for the pad.
     """
     point, normal = _unit_plane(plane_point, plane_normal)
     if pad_mm <= 0:
         raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
+    _check_direction(labels, normal)
     labels = _divided(labels)
     height = labels.heights(point, normal)
     section = _section(labels, point, normal)
+    _check_bones(labels, height)
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
     near = np.nonzero((height < 0) & (height > -pad_mm))
     depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
@@ -79,7 +84,8 @@ def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
     spacing, start = labels.spacing.copy(), np.zeros(3)
     spacing[axis] /= parts
     start[axis] = place[0]
-    masks = {0: labels.limb} | {labels.value(name): labels.mask(name) for name in labels.bone_names}
+    present = set(np.unique(labels.array).tolist()) - {0, labels.soft_value}
+    masks = {0: labels.limb} | {value: labels.array == value for value in sorted(present)}
     inside = {
         value: _interpolated(signed_distance_to(mask, labels), place, 2 - axis) > 0
         for value, mask in masks.items()
@@ -106,6 +112,34 @@ def _unit_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
     if not length > 0:
         raise LabelError("the normal of the amputation plane is zero", remedy="give a proximal direction")
     return np.asarray(point, dtype=float), vector / length
+
+
+def _check_direction(labels: LabelMap, normal: Array) -> None:
+    """Refuse a normal that points distally, or that is not along the limb at all."""
+    along = float(proximal_end(labels.limb, labels).direction(labels) @ normal)
+    angle = float(np.degrees(np.arccos(np.clip(along, -1, 1))))
+    if angle > 180 - _MOST_OBLIQUE_DEG:
+        raise LabelError(
+            "the normal of the amputation plane points distally",
+            remedy="turn it round: it points to what is kept",
+        )
+    if angle > _MOST_OBLIQUE_DEG:
+        raise LabelError(
+            f"the amputation plane does not cross the limb: its normal is {angle:.0f} degrees off the limb",
+            remedy="give a normal that points proximally along the limb",
+        )
+
+
+def _check_bones(labels: LabelMap, height: Array) -> None:
+    """Refuse a plane that has all bones on one side."""
+    bones = height[np.isin(labels.array, [labels.value(name) for name in labels.bone_names])]
+    if not (bones > 0).any():
+        raise LabelError("no bone is left proximal of the amputation plane", remedy="move the plane distally")
+    if not (bones < 0).any():
+        raise LabelError(
+            "the amputation plane cuts nothing off: no bone lies distal of it",
+            remedy="move the plane proximally",
+        )
 
 
 def _quarter_ellipse(t: Array) -> Array:
@@ -159,12 +193,6 @@ def _check(labels: LabelMap, array: NDArray[np.uint8], section: _Section, height
         raise LabelError(
             "the image ends within the limb's cross-section at the amputation plane",
             remedy="move the plane proximally",
-        )
-    soft = labels.soft_value
-    if not np.any((array > 0) & (array != soft)):
-        raise LabelError(
-            "no bone is left proximal of the amputation plane",
-            remedy="move the plane distally, or turn its normal to point proximally",
         )
     border = np.ones(array.shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 FARTHEST_MM = 5.0
 SAMPLE_EDGE_MM = 1.0
 AXIS_STEPS = 4
+_ON_CUT_MM = 0.01
 
 
 def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = None) -> tuple[Array, float]:
@@ -38,6 +39,16 @@ def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = No
             remedy="give the position in LPS millimetres of the image (3D Slicer shows RAS: negate x and y)",
         )
     return np.asarray(nearest[0], dtype=float), distance
+
+
+def thinnest_tissue(anatomy: Anatomy, bone: str) -> tuple[float, Array]:
+    """Least distance (mm) from a bone to the skin, and where it is on the bone (3,); the cut is no skin."""
+    skin, points = anatomy.skin, anatomy.bones[bone].points
+    open_faces = skin.faces[(np.abs(anatomy.height(skin.points)) > _ON_CUT_MM)[skin.faces].any(axis=1)]
+    inner = np.ascontiguousarray(points[anatomy.height(points) < 0])
+    squared = igl.point_mesh_squared_distance(inner, skin.points, np.ascontiguousarray(open_faces))[0]
+    least = int(np.argmin(squared))
+    return float(np.sqrt(squared[least])), inner[least]
 
 
 def indenter_axis(skin: Surface, position: ArrayLike, width: float, edge: ArrayLike | None = None) -> Array:

@@ -17,6 +17,7 @@ _HOME = {
     "report_study": "run",
     "run_demo": "demo",
     "run_study": "run",
+    "show_stage": "show",
     "simulate_feb": "febfile",
     "simulate_site": "simulate",
     "study_status": "run",

@@ -1,39 +1,28 @@
 """Pictures of the model, drawn off-screen: surfaces with sites (the paper's figure 1), cut meshes (figures 4
 and 6) and the deformed cut at the peak.
-
-Every view is a parallel projection, so that a scale bar holds everywhere in it and the labels can be set as
-text above the picture instead of being burnt into it.
 """
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 import pyvista as pv
-from matplotlib import colormaps
 from numpy.typing import NDArray
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from .page import Figure
+from .panels import FIELD_MAP, PAPER, Mark, Shot, View, colour_bar, legend, strip
 from .store import Json, Store
-from .tables import number
 
-PAPER = "#f6f5f1"
 SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
 BETWEEN = ("#7d6a2e", "#f7efce", "#4a6472")  # layers between the outermost and the core
 SKIN_SURFACE = "#d9a07c"
 MATT: dict[str, Any] = {"ambient": 0.35, "diffuse": 0.75, "specular": 0.0}
 FITTED, HELD_OUT = "#0072b2", "#d55e00"
-FIELD_MAP = "viridis"
 SIDES = ("anterior view", "left view", "posterior view", "right view")
 MARKER_COLOUR_MM = 4.0  # the height of a skin marker in the image
 FIELDS = (
@@ -45,60 +34,21 @@ Array = NDArray[np.float64]
 Grid = Any  # a pyvista data set; what its stubs promise differs between its releases
 
 
-@dataclass(frozen=True)
-class View:
-    """A parallel projection: ``direction`` is where the camera looks, ``size`` is in pixels."""
-
-    focal: Array
-    direction: Array
-    up: Array
-    half_height_mm: float
-    size: tuple[int, int]
-
-    @property
-    def right(self) -> Array:
-        return np.cross(self.direction, self.up)
-
-    @property
-    def pixels_per_mm(self) -> float:
-        return self.size[1] / (2 * self.half_height_mm)
-
-    def project(self, points: Array) -> Array:
-        """Pixels (n, 2), the origin at the top left, of points (n, 3) in mm."""
-        offset = np.atleast_2d(points) - self.focal
-        axes = np.column_stack([self.right, -self.up])
-        return offset @ axes * self.pixels_per_mm + np.array(self.size) / 2
-
-
-@dataclass(frozen=True)
-class Mark:
-    """A point of a picture with its name; ``axis`` (into the limb) is drawn as an arrow when given."""
-
-    text: str
-    position: Array
-    color: str
-    filled: bool = True
-    axis: Array | None = None
-
-
-Shot = tuple[Array, View, list[Mark]]
-
-
-def _unit(values: Iterable[float]) -> Array:
+def unit(values: Iterable[float]) -> Array:
     v = np.asarray(tuple(values), dtype=float)
     return v / np.linalg.norm(v)
 
 
 def limb_frame(store: Store) -> Array:
     """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
-    up = _unit(store.surfaces.get("cut_normal") or (0.0, 0.0, 1.0))
+    up = unit(store.surfaces.get("cut_normal") or (0.0, 0.0, 1.0))
     back = np.array([0.0, 1.0, 0.0])
-    back = _unit(back - (back @ up) * up) if abs(up[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
+    back = unit(back - (back @ up) * up) if abs(up[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
     return np.array([np.cross(back, up), back, up])
 
 
 @contextmanager
-def _without_display_warning() -> Iterator[None]:
+def without_display_warning() -> Iterator[None]:
     """VTK warns on the terminal that there is no display before it draws without one, as it should."""
     before = vtkLogger.GetCurrentVerbosityCutoff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
@@ -108,7 +58,7 @@ def _without_display_warning() -> Iterator[None]:
         vtkLogger.SetStderrVerbosity(before)
 
 
-def _shoot(plotter: Any, view: View) -> Array:
+def shoot(plotter: Any, view: View) -> Array:
     """The picture (rows, columns, 3) of what the plotter holds, seen by a view."""
     camera = plotter.camera
     camera.parallel_projection = True
@@ -122,44 +72,38 @@ def _shoot(plotter: Any, view: View) -> Array:
     return np.asarray(plotter.screenshot(return_img=True))
 
 
-def _plotter() -> Any:
+def new_plotter() -> Any:
     plotter: Any = pv.Plotter(off_screen=True, lighting="light kit")
     plotter.set_background(PAPER)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
 
 
-def _png(pixels: Array) -> str:
-    buffer = io.BytesIO()
-    matplotlib.image.imsave(buffer, pixels, format="png")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-@_without_display_warning()
+@without_display_warning()
 def surface_figure(store: Store) -> Figure | None:
     """The limb from four sides: skin translucent, bones inside, sites named on the side that shows them."""
     files = store.surface_files
     if "skin" not in files:
         return None
-    plotter = _plotter()
+    plotter = new_plotter()
     skin = pv.read(files["skin"])
     plotter.enable_depth_peeling(8)
     plotter.add_mesh(skin, color=SKIN_SURFACE, opacity=0.36, smooth_shading=True, **MATT)
     for name, file in files.items():
         if name != "skin":
             plotter.add_mesh(pv.read(file), color=BONE, **MATT)
-    views = _four_sides(store, skin)
-    shots = [(_shoot(plotter, view), view, _facing(store, view)) for view in views]
+    views = four_sides(store, skin)
+    shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
     plotter.close()
     alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
     caption = (
         "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
         "Filled: sites that were fitted; open: held out."
     )
-    return Figure("model", _strip(shots, SIDES, alt), caption)
+    return Figure("model", strip(shots, SIDES, alt), caption)
 
 
-@_without_display_warning()
+@without_display_warning()
 def marker_figure(store: Store) -> Figure | None:
     """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
     marked_file, plain_file = store.folder / "segment" / "skin-markers.stl", store.surface_files.get("skin")
@@ -167,24 +111,24 @@ def marker_figure(store: Store) -> Figure | None:
         return None
     plain = pv.read(plain_file)
     marked = pv.read(marked_file).compute_implicit_distance(plain)
-    plotter = _plotter()
+    plotter = new_plotter()
     limits = (0.0, float(np.ceil(MARKER_COLOUR_MM)))
     plotter.add_mesh(
         marked, scalars="implicit_distance", clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, **MATT
     )
-    views = _four_sides(store, plain)
-    shots = [(_shoot(plotter, view), view, _facing(store, view)) for view in views]
+    views = four_sides(store, plain)
+    shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
     plotter.close()
     alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
     caption = (
         "Skin of the image with markers, coloured by its distance from the skin without: each site of the "
         "study was matched to one of the bumps."
     )
-    bar = _colour_bar(limits, "distance (mm)")
-    return Figure("markers", _strip(shots, SIDES, alt) + bar, caption)
+    bar = colour_bar(limits, "distance (mm)")
+    return Figure("markers", strip(shots, SIDES, alt) + bar, caption)
 
 
-def _four_sides(store: Store, skin: Any) -> list[View]:
+def four_sides(store: Store, skin: Any) -> list[View]:
     """Views of the whole limb, in the order of ``SIDES``."""
     left, back, up = limb_frame(store)
     points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
@@ -198,61 +142,61 @@ def _facing(store: Store, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
     marks = []
     for row in store.sites:
-        if row.get("position_mm") and row.get("axis") and _unit(row["axis"]) @ view.direction > 0.5:
-            marks.append(_mark(row))
+        if row.get("position_mm") and row.get("axis") and unit(row["axis"]) @ view.direction > 0.5:
+            marks.append(site_mark(row))
     return marks
 
 
-def _mark(row: Json, axis: bool = False) -> Mark:
+def site_mark(row: Json, axis: bool = False) -> Mark:
     fitted = bool(row.get("fitted"))
     color = FITTED if fitted else HELD_OUT
-    position, direction = np.array(row["position_mm"]), _unit(row["axis"]) if axis else None
+    position, direction = np.array(row["position_mm"]), unit(row["axis"]) if axis else None
     return Mark(str(row["site"]), position, color, fitted, direction)
 
 
-@_without_display_warning()
+@without_display_warning()
 def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
-    rows = _drawable(store, sites, "mesh")
+    rows = drawable(store, sites, "mesh")
     if not rows:
         return None
     whole: list[Shot] = []
     near: list[Shot] = []
     colours: dict[str, str] = {}
     for row, file in rows:
-        view, close = _cut_views(store, row, file)
-        plotter = _plotter()
-        grid = _linear(file)
-        colours |= _region_colours(grid)
-        _add_regions(plotter, _far_side(grid, view))
-        whole.append((_shoot(plotter, view), view, [_mark(row, axis=True)]))
-        near.append((_shoot(plotter, close), close, []))
+        view, close = cut_views(store, row, file)
+        plotter = new_plotter()
+        grid = linear(file)
+        colours |= region_colours(grid)
+        add_regions(plotter, far_side(grid, view))
+        whole.append((shoot(plotter, view), view, [site_mark(row, axis=True)]))
+        near.append((shoot(plotter, close), close, []))
         plotter.close()
     names = [row["site"] for row, _ in rows]
     alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
     paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
-    legend = _legend((*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE)))
+    key = legend((*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE)))
     caption = (
         "The mesh of each fitted site, cut along the limb through the site (above), and near the indenter "
         "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
     )
     titles = [f"site {name}" for name in names]
-    markup = _strip(whole, titles, alt) + _strip(near, [f"{t}, near" for t in titles], alt) + legend
+    markup = strip(whole, titles, alt) + strip(near, [f"{t}, near" for t in titles], alt) + key
     return Figure("mesh-cut", markup, caption)
 
 
-@_without_display_warning()
+@without_display_warning()
 def field_figure(store: Store, sites: Sequence[str], stage: str, name: str) -> Figure | None:
     """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
-    rows = _drawable(store, sites, stage)
-    grids = [(row, file, _linear(file)) for row, file in rows]
+    rows = drawable(store, sites, stage)
+    grids = [(row, file, linear(file)) for row, file in rows]
     stored = {name for _, _, grid in grids for name in grid.array_names}
     field = next(((name, title) for name, title in FIELDS if name in stored), None)
     if not grids or field is None or "displacement_mm" not in stored:
         return None
-    views = [_cut_views(store, row, file)[1] for row, file, _ in grids]
-    cuts = [_far_side(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
+    views = [cut_views(store, row, file)[1] for row, file, _ in grids]
+    cuts = [far_side(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
     limits = _limits(cuts, views, field[0])
     shots: list[Shot] = [
         (_shoot_field(cut, view, field[0], limits), view, []) for view, cut in zip(views, cuts, strict=True)
@@ -261,30 +205,30 @@ def field_figure(store: Store, sites: Sequence[str], stage: str, name: str) -> F
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
     caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
     return Figure(
-        name, _strip(shots, [f"site {name}" for name in names], alt) + _colour_bar(limits, field[1]), caption
+        name, strip(shots, [f"site {name}" for name in names], alt) + colour_bar(limits, field[1]), caption
     )
 
 
 def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
     """A deformed cut, coloured by a field without shading, so that colours can be read off the bar."""
-    plotter = _plotter()
+    plotter = new_plotter()
     surface = cut.warp_by_vector("displacement_mm").extract_surface(algorithm="dataset_surface")
     plotter.add_mesh(
         surface, scalars=field, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, lighting=False
     )
-    pixels = _shoot(plotter, view)
+    pixels = shoot(plotter, view)
     plotter.close()
     return pixels
 
 
-def _drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
+def drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
     """Sites with a place and a stored mesh."""
     rows = {row["site"]: row for row in store.sites if row.get("position_mm") and row.get("axis")}
     found = [(rows[name], store.vtu(stage, name)) for name in sites if name in rows]
     return [(row, file) for row, file in found if file is not None]
 
 
-def _linear(file: Path) -> Grid:
+def linear(file: Path) -> Grid:
     """The stored mesh with straight-edged tetrahedra, which draw much faster.
 
     Made by hand: VTK's linear copy keeps the mid-edge nodes in the connectivity, and cutting it crashes.
@@ -301,11 +245,11 @@ def _linear(file: Path) -> Grid:
     return plain
 
 
-def _cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
+def cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
     """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
     up = limb_frame(store)[2]
-    axis = _unit(row["axis"])
-    normal = _unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else limb_frame(store)[0]
+    axis = unit(row["axis"])
+    normal = unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else limb_frame(store)[0]
     points = np.asarray(pv.read(file).points)
     height = points @ up
     middle = points.mean(axis=0)
@@ -317,7 +261,7 @@ def _cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
     return whole, close
 
 
-def _far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
+def far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
     """What lies behind the plane through the middle of the view: whole cells, or cut through."""
     if smooth:
         return grid.clip(normal=tuple(view.direction), origin=tuple(view.focal), invert=False)
@@ -325,9 +269,9 @@ def _far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
     return grid.extract_cells(np.flatnonzero((centres - view.focal) @ view.direction > 0))
 
 
-def _add_regions(plotter: Any, grid: Grid) -> None:
+def add_regions(plotter: Any, grid: Grid) -> None:
     regions = np.asarray(grid.cell_data["region"])
-    for index, colour in enumerate(_region_colours(grid).values()):
+    for index, colour in enumerate(region_colours(grid).values()):
         part = grid.extract_cells(np.flatnonzero(regions == index))
         if part.n_cells:
             surface = part.extract_surface(algorithm="dataset_surface")
@@ -336,7 +280,7 @@ def _add_regions(plotter: Any, grid: Grid) -> None:
                 _add_faces(plotter, surface.extract_cells(np.flatnonzero(chosen)), color)
 
 
-def _region_colours(grid: Grid) -> dict[str, str]:
+def region_colours(grid: Grid) -> dict[str, str]:
     """The colour of each region: layers, outermost first, and the core."""
     names = [str(name) for name in grid.field_data["region_names"]]
     between = [BETWEEN[i % len(BETWEEN)] for i in range(len(names) - 2)]
@@ -366,84 +310,3 @@ def _limits(cuts: Sequence[Grid], views: Sequence[View], field: str) -> tuple[fl
         shown.append((np.linalg.norm(values, axis=1) if values.ndim == 2 else values)[seen])
     low, high = np.percentile(np.concatenate(shown), [1, 99])
     return float(low), float(max(high, low + 1e-9))
-
-
-# ---- pictures as SVG ------------------------------------------------------------------------------------
-
-_GAP, _TITLE = 14, 46
-
-
-def _strip(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
-    """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
-    width = sum(view.size[0] for _, view, _ in shots) + _GAP * (len(shots) - 1)
-    height = max(view.size[1] for _, view, _ in shots) + _TITLE
-    parts, x = [], 0
-    for (pixels, view, marks), title in zip(shots, titles, strict=True):
-        parts.append(f'<g transform="translate({x} 0)">{_panel(pixels, view, marks, title)}</g>')
-        x += view.size[0] + _GAP
-    head = f'<svg class="picture" viewBox="0 0 {width} {height}" role="img"><title>{escape(alt)}</title>'
-    return head + "".join(parts) + "</svg>"
-
-
-def _panel(pixels: Array, view: View, marks: list[Mark], title: str) -> str:
-    w, h = view.size
-    image = f'<image href="{_png(pixels)}" width="{w}" height="{h}"/>'
-    text = f'<text class="panel-title" x="2" y="{_TITLE - 12}">{escape(title)}</text>'
-    return f'{text}<g transform="translate(0 {_TITLE})">{image}{_labels(view, marks)}{_scale_bar(view)}</g>'
-
-
-def _labels(view: View, marks: list[Mark]) -> str:
-    """Dots, arrows and names; names stand right of their dot and give way to each other downwards."""
-    placed: list[tuple[float, float]] = []
-    parts = []
-    for mark in sorted(marks, key=lambda m: float(view.project(m.position)[0, 1])):
-        x, y = (float(v) for v in view.project(mark.position)[0])
-        if mark.axis is not None:
-            parts.append(_arrow(view, mark))
-        else:
-            fill = mark.color if mark.filled else PAPER
-            parts.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="9" fill="{fill}" stroke="{mark.color}"/>')
-            ly = y
-            while any(abs(ly - py) < 32 and abs(x - px) < 24 * (2 + len(mark.text)) for px, py in placed):
-                ly += 4
-            placed.append((x, ly))
-            parts.append(f'<text class="site" x="{x + 15:.0f}" y="{ly + 11:.0f}">{escape(mark.text)}</text>')
-    return "".join(parts)
-
-
-def _arrow(view: View, mark: Mark) -> str:
-    assert mark.axis is not None
-    tip = view.project(mark.position)[0]
-    step = view.project(mark.position + mark.axis)[0] - tip
-    step = step / np.linalg.norm(step)
-    side = np.array([-step[1], step[0]])
-    tail, wing = tip - 70 * step, tip - 22 * step
-    head = " ".join(f"{p[0]:.0f},{p[1]:.0f}" for p in (tip, wing + 10 * side, wing - 10 * side))
-    shaft = f'x1="{tail[0]:.0f}" y1="{tail[1]:.0f}" x2="{wing[0]:.0f}" y2="{wing[1]:.0f}"'
-    line = f'<line {shaft} stroke="{mark.color}" stroke-width="6"/>'
-    return f'{line}<polygon points="{head}" fill="{mark.color}"/>'
-
-
-def _scale_bar(view: View) -> str:
-    length = next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * view.size[0])
-    w, (right, bottom) = length * view.pixels_per_mm, (view.size[0] - 14, view.size[1] - 14)
-    line = f'<line x1="{right - w:.1f}" y1="{bottom}" x2="{right}" y2="{bottom}" class="scale"/>'
-    return f'{line}<text class="scale-text" x="{right}" y="{bottom - 10}">{length} mm</text>'
-
-
-def _legend(entries: Iterable[tuple[str, str]]) -> str:
-    items = "".join(
-        f'<span><i class="swatch" style="background:{color}"></i>{escape(text)}</span>'
-        for text, color in entries
-    )
-    return f'<div class="legend">{items}</div>'
-
-
-def _colour_bar(limits: tuple[float, float], title: str) -> str:
-    stops = ", ".join(
-        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[FIELD_MAP](t)[:3])
-        for t in np.linspace(0, 1, 9)
-    )
-    bar = f'<i class="colour-bar" style="background:linear-gradient(90deg, {stops})"></i>'
-    low, high = (number(value) for value in limits)
-    return f'<div class="legend"><span>{low}</span>{bar}<span>{high}</span><span>{escape(title)}</span></div>'
