@@ -30,10 +30,10 @@ VERDICTS = {
     "bad-material": ("input", 'could not read its input: tag "SolidDomain" (line 3625) : invalid value'),
     "broken-xml": ("input", "could not read its input: Unexpected end of file"),
     "missing-file": ("input", "Failed opening input file model.feb"),
-    "diverges": ("error", "at 0 s of 12.71 s: 69 negative jacobians detected.; no convergence at 6.354 s"),
+    "diverges": ("error", "at 0 s of 12.71 s: 69 negative jacobians detected; no convergence at 6.354 s"),
     "stops-early": (
         "error",
-        "at 2.769 s of 12.71 s: Max nr of reformations reached.; no convergence at 2.921",
+        "at 2.769 s of 12.71 s: Max nr of reformations reached; no convergence at 2.921",
     ),
     "killed": ("killed", "killed by signal 9, most often for want of memory, at 4.13 s of 12.71 s"),
 }

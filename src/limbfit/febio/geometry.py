@@ -196,7 +196,7 @@ def _node_set(group: Node, numbers: _Numbers) -> Indices:
             low, high = int(first), int(last or first)
         except ValueError:
             raise group.refuse(f"{text.strip()[:40]!r} is no node number") from None
-        if high - low >= len(numbers.ids):
+        if not 0 <= high - low < len(numbers.ids):
             raise group.refuse(f"there are no nodes {low} to {high}")
         ids += range(low, high + 1)
     return np.array(numbers.of(group, ids))

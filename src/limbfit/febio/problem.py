@@ -172,13 +172,17 @@ def drive(model: FebModel) -> Drive:
         raise ProblemError("nothing moves: the load curve is zero", place=f"line {moving[0].line}")
     scales = {m.curve: _multiple(model.curves[m.curve].at(times), base, m) for m in moving}
     axis, length = None, 1.0
-    if {m.target for m in model.rigid_motions if m.factor != 0.0}:
-        if len({m.target for m in model.rigid_motions if m.factor != 0.0}) > 1:
-            raise ProblemError("more than one rigid body moves", place=f"line {model.rigid_motions[-1].line}")
+    bodies = {m.target for m in model.rigid_motions if m.factor != 0.0}
+    if bodies:
+        place = f"line {model.rigid_motions[-1].line}"
+        if len(bodies) > 1:
+            raise ProblemError("more than one rigid body moves", place=place)
         axis = np.zeros(3)
         for m in model.rigid_motions:
             axis[m.component] += m.factor * scales.get(m.curve, 0.0)
         length = float(np.linalg.norm(axis))
+        if length == 0.0:
+            raise ProblemError("the motions of the rigid body cancel", place=place)
         axis /= length
     sign = float(np.sign(base[np.abs(base).argmax()]))
     factors = tuple(m.factor * scales.get(m.curve, 0.0) * sign / length for m in model.motions)

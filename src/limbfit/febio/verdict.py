@@ -84,7 +84,7 @@ def _cause(messages: str, kind: str) -> str:
         return ""
     boxes = _BOX.findall(messages)
     lines = [line.strip(" *") for line in boxes[-1].split("\n")] if boxes else []
-    words = " ".join(" ".join(lines).split())
+    words = " ".join(" ".join(lines).split()).rstrip(".")
     failed = _FAILED.findall(messages)
     parts = [words] if words else []
     if kind != "input" and failed:

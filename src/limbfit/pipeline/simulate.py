@@ -95,6 +95,7 @@ def simulate_site(
     context.tell("simulate", 0, 1, f"site {name}")
     played = folder / f"{name}.pvd" if animation else None
     if program is not None:
+        (folder / f"{name}.vtu").unlink(missing_ok=True)  # that of another simulation
         result, fields = run_febio_site(found, program, folder / f"{name}.febio")
     else:
         fields = folder / f"{name}.vtu"
