@@ -131,8 +131,8 @@ def main() -> None:
     for seed in options.seeds:
         rows.append(one(options.detail, options.contrast, seed))
         show(rows[-1])
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        if options.json:
+            options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ Spacing = NDArray[np.float64]
 
 SKIN_MM = 1.5  # skin is darker than fat; so deep everything counts as skin
 SEPTUM_MM = 1.5  # sheets of fat thinner than twice this are septa
+_VESSEL_MM2 = 60.0  # cross-section of the largest vessel in the fat
 FAT_HU = (-200.0, -25.0)
 _FAINTEST = 1.5  # of muscle: fat is at least this bright
 _BRIGHTEST = 2.0  # where nothing tells how bright fat is
@@ -104,10 +105,10 @@ def subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: S
     The image's ends (first and last k) do not count as skin.
     """
     outer = ~limb | (depth < SKIN_MM)
-    layer = (bright | outer) & ~bones
+    layer = _without_small_holes(bright | outer, spacing) & ~bones
     opened = _opened(layer, spacing)
     joined = binary_propagation(outer & opened, mask=opened) | outer
-    # Vessels and nerves within the layer belong to it: what it parts from the inner limb.
+    # What the layer parts from the inner limb belongs to it too.
     parts, count = connected(limb & ~joined)
     if count > 1:
         joined |= (parts > 0) & (parts != int(np.argmax(np.bincount(parts.ravel())[1:])) + 1)
@@ -120,6 +121,16 @@ def depth_below(limb: Mask, spacing: Spacing) -> Field:
     padded[0], padded[-1] = padded[1], padded[-2]
     found = distance_transform_edt(padded, sampling=spacing[::-1])[1:-1, 1:-1, 1:-1]
     return np.asarray(found, dtype=np.float32)
+
+
+def _without_small_holes(mask: Mask, spacing: Spacing) -> Mask:
+    """Vessels and nerves in the fat filled, slice by slice."""
+    in_slice = np.zeros((3, 3, 3), dtype=int)
+    in_slice[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]]
+    parts, _ = connected(~mask, in_slice)
+    small = np.bincount(parts.ravel()) * float(spacing[0] * spacing[1]) < _VESSEL_MM2
+    small[0] = False
+    return np.asarray(mask | small[parts])
 
 
 def _opened(mask: Mask, spacing: Spacing) -> Mask:

@@ -94,7 +94,9 @@ def _odd_slices(name: str, mask: Mask, spacing: Array) -> list[Suspect]:
     high = len(area) - (reach if last < len(areas) - 1 else 1)
     inner = np.zeros(len(area), dtype=bool)
     inner[low:high] = True
-    found = _outliers(name, area, centre, inner) + _jumps(name, area, inner)
+    found = _outliers(name, area, centre, inner)
+    known = {s.slice + step for s in found for step in (-1, 0, 1)}
+    found += [jump for jump in _jumps(name, area, inner) if jump.slice not in known]
     return [Suspect(s.label, s.slice + first, s.what) for s in found]
 
 

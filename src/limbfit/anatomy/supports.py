@@ -18,15 +18,15 @@ from .grid import Grid
 
 Mask = NDArray[np.bool_]
 
-BALL_MM = 15.0  # half the thickness of the thickest slab
+BALL_MM = 20.0  # half the thickness of the thickest slab
 _REACH_MM = 15.0  # a support sticks out of the limb by more
 _SHARE = 0.15  # of the limb's length, along which it does
-_BITE_MM = 5.0  # how deep the strip under the limb may be
+_BITE_MM = 10.0  # how deep the strip under the limb may be
 _STEP_MM = 2.0
 
 
 def without_supports(mask: Mask, grid: Grid) -> Mask:
-    """The mask ``[k, j, i]`` (k along the limb) without slabs of up to 30 mm that stick out of the limb."""
+    """The mask ``[k, j, i]`` (k along the limb) without slabs of up to 40 mm that stick out of the limb."""
     steps = np.maximum((_STEP_MM / grid.spacing[::-1]).astype(int), 1)
     coarse = mask[:: steps[0], :: steps[1], :: steps[2]]
     sampling = grid.spacing[::-1] * steps
@@ -60,7 +60,8 @@ def _wings(residue: Mask, body: Mask, sampling: NDArray[np.float64]) -> Mask:
     for value, box in enumerate(find_objects(parts), start=1):
         piece = parts[box] == value
         far = piece & (away[box] > _REACH_MM)
-        if far.any(axis=(1, 2)).sum() > _SHARE * length:
+        beside = far.any(axis=(1, 2)) & body[box[0]].any(axis=(1, 2))  # else it is a thin end of the limb
+        if beside.sum() > _SHARE * length:
             wings[box] |= piece
     return wings
 

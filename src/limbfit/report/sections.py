@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from . import figures, pictures, tables
 from .comparison import comparison
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
+from .slices import slices_figure
 from .store import PARAMETERS, Json, Store
 
 PRIVACY = (
@@ -163,6 +164,7 @@ def _verdict(store: Store) -> tuple[str, ...]:
 def model(store: Store) -> Section:
     """Surfaces, sites and volumes."""
     blocks = _blocks(
+        slices_figure(store),
         pictures.surface_figure(store),
         pictures.marker_figure(store),
         tables.volume_table(store),

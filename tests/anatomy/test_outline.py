@@ -1,0 +1,182 @@
+"""The outline with what lies around and inside a limb in real images: supports, ghosts, air; CT and T1."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from limbfit.anatomy.body import limb_mask, smoothed
+from limbfit.anatomy.contrast import is_ct
+from limbfit.anatomy.fat import bright_fat, depth_below, subcutaneous
+from limbfit.anatomy.grid import FAT, Volume
+from limbfit.anatomy.segmentation import segment
+from limbfit.anatomy.supports import without_supports
+from limbfit.errors import ImageError
+from limbfit.phantom.geometry import BONES, SKIN_AND_FAT, Limb, make_limb
+from limbfit.phantom.mri import CONTRASTS, image_of, make_grid
+
+SEED = 2
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
+
+
+@pytest.fixture(scope="module")
+def limb() -> Limb:
+    return make_limb(SEED, SKIN_AND_FAT)
+
+
+@pytest.fixture(scope="module")
+def grid(limb):
+    return make_grid(limb, "coarse", SEED)
+
+
+@pytest.fixture(scope="module")
+def images(limb, grid) -> dict[str, Volume]:
+    return {name: image_of(limb, grid, seed=SEED, levels=levels) for name, levels in CONTRASTS.items()}
+
+
+@pytest.fixture(scope="module")
+def points(grid) -> np.ndarray:
+    return grid.points(*(slice(0, n) for n in grid.shape))
+
+
+@pytest.fixture(scope="module")
+def inside(limb, points) -> np.ndarray:
+    return limb.skin(points) < 0
+
+
+def on_a_table(image: Volume, inside: np.ndarray, level: float, thick_mm: float) -> Volume:
+    """The limb pressed 2 mm into a slab that is as wide and as long as the image."""
+    lowest = int(np.flatnonzero(inside.any(axis=(0, 2)))[-1])
+    top = lowest - round(2.0 / image.spacing[1])
+    array = image.array.copy()
+    slab = np.zeros(array.shape, dtype=bool)
+    slab[:, top : top + round(thick_mm / image.spacing[1])] = True
+    array[slab & ~inside] = level
+    return image.with_array(array)
+
+
+@pytest.mark.parametrize(("contrast", "level"), [("UTE", 0.6), ("T1", 1.0), ("CT", -80.0)])
+def test_a_table_that_touches_the_limb_is_no_limb(images, inside, contrast, level):
+    image = on_a_table(images[contrast], inside, level, 12.0)
+    labels = segment(image)
+    assert dice(labels.limb, inside) > 0.985
+    outside = labels.limb & ~inside
+    assert outside.sum() < 0.012 * inside.sum()
+
+
+def test_a_cushion_on_one_side_only(images, inside):
+    image = on_a_table(images["UTE"], inside, 0.7, 20.0)
+    array = image.array.copy()
+    array[:, :, :38][~inside[:, :, :38]] = images["UTE"].array[:, :, :38][~inside[:, :, :38]]
+    half = limb_mask(image.with_array(array), smoothed(image.with_array(array)))
+    assert dice(half, inside) > 0.985
+
+
+def test_ghosts_of_the_limb_are_air(images, inside):
+    """Copies along the phase direction at 6 % of the signal, as motion and flow make them."""
+    image = images["UTE"]
+    ghosts = 0.06 * (np.roll(image.array, 25, axis=1) + np.roll(image.array, -25, axis=1))
+    found = limb_mask(
+        image.with_array(image.array + ghosts), smoothed(image.with_array(image.array + ghosts))
+    )
+    assert dice(found, inside) > 0.985
+    assert (found & ~inside).sum() < 0.01 * inside.sum()
+
+
+def test_air_inside_belongs_to_the_limb(images, inside, points, limb):
+    """Gas pockets of 8 mm and a channel along the limb leave no hole."""
+    image, array = images["UTE"], images["UTE"].array.copy()
+    local = limb.to_limb(points)
+    pockets = np.zeros(inside.shape, dtype=bool)
+    for centre in ((10.0, 25.0, 90.0), (-15.0, 30.0, 130.0)):
+        pockets |= np.linalg.norm(local - np.array(centre), axis=-1) < 8.0
+    pockets |= np.hypot(local[..., 0] - 5.0, local[..., 1] - 40.0) < 3.0
+    pockets &= limb.skin(points) < -8.0
+    array[pockets] = 0.01
+    found = limb_mask(image.with_array(array), smoothed(image.with_array(array)))
+    assert pockets.sum() > 300
+    assert found[pockets].all()
+    assert dice(found, inside) > 0.985
+
+
+def test_a_limb_without_supports_is_left_as_it_is(inside, images):
+    assert np.array_equal(without_supports(inside, images["UTE"]), inside)
+
+
+@pytest.mark.parametrize("contrast", CONTRASTS)
+def test_every_contrast_gives_limb_bones_and_fat(images, inside, limb, points, contrast):
+    labels = segment(images[contrast])
+    assert dice(labels.limb, inside) > 0.99
+    for name in BONES:
+        assert dice(labels.mask(name), limb.bone(name, points) < 0) > 0.93, name
+    layer = inside & (limb.skin(points) > -limb.layers_mm)
+    assert dice(labels.mask(FAT), layer) > 0.85
+    assert labels.mask(FAT).sum() == pytest.approx(layer.sum(), rel=0.15)
+
+
+def test_contrast_is_told_by_the_grey_values_and_must_not_contradict_them(images):
+    assert is_ct(images["CT"])
+    assert not is_ct(images["T1"], "T1")
+    for image, stated in (("CT", "T1"), ("UTE", "CT")):
+        with pytest.raises(ImageError, match=stated):
+            segment(images[image], contrast=stated)
+
+
+def test_seeds_part_bones_that_were_found_as_one(images, limb):
+    """A bridge of bone across the knee joins femur and tibia; a seed in each parts them in the gap."""
+    image, array = images["CT"], images["CT"].array.copy()
+    gap = limb.to_patient(np.array([5.0, 0.0, limb.shape.joint]))
+    i, j, k = np.round(image.point_to_index(gap)).astype(int)
+    array[k - 3 : k + 4, j - 2 : j + 3, i - 2 : i + 3] = 1300.0
+    bridged = image.with_array(array)
+    assert len(segment(bridged).bone_names) < len(BONES)
+    low, high = (limb.to_patient(np.array([2.0, -4.0, limb.shape.joint + dz])) for dz in (-20.0, 30.0))
+    labels = segment(bridged, seeds={"shin": [low], "thigh": [high]})
+    assert labels.bone_names == ("shin", "thigh")
+    heights = [limb.to_limb(labels.index_to_point(np.argwhere(labels.mask(name))[:, ::-1]))[:, 2]
+               for name in labels.bone_names]  # fmt: skip
+    assert heights[0].max() < limb.shape.joint + 6
+    assert heights[1].min() > limb.shape.joint - 6
+
+
+def test_a_seed_outside_every_bone_is_refused_with_its_place(images, limb):
+    point = limb.to_patient(np.array([0.0, 40.0, 100.0]))
+    with pytest.raises(ImageError, match="seed of 'tibia'"):
+        segment(images["UTE"], seeds={"tibia": [point]})
+
+
+def test_a_septum_is_no_subcutaneous_fat_and_a_vessel_in_the_fat_is():
+    """A sheet of fat 2 mm thick that reaches in from the skin, fat deep between muscles, a dark vessel."""
+    spacing, shape = np.ones(3), (20, 60, 60)
+    j, i = np.mgrid[:60, :60]
+    radius = np.hypot(j - 29.5, i - 29.5)
+    limb = np.broadcast_to(radius < 27, shape).copy()
+    layer = limb & (radius > 21)
+    levels = np.where(layer, 2.0, 1.0).astype(np.float32) * limb
+    septum = limb & (np.abs(i - 29.5) < 1) & (j > 30)
+    deep = limb & (np.hypot(j - 24, i - 24) < 4)
+    vessel = layer & (np.hypot(j - 29.5, i - 5.5) < 1.2)
+    levels[septum | deep] = 2.0
+    levels[vessel] = 0.1
+    bones, depth = np.zeros(shape, dtype=bool), depth_below(limb, spacing)
+    fat = subcutaneous(bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing)
+    assert dice(fat, layer) > 0.95
+    assert not fat[deep].any()
+    assert not fat[septum & (radius < 18)].any()
+    assert fat[vessel].all()
+
+
+def test_dark_fat_far_from_the_coil_is_fat():
+    """The signal falls to 40 % along the limb: fat at one end is darker than muscle at the other."""
+    spacing, shape = np.array([1.0, 1.0, 2.0]), (80, 60, 60)
+    k, j, i = np.mgrid[:80, :60, :60]
+    radius = np.hypot(j - 29.5, i - 29.5)
+    limb, layer = radius < 27, (radius < 27) & (radius > 22)
+    levels = (np.where(layer, 2.0, 1.0) * limb * (1 - 0.6 * k / 79)).astype(np.float32)
+    bones, depth = np.zeros(shape, dtype=bool), depth_below(limb, spacing)
+    fat = subcutaneous(bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing)
+    for end in (slice(0, 10), slice(-10, None)):
+        assert dice(fat[end], layer[end]) > 0.9
