@@ -24,8 +24,8 @@ from limbfit.anatomy.surfaces import Anatomy, load_anatomy
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid, write_series
 
-EDGE_MM = 6.0
-SAME_MM = 0.3  # triangles of 6 mm of the same body that were remeshed another way
+EDGE_MM = 10.0
+SAME_MM = 0.3  # triangles of 10 mm of the same body that were remeshed another way
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,9 @@ class Study:
         lines = ["[study]", 'name = "damaged"']
         if inputs.image:
             lines += ["[image]", f'path = "{inputs.image}"']
+        lines += ["[segmentation]", "bias_correction = false"]  # it takes most of the time
         if inputs.labels:
-            lines += ["[segmentation]", f'labels = "{inputs.labels}"']
+            lines += [f'labels = "{inputs.labels}"']
         lines += ["[geometry]", f"surface_edge_mm = {EDGE_MM}"]
         if inputs.surfaces is not None:
             skin, bones = inputs.surfaces

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -252,6 +253,11 @@ def test_a_given_cut_is_kept(leg):
     check_anatomy(cut)
     with pytest.raises(SurfaceError, match="misses the limb"):
         build_anatomy(leg, 5.0, (point + 500 * normal, normal))
+
+
+def test_a_cut_without_a_direction_is_refused(anatomy):
+    with pytest.raises(SurfaceError, match="normal of the proximal cut is zero"):
+        replace(anatomy, cut_normal=[0, 0, 0])
 
 
 def test_the_proximal_end_is_found_along_every_axis_and_sense(leg):

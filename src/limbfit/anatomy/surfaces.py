@@ -74,9 +74,9 @@ class Anatomy:
     cut_normal: Array
 
     def __post_init__(self) -> None:
-        normal = np.asarray(self.cut_normal, dtype=float)
-        object.__setattr__(self, "cut_normal", normal / np.linalg.norm(normal))
-        object.__setattr__(self, "cut_point", np.asarray(self.cut_point, dtype=float))
+        point, normal = _plane(self.cut_point, self.cut_normal)
+        object.__setattr__(self, "cut_normal", normal)
+        object.__setattr__(self, "cut_point", point)
 
     def height(self, points: ArrayLike) -> Array:
         """(...) distance of points beyond the cut plane, mm; negative inside the limb."""
