@@ -29,7 +29,7 @@ _FACES = {
     "tet": ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)),
     "hex": ((0, 1, 2, 3), (4, 7, 6, 5), (0, 4, 5, 1), (1, 5, 6, 2), (2, 6, 7, 3), (3, 7, 4, 0)),
 }
-PROGRAMS = ("abaqus", "calculix")
+_NO_TERM = 1e12  # mm^2/N
 
 
 def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSettings) -> Tool:
@@ -100,7 +100,7 @@ def _lines(
             yield from _wrapped(np.asarray(nodes) + 1)
     yield f"*NSET, NSET=handle\n{handle}"
     for name in mesh.region_names:
-        yield from _material(name, problem.materials[name])
+        yield from _material(name, problem.materials[name], program)
     yield f"*MATERIAL, NAME=steel\n*ELASTIC\n2e5, 0.3\n*SOLID SECTION, ELSET={INDENTER}, MATERIAL=steel"
     yield f"*RIGID BODY, ELSET={INDENTER}, REF NODE={handle}"
     yield from _sides(PATCH, mesh, np.asarray(problem.contact_faces), numbers)
@@ -110,14 +110,16 @@ def _lines(
     yield from _step(problem, system, handle, settings)
 
 
-def _material(name: str, material: Material) -> Iterator[str]:
+def _material(name: str, material: Material, program: str) -> Iterator[str]:
     """Ogden with long-term moduli ``c/2``, exponents and ``D``; relaxation over the instantaneous moduli."""
     table = material.table()
     prony = [(float(g), float(tau)) for g, tau in table.prony if g != 0.0]
     yield f"*SOLID SECTION, ELSET={name}, MATERIAL={name}_law\n*MATERIAL, NAME={name}_law"
     moduli = ", MODULI=LONG TERM" if prony else ""
     yield f"*HYPERELASTIC, OGDEN, N={len(table.terms)}{moduli}"
-    bulk = [2.0 / table.kappa, *[0.0] * (len(table.terms) - 1)]
+    # A second D of 0 is none for Abaqus; CalculiX would take a stiff default of its own.
+    none = _NO_TERM if program == "calculix" else 0.0
+    bulk = [2.0 / table.kappa, *[none] * (len(table.terms) - 1)]
     values = [*(v for c, m in table.terms for v in (c / 2.0, m)), *bulk]
     for i in range(0, len(values), 8):
         yield _row(values[i : i + 8])
