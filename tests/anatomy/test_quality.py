@@ -24,7 +24,7 @@ def test_a_good_map_has_measures_and_no_suspects(leg):
     quality = assess(leg[1])
     assert quality.suspects == ()
     tibia = quality.labels["tibia"]
-    assert tibia["volume_cm3"] == pytest.approx(np.pi * 1.3**2 * 12, rel=0.03)
+    assert tibia["volume_cm3"] == pytest.approx(np.pi * 1.3**2 * 12, rel=0.07)
     assert (tibia["pieces"], tibia["holes"], tibia["slices_without"]) == (1, 0, 0)
     json.dumps(quality.as_json())
 

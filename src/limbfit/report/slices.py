@@ -16,7 +16,7 @@ def slices_figure(store: Store) -> Figure | None:
         return None
     data = base64.b64encode(file.read_bytes()).decode("ascii")
     caption = (
-        "Outlines of the limb and of its labels over slices from end to end; below, enlarged, slices in which "
+        "Outlines of the limb and of its labels over slices from end to end; enlarged below: slices in which "
         "an area or a centroid does not fit its neighbours."
     )
     markup = f'<img src="data:image/png;base64,{data}" alt="{escape(caption)}" style="width:100%">'
