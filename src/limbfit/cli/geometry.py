@@ -74,11 +74,8 @@ def show_surfaces(found: dict[str, Any]) -> None:
     STDOUT.print(table)
     line(f"{found['closed_bodies']} closed bodies; proximal cut through {point(found['cut_point'])}")
     if found["amputation"]:
-        ends = found["amputation"]["beyond_plane_mm"]
-        line(
-            f"amputated: the limb ends {ends.pop('skin'):.1f} mm beyond the plane, "
-            + ", ".join(f"{name} {-end:.1f} mm before it" for name, end in ends.items())
-        )
+        ends = found["amputation"]["beyond_plane_mm"].items()
+        line("amputated; ends beyond the plane (mm): " + ", ".join(f"{name} {end:.1f}" for name, end in ends))
 
 
 def show_sites(found: dict[str, Any]) -> None:
