@@ -11,7 +11,7 @@ import pytest
 
 from limbfit.bench.blocks import punched_block
 from limbfit.errors import ProblemError
-from limbfit.fe import Indenter, Ogden, OgdenQLV, RigidSurface, StepControl, System, solve
+from limbfit.fe import History, Indenter, Ogden, OgdenQLV, RigidSurface, StepControl, System, solve
 from limbfit.fe.stepping import schedule
 from limbfit.febio import (
     FebSettings,
@@ -157,7 +157,7 @@ def test_another_reader_understands_it(tmp_path):
     pytest.importorskip("pyfebio")
     from pyfebio import control, loaddata, mesh, meshdomains, output
 
-    problem = block("tet10", divisions=2)
+    problem = block("tet10", "stl", divisions=2)
     file, tool = exported(problem, tmp_path)
     root = ET.parse(file).getroot()
     schemas = {
@@ -174,28 +174,26 @@ def test_another_reader_understands_it(tmp_path):
     assert [len(part.all_elements) for part in found["Mesh"].elements] == [
         *np.bincount(problem.mesh.regions), len(tool.cells)
     ]  # fmt: skip
-    assert {domain.elem_type for domain in found["MeshDomains"].solid_domains} == {"TET10G4", None}
+    assert {domain.elem_type for domain in found["MeshDomains"].solid_domains} == {"TET10G4"}
+    assert [domain.name for domain in found["MeshDomains"].shell_domains] == ["indenter"]
     curve = found["LoadData"].load_controllers[0]
     assert len(curve.points.points) == len(problem.history.times)
 
 
 @pytest.mark.parametrize("shape", ["square", "sphere"])
 def test_it_pushes_as_hard(tmp_path, shape):
-    """Solved from the file, with limbfit's own penalty, the facets are all that differs."""
-    problem = block("tet4", shape, divisions=10)
+    """Solved from the file, with the same penalty, the facets are all that differs."""
+    ramp = History(np.array([0.0, 2.0, 3.0]), np.array([0.0, 2.0, 1.0]))
+    problem = replace(block("tet4", shape, divisions=8), history=ramp)
     file, _ = exported(problem, tmp_path)
-    steps = StepControl(load_steps=4, unload_steps=2)
-    times = tuple(schedule(problem.history, steps))
-    direct = solve(problem, steps, store="none")
-    run = run_feb(
-        file, tmp_path / "out", times=times, penalty=2000.0 / problem.indenter.width, penetration=0.01
-    )
+    same = {"times": (1.0, 2.0, 3.0), "penalty": 20.0, "penetration": 1.0}
+    direct = solve(problem, StepControl(**same), store="none")
+    run = run_feb(file, tmp_path / "out", **same)
     assert run.result.completed
-    at = [np.isin(result.times, times) for result in (run.result, direct)]  # where both stepped
     limit = 0.01 * direct.peak_force
-    np.testing.assert_allclose(run.result.force[at[0]], direct.force[at[1]], atol=limit)
+    np.testing.assert_allclose(run.result.force, direct.force, atol=limit)
     log = read_log(run.files[0])
-    found = result_of_log(problem, log, Verdict("normal", "", float(times[-1]), ""))
+    found = result_of_log(problem, log, Verdict("normal", "", 3.0, ""))
     np.testing.assert_allclose(found.force, run.result.force, atol=1e-3 * limit)
 
 
