@@ -42,13 +42,13 @@ def _of_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames([str(one.path) for one in slices])
     reader.SetOutputPixelType(sitk.sitkFloat32)
-    with _mute():
+    with muted():
         return sitk.GetArrayFromImage(reader.Execute())
 
 
 @contextmanager
-def _mute() -> Iterator[None]:
-    """Keep the C libraries of GDCM from writing to the terminal, which they do past every setting."""
+def muted() -> Iterator[None]:
+    """Keep the C libraries below ITK from writing to the terminal, which they do past every setting."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [(stream, os.dup(stream)) for stream in (1, 2)]

@@ -14,6 +14,7 @@ import SimpleITK as sitk  # noqa: N813
 from ..errors import ImageError, LabelError
 from .dicom import Series, describe_series, list_series, read_series
 from .dicom_labels import find_dicom_labels, read_dicom_labels
+from .dicom_pixels import muted
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
 from .labelcheck import cleaned
 from .labelfiles import (
@@ -158,8 +159,9 @@ def _read_image(path: Path) -> sitk.Image:
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     try:
-        reader.ReadImageInformation()
-        image = reader.Execute()
+        with muted():
+            reader.ReadImageInformation()
+            image = reader.Execute()
     except RuntimeError as error:
         raise _unreadable(path, str(error)) from None
     _check_stated_geometry(reader, path)
