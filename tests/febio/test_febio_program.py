@@ -164,6 +164,14 @@ def test_the_time_limit_ends_it_and_its_children(tmp_path):
     pytest.fail("the child lives on")
 
 
+def test_of_very_many_words_the_last_count(tmp_path):
+    body = f"sys.stdout.write('  version 4.11.0\\n' + 'x' * 7 * 10**7 + {NORMAL!r})"
+    run = run_febio(program(tmp_path, body), tmp_path, 0.0, "forces.txt")
+    assert run.verdict.version == "4.11.0"
+    assert run.verdict.kind == "no output"  # ended well, without a table
+    assert "ended well" in run.verdict.reason
+
+
 def test_threads_and_folder(tmp_path):
     body = "open('seen', 'w').write(os.environ['OMP_NUM_THREADS'] + os.getcwd() + ' '.join(sys.argv[1:]))"
     run_febio(program(tmp_path, body), tmp_path, 2.0, "forces.txt", threads=3)

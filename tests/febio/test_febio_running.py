@@ -131,6 +131,10 @@ def test_tables_are_not_written_over(tmp_path):
     assert (tmp_path / "cells.txt").read_text() == "FEBio's own"
     found = simulate_feb(file, tmp_path / "out", listener=lambda _: None)
     assert Path(found["fields"]).is_file()
+    file.write_text(CUBE.replace("nodes.txt", file.name))
+    with pytest.raises(InputError, match="is there already"):  # never over the input itself
+        simulate_feb(file, tmp_path, listener=lambda _: None)
+    assert file.read_text().startswith("<?xml")
 
 
 def test_command(tmp_path):

@@ -157,7 +157,7 @@ def test_another_reader_understands_it(tmp_path):
     pytest.importorskip("pyfebio")
     from pyfebio import control, loaddata, mesh, meshdomains, output
 
-    problem = block("tet10", "stl", divisions=2)
+    problem = block("tet10", "stl")
     file, tool = exported(problem, tmp_path)
     root = ET.parse(file).getroot()
     schemas = {

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 VARIABLE = "FEBIO_CMD"
 NAMES = ("febio4", "febio")
 INPUT, OUTPUT, LOG = "model.feb", "stdout.txt", "model.log"
-_MOST_MESSAGES = 64 * 2**20  # of FEBio's words that are read, bytes
+_MOST_MESSAGES = 32 * 2**20  # of FEBio's first and last words, bytes
 GET_IT = f"install FEBio 4 (https://febio.org/downloads); put febio4 on the path or set {VARIABLE} to it"
 
 
@@ -83,8 +83,7 @@ def run_febio(
     except OSError as error:
         raise RunError(f"{program}: {error.strerror or error}") from error
     seconds = time.perf_counter() - started
-    with words.open("rb") as said:
-        messages = said.read(_MOST_MESSAGES).decode("utf-8", "replace")
+    messages = _messages(words)
     verdict = judge(messages, code, end_s, timed_out=timed_out, limit_s=time_limit_s)
     try:
         log = read_log(folder / table)
@@ -93,6 +92,17 @@ def run_febio(
         if verdict.completed:
             verdict = replace(verdict, kind="no output", reason=f"FEBio ended well, but {error}")
     return FebioRun(verdict, log, seconds, folder)
+
+
+def _messages(file: Path) -> str:
+    """FEBio's words; of very many the first (its version) and the last (its end)."""
+    with file.open("rb") as said:
+        found = said.read(_MOST_MESSAGES)
+        left = file.stat().st_size - len(found)
+        if left > 0:
+            said.seek(-min(left, _MOST_MESSAGES), os.SEEK_END)
+            found += b"\n" + said.read()
+    return found.decode("utf-8", "replace")
 
 
 def _call(program: Path, folder: Path, stream: Any, threads: int, limit_s: float) -> tuple[int, bool]:

@@ -64,7 +64,8 @@ def run_feb(
         raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None
     assert control.times is not None
     for table in tables.files:
-        if keep and table.exists():
+        own = table.exists() and table.samefile(path)
+        if own or (keep and table.exists()):
             raise InputError("is there already", file=table, remedy="give another folder with --output")
     last = control.times[-1]
 
