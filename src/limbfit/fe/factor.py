@@ -200,8 +200,10 @@ class Factor:
             fresh = np.einsum("ij,ij->j", r, z)
             p = z + fresh / np.where(rz > 0.0, rz, 1.0) * p
             rz = fresh
-            if (rz < 0.0).any():  # multigrid of a matrix that is not positive definite need not be either
-                return Solution(x if x.any() else r, False, False)
+            if (rz < 0.0).any():
+                # Multigrid of a matrix that is not positive definite need not be either; a factor that is
+                # not has too few digits.
+                return Solution(x if x.any() else r, False, self.lasting)
             Ap = self.product(data, p)
             curvature = np.einsum("ij,ij->j", p, Ap)
             live = rz > 0.0
