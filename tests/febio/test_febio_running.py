@@ -13,7 +13,8 @@ from febfiles import written
 
 from limbfit import simulate_feb
 from limbfit.errors import InputError
-from limbfit.febio import read_log, run_feb
+from limbfit.fe import Indenter
+from limbfit.febio import FebSettings, axial_force, read_feb, read_log, run_feb, to_problem, write_feb
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 recorded = pytest.mark.skipif(
@@ -57,6 +58,20 @@ def test_punch(tmp_path, case):
     theirs = febio.column(strongest)
     ours = np.interp(febio.times, mine.times, mine.column(strongest))
     assert np.abs(ours - theirs).max() < 0.01 * np.abs(theirs).max()
+
+
+@recorded
+@pytest.mark.slow
+def test_written_anew(tmp_path):
+    """FEBio's input read, written with limbfit's own punch, steps and search, read and solved again."""
+    case = REFERENCE / "residuum" / "posterior_tet4"
+    problem = to_problem(read_feb(f"{case}.feb"), Indenter("square", 20.0, 2.0))
+    write_feb(problem, tmp_path / "anew.feb", FebSettings())
+    result = run_feb(tmp_path / "anew.feb", tmp_path / "out").result
+    log = read_log(f"{case}.txt")
+    force = axial_force(problem, log)
+    assert result.completed
+    assert np.abs(np.interp(log.times, result.times, result.force) - force).max() < 0.01 * force.max()
 
 
 CUBE = """<?xml version="1.0"?>
