@@ -42,12 +42,12 @@ def remesh(task: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def surface(task: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, triangles and references of the boundary with edges of the wanted size."""
     used, triangles = np.unique(task["triangles"], return_inverse=True)
-    triangles = triangles.reshape(-1, 3).astype(np.int32)
+    triangles = triangles.reshape(-1, 3)
     size = np.ascontiguousarray(task["size"][used][:, None])
     mesh = MmgMeshS()
     mesh.set_mesh_size(vertices=len(used), triangles=len(triangles))
     mesh.set_vertices(task["points"][used])
-    mesh.set_triangles(triangles, task["triangle_refs"].astype(np.int64))
+    mesh.set_triangles(triangles.astype(np.int32), task["triangle_refs"].astype(np.int64))
     mesh["metric"] = size
     mesh.remesh(
         hausd=float(task["hausdorff_mm"]),
@@ -56,8 +56,8 @@ def surface(task: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.nda
         hmax=float(size.max()),
         verbose=-1,
     )
-    triangles, refs = mesh.get_triangles_with_refs()
-    return mesh.get_vertices(), triangles.astype(np.int64), np.asarray(refs)
+    remeshed, refs = mesh.get_triangles_with_refs()
+    return mesh.get_vertices(), remeshed.astype(np.int64), np.asarray(refs)
 
 
 if __name__ == "__main__":

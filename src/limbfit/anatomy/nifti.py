@@ -28,7 +28,8 @@ def check_nifti(path: Path) -> None:
     ImageError
     """
     try:
-        with gzip.open(path, "rb") if path.name.lower().endswith(".gz") else path.open("rb") as stream:
+        opened = gzip.open if path.name.lower().endswith(".gz") else open
+        with opened(path, "rb") as stream:
             header = stream.read(_HEADER)
             length, bad = _voxels(stream, header)
         whole = length >= _length(header)
@@ -40,7 +41,7 @@ def check_nifti(path: Path) -> None:
         raise ImageError(f"{bad} voxels are not numbers", file=path, remedy="export the image again")
 
 
-def _voxels(stream: IO[bytes], header: bytes) -> tuple[int, int]:
+def _voxels(stream: IO[bytes] | gzip.GzipFile, header: bytes) -> tuple[int, int]:
     """Length of the file in bytes, and how many of its voxels are not numbers."""
     length, bad = len(header), 0
     kind = _FLOATS.get(struct.unpack(f"{_order(header)}h", header[70:72])[0])
