@@ -157,6 +157,8 @@ class GeometryTable(_Table):
 
     @model_validator(mode="after")
     def _layers(self) -> GeometryTable:
+        if "layers" in self.model_fields_set and not self.layers:
+            raise ValueError("layers is empty; a model has one layer of tissue or more over its core")
         if self.layers and "skin_layer_mm" in self.model_fields_set:
             raise ValueError("give either skin_layer_mm or layers")
         if not self.layers and "core" in self.model_fields_set:

@@ -85,7 +85,9 @@ def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
     spacing[axis] /= parts
     start[axis] = place[0]
     present = set(np.unique(labels.array).tolist()) - {0, labels.soft_value}
-    masks = {0: labels.limb} | {value: labels.array == value for value in sorted(present)}
+    bones = {labels.value(name) for name in labels.bone_names}
+    order = sorted(present, key=lambda value: (value in bones, value))  # where they overlap bone stays whole
+    masks = {0: labels.limb} | {value: labels.array == value for value in order}
     inside = {
         value: _interpolated(signed_distance_to(mask, labels), place, 2 - axis) > 0
         for value, mask in masks.items()
