@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 MOST_REFINEMENTS = 12
 MOST_MINRES, MOST_RESTARTS = 100, 8
 # With fewer unknowns a factor costs no more than multigrid; with more cycles than this it is given up.
-FEWEST_MULTIGRID, MOST_CYCLES = 30_000, 150
+FEWEST_MULTIGRID, MOST_CYCLES = 60_000, 150
 # Smallest shift of a tangent that is not positive definite, relative to each entry of its diagonal: tissues
 # differ in stiffness by up to a hundredfold, and a common shift would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 1e-2, 1e6
