@@ -1,20 +1,11 @@
-"""The study file: one ``study.toml`` beside its data, typed and checked, units in the names.
-
-Relative paths are relative to the study file and must stay inside its folder's reach; results go to
-``results/`` beside it. ``load_study`` is the only way in: it names the file, the key and the remedy when
-something is wrong.
-"""
+"""The tables of ``study.toml``: their keys, types, defaults and limits; units are in the names."""
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-
-from .anatomy.markups import read_markups
-from .errors import StudyError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -24,11 +15,13 @@ ParameterName = Literal["c_kPa", "m", "gamma", "tau_s"]
 TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
-class _Table(BaseModel):
+class Table(BaseModel):
+    """A frozen table without unknown keys or numbers that are not finite."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class TissueParameters(_Table):
+class TissueParameters(Table):
     """Parameters of one tissue: long-term shear modulus, exponent, relaxation amplitude and time."""
 
     c_kPa: Positive
@@ -37,14 +30,14 @@ class TissueParameters(_Table):
     tau_s: Positive
 
 
-class StudyTable(_Table):
+class StudyTable(Table):
     """What the study is called."""
 
     name: str
     description: str = ""
 
 
-class ImageTable(_Table):
+class ImageTable(Table):
     """The image: a DICOM folder, NIfTI, NRRD or MHA.
 
     ``markers`` is another one of the same limb with skin markers on, or ``"same"``: they are on in this one.
@@ -67,7 +60,7 @@ class ImageTable(_Table):
         return None if self.markers == "same" else self.markers
 
 
-class SegmentationTable(_Table):
+class SegmentationTable(Table):
     """``labels``: a label map (``.seg.nrrd``, image, DICOM-SEG, RTSTRUCT); it wins over the automatic one.
 
     ``contours`` is a file of contours that does so; ``seeds`` are points (LPS mm) in each bone to be found.
@@ -95,7 +88,7 @@ class SegmentationTable(_Table):
         return self.labels is not None or self.contours is not None
 
 
-class SurfacesTable(_Table):
+class SurfacesTable(Table):
     """Closed surfaces as the way in, instead of an image.
 
     ``coordinates`` is by default what the files say themselves, or LPS where they do not.
@@ -107,21 +100,21 @@ class SurfacesTable(_Table):
     unit: Literal["mm", "cm", "m", "inch"] = "mm"
 
 
-class MarkupsTable(_Table):
+class MarkupsTable(Table):
     """Control points of 3D Slicer (``.mrk.json``): ``position`` or ``near`` of the sites of their names."""
 
     file: Path
     gives: Literal["position", "near"] = "position"
 
 
-class Plane(_Table):
+class Plane(Table):
     """A plane by a point and the normal that points proximally."""
 
     point: Vector
     normal: Vector = (0.0, 0.0, 1.0)
 
 
-class Layer(_Table):
+class Layer(Table):
     """A layer of tissue under the skin's surface, of one thickness or as thick as the segmented fat says.
 
     With ``thickness = "map"`` its inner face is that of the image's fat, but at least ``min_thickness_mm``
@@ -142,7 +135,7 @@ class Layer(_Table):
         return self
 
 
-class GeometryTable(_Table):
+class GeometryTable(Table):
     """How surfaces become a model: one ``skin_layer_mm``, or ``layers`` (outermost first) over ``core``."""
 
     skin_layer_mm: Positive = 3.0
@@ -176,7 +169,7 @@ class GeometryTable(_Table):
         return self.layers or (Layer(name="skin", thickness_mm=self.skin_layer_mm),)
 
 
-class MeshTable(_Table):
+class MeshTable(Table):
     """The mesh of each site: element and edge lengths near the indenter and far from it."""
 
     element: Literal["tet4", "tet10"] = "tet10"
@@ -189,7 +182,7 @@ class MeshTable(_Table):
     time_limit_s: Positive = 600.0
 
 
-class IndenterTable(_Table):
+class IndenterTable(Table):
     """The rigid indenter; the paper's is a square of 20 mm.  ``file`` is the surface of shape ``stl``."""
 
     shape: Literal["square", "sphere", "cylinder", "stl"] = "square"
@@ -207,7 +200,7 @@ class IndenterTable(_Table):
         return self
 
 
-class TracesTable(_Table):
+class TracesTable(Table):
     """Column names of the records, where they differ from the defaults; units are in the names."""
 
     time_s: str = "time_s"
@@ -216,7 +209,7 @@ class TracesTable(_Table):
     smoothing: Annotated[float, Field(ge=0)] | None = None
 
 
-class Site(_Table):
+class Site(Table):
     """An indentation site.
 
     ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
@@ -246,7 +239,7 @@ class Site(_Table):
         return self
 
 
-class TissueRange(_Table):
+class TissueRange(Table):
     """Where one tissue's start or bounds differ from those of all; what is not named here stays."""
 
     start: dict[ParameterName, Positive] = {}
@@ -254,7 +247,7 @@ class TissueRange(_Table):
     upper: dict[ParameterName, Positive] = {}
 
 
-class MaterialTable(_Table):
+class MaterialTable(Table):
     """Start and bounds of the identification; the defaults are the paper's (section 2.3, table 1).
 
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
@@ -284,7 +277,7 @@ class MaterialTable(_Table):
         return self
 
 
-class CalibrationTable(_Table):
+class CalibrationTable(Table):
     """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals."""
 
     objective: Literal["pointwise", "paper"] = "pointwise"
@@ -292,7 +285,7 @@ class CalibrationTable(_Table):
     max_iterations: Annotated[int, Field(ge=1, le=200)] = 25
 
 
-class SolverTable(_Table):
+class SolverTable(Table):
     """Steps over loading and unloading before the solver adapts them.
 
     ``solver`` is what ``limbfit simulate`` runs; identification and prediction are always limbfit's own.
@@ -303,7 +296,7 @@ class SolverTable(_Table):
     unload_steps: Annotated[int, Field(ge=2, le=500)] = 8
 
 
-class FebioTable(_Table):
+class FebioTable(Table):
     """FEBio beside limbfit: where it is, what it may take; ``penalty`` is times its automatic one."""
 
     program: Path | None = None
@@ -312,203 +305,7 @@ class FebioTable(_Table):
     penalty: Positive = 3.0
 
 
-class ExecutionTable(_Table):
+class ExecutionTable(Table):
     """Workers that simulate side by side, one thread each; 0 means one per core."""
 
     workers: Annotated[int, Field(ge=0, le=1024)] = 0
-
-
-class Study(_Table):
-    """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
-
-    study: StudyTable
-    image: ImageTable | None = None
-    segmentation: SegmentationTable = SegmentationTable()
-    surfaces: SurfacesTable | None = None
-    geometry: GeometryTable = GeometryTable()
-    mesh: MeshTable = MeshTable()
-    indenter: IndenterTable = IndenterTable()
-    traces: TracesTable = TracesTable()
-    markups: MarkupsTable | None = None
-    sites: tuple[Site, ...]
-    material: MaterialTable = MaterialTable()
-    calibration: CalibrationTable = CalibrationTable()
-    solver: SolverTable = SolverTable()
-    febio: FebioTable = FebioTable()
-    execution: ExecutionTable = ExecutionTable()
-    file: Path = Field(default=Path("study.toml"), exclude=True)
-    notes: tuple[str, ...] = Field(default=(), exclude=True)
-
-    @property
-    def folder(self) -> Path:
-        return self.file.parent
-
-    @property
-    def results(self) -> Path:
-        return self.folder / "results"
-
-    @property
-    def fitted(self) -> tuple[Site, ...]:
-        return tuple(site for site in self.sites if site.fitted)
-
-    @property
-    def tissues(self) -> tuple[str, ...]:
-        """Names of the materials and of the mesh's regions: the layers, outermost first, and the core."""
-        return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
-
-    @property
-    def inputs(self) -> dict[str, Path]:
-        """Every file and folder that the study names, by its key."""
-        named: dict[str, Path | None] = {
-            "segmentation.labels": self.segmentation.labels,
-            "segmentation.contours": self.segmentation.contours,
-            "indenter.file": self.indenter.file,
-            **{f"sites.{site.name}.trace": site.trace for site in self.sites},
-        }
-        if self.image is not None:
-            named |= {"image.path": self.image.path, "image.markers": self.image.marked}
-        if self.surfaces is not None:
-            named["surfaces.skin"] = self.surfaces.skin
-            named |= {f"surfaces.bones.{name}": path for name, path in self.surfaces.bones.items()}
-        if self.markups is not None:
-            named["markups.file"] = self.markups.file
-        return {key: path for key, path in named.items() if path is not None}
-
-    def path(self, relative: Path) -> Path:
-        """A path of the study file as a path of this machine."""
-        return self.folder / relative
-
-    def site(self, name: str) -> Site:
-        for site in self.sites:
-            if site.name == name:
-                return site
-        raise StudyError(
-            f"no site is named {name!r}",
-            file=self.file,
-            place="sites",
-            remedy="the study has " + ", ".join(s.name for s in self.sites),
-        )
-
-    @field_validator("sites")
-    @classmethod
-    def _sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
-        names = [site.name for site in sites]
-        if not names:
-            raise ValueError("the study has no site")
-        doubled = sorted({name for name in names if names.count(name) > 1})
-        if doubled:
-            raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
-        return sites
-
-    @model_validator(mode="after")
-    def _materials_of_tissues(self) -> Study:
-        material, tissues = self.material, self.tissues
-        unknown = [tissue for tissue in material.tissues if tissue not in tissues]
-        if unknown:
-            known = ", ".join(tissues)
-            raise ValueError(
-                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
-            )
-        for name in PARAMETERS:
-            lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
-            upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
-            if not lower < upper:
-                raise ValueError(
-                    f"material: the tissues' bounds of {name} have no range in common, "
-                    "and the stage of one material needs one; widen them"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _one_door(self) -> Study:
-        if (self.image is None) == (self.surfaces is None):
-            raise ValueError("give either [image] or [surfaces]: geometry enters by one door")
-        if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
-            raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
-        if self.surfaces is not None or (self.image is not None and self.image.markers is None):
-            blind = [site.name for site in self.sites if site.position is None]
-            if blind:
-                raise ValueError(
-                    f"site {blind[0]}: 'near' needs image.markers; give 'position' where there are no markers"
-                )
-        return self
-
-
-def load_study(path: str | Path) -> Study:
-    """Read and check a study; ``path`` is the file or its folder.
-
-    Raises
-    ------
-    StudyError
-        With the file, the key and the remedy.
-    """
-    file = Path(path)
-    if file.is_dir():
-        file = file / "study.toml"
-    if not file.is_file():
-        raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StudyError(f"not valid TOML: {error}", file=file) from None
-    content = {key: value for key, value in content.items() if key not in ("file", "notes")}
-    notes = _place_by_markups(content, file)
-    try:
-        study = Study(**content, file=file, notes=notes)
-    except ValidationError as error:
-        raise _study_error(error, file) from None
-    _check_paths(study)
-    return study
-
-
-def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
-    """Give sites without a place that of the control point of their name; say which points are left over.
-
-    What is malformed is left for the check of the types to refuse.
-    """
-    table, sites = content.get("markups"), content.get("sites")
-    if not isinstance(table, dict) or not isinstance(table.get("file"), str) or not isinstance(sites, list):
-        return ()
-    source = file.parent / table["file"]
-    if not source.is_file():
-        raise StudyError(f"{table['file']} does not exist", file=file, place="markups.file")
-    points = read_markups(source)
-    for site in (site for site in sites if isinstance(site, dict)):
-        name = str(site.get("name"))
-        is_placed = "position" in site or "near" in site
-        if is_placed and name in points:
-            raise StudyError(
-                "the site has a place here and a control point in the markups file",
-                file=file,
-                place=f"sites.{name}",
-                remedy="leave one of them out",
-            )
-        if not is_placed and name not in points:
-            raise StudyError(
-                f"no control point of {table['file']} is labelled {name!r}",
-                file=file,
-                place=f"sites.{name}",
-                remedy="it has " + (", ".join(map(repr, points)) or "none"),
-            )
-        if not is_placed:
-            site[table.get("gives", "position")] = points[name].tolist()
-    unused = sorted(set(points) - {str(site.get("name")) for site in sites if isinstance(site, dict)})
-    return (f"control points without a site: {', '.join(unused)}",) if unused else ()
-
-
-def _study_error(error: ValidationError, file: Path) -> StudyError:
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"]) or None
-    more = len(error.errors()) - 1
-    what = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        what = "unknown key"
-    remedy = "see docs/study.md for the keys" if first["type"] == "extra_forbidden" else None
-    return StudyError(what + (f" (and {more} more)" if more else ""), file=file, place=place, remedy=remedy)
-
-
-def _check_paths(study: Study) -> None:
-    """Every input that the study names must exist before anything runs."""
-    for place, path in study.inputs.items():
-        if not study.path(path).exists():
-            raise StudyError(f"{path} does not exist", file=study.file, place=place)

@@ -1,0 +1,20 @@
+"""The study file: one ``study.toml`` beside its data, typed and checked, units in the names.
+
+Relative paths are relative to the study file and must stay inside its folder's reach; results go to
+``results/`` beside it.
+"""
+
+from .loading import load_study
+from .tables import PARAMETERS, IndenterTable, MaterialTable, Site, SolverTable, Vector
+from .whole import Study
+
+__all__ = [
+    "PARAMETERS",
+    "IndenterTable",
+    "MaterialTable",
+    "Site",
+    "SolverTable",
+    "Study",
+    "Vector",
+    "load_study",
+]

@@ -1,0 +1,93 @@
+"""Reading a study; what is wrong with it is told with file, key and remedy."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ..anatomy.markups import read_markups
+from ..errors import StudyError
+from .whole import Study
+
+
+def load_study(path: str | Path) -> Study:
+    """Read and check a study; ``path`` is the file or its folder.
+
+    Raises
+    ------
+    StudyError
+        With the file, the key and the remedy.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "study.toml"
+    if not file.is_file():
+        raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StudyError(f"not valid TOML: {error}", file=file) from None
+    content = {key: value for key, value in content.items() if key not in ("file", "notes")}
+    notes = _place_by_markups(content, file)
+    try:
+        study = Study(**content, file=file, notes=notes)
+    except ValidationError as error:
+        raise _study_error(error, file) from None
+    _check_paths(study)
+    return study
+
+
+def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
+    """Give sites without a place that of the control point of their name; say which points are left over.
+
+    What is malformed is left for the check of the types to refuse.
+    """
+    table, sites = content.get("markups"), content.get("sites")
+    if not isinstance(table, dict) or not isinstance(table.get("file"), str) or not isinstance(sites, list):
+        return ()
+    source = file.parent / table["file"]
+    if not source.is_file():
+        raise StudyError(f"{table['file']} does not exist", file=file, place="markups.file")
+    points = read_markups(source)
+    for site in (site for site in sites if isinstance(site, dict)):
+        name = str(site.get("name"))
+        is_placed = "position" in site or "near" in site
+        if is_placed and name in points:
+            raise StudyError(
+                "the site has a place here and a control point in the markups file",
+                file=file,
+                place=f"sites.{name}",
+                remedy="leave one of them out",
+            )
+        if not is_placed and name not in points:
+            raise StudyError(
+                f"no control point of {table['file']} is labelled {name!r}",
+                file=file,
+                place=f"sites.{name}",
+                remedy="it has " + (", ".join(map(repr, points)) or "none"),
+            )
+        if not is_placed:
+            site[table.get("gives", "position")] = points[name].tolist()
+    unused = sorted(set(points) - {str(site.get("name")) for site in sites if isinstance(site, dict)})
+    return (f"control points without a site: {', '.join(unused)}",) if unused else ()
+
+
+def _study_error(error: ValidationError, file: Path) -> StudyError:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"]) or None
+    more = len(error.errors()) - 1
+    what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        what = "unknown key"
+    remedy = "see docs/study.md for the keys" if first["type"] == "extra_forbidden" else None
+    return StudyError(what + (f" (and {more} more)" if more else ""), file=file, place=place, remedy=remedy)
+
+
+def _check_paths(study: Study) -> None:
+    """Every input that the study names must exist before anything runs."""
+    for place, path in study.inputs.items():
+        if not study.path(path).exists():
+            raise StudyError(f"{path} does not exist", file=study.file, place=place)

@@ -1,0 +1,144 @@
+"""A study as a whole: its tables, and what must hold between them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field, field_validator, model_validator
+
+from ..errors import StudyError
+from .tables import (
+    PARAMETERS,
+    CalibrationTable,
+    ExecutionTable,
+    FebioTable,
+    GeometryTable,
+    ImageTable,
+    IndenterTable,
+    MarkupsTable,
+    MaterialTable,
+    MeshTable,
+    SegmentationTable,
+    Site,
+    SolverTable,
+    StudyTable,
+    SurfacesTable,
+    Table,
+    TracesTable,
+)
+
+
+class Study(Table):
+    """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
+
+    study: StudyTable
+    image: ImageTable | None = None
+    segmentation: SegmentationTable = SegmentationTable()
+    surfaces: SurfacesTable | None = None
+    geometry: GeometryTable = GeometryTable()
+    mesh: MeshTable = MeshTable()
+    indenter: IndenterTable = IndenterTable()
+    traces: TracesTable = TracesTable()
+    markups: MarkupsTable | None = None
+    sites: tuple[Site, ...]
+    material: MaterialTable = MaterialTable()
+    calibration: CalibrationTable = CalibrationTable()
+    solver: SolverTable = SolverTable()
+    febio: FebioTable = FebioTable()
+    execution: ExecutionTable = ExecutionTable()
+    file: Path = Field(default=Path("study.toml"), exclude=True)
+    notes: tuple[str, ...] = Field(default=(), exclude=True)
+
+    @property
+    def folder(self) -> Path:
+        return self.file.parent
+
+    @property
+    def results(self) -> Path:
+        return self.folder / "results"
+
+    @property
+    def fitted(self) -> tuple[Site, ...]:
+        return tuple(site for site in self.sites if site.fitted)
+
+    @property
+    def tissues(self) -> tuple[str, ...]:
+        """Names of the materials and of the mesh's regions: the layers, outermost first, and the core."""
+        return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
+
+    @property
+    def inputs(self) -> dict[str, Path]:
+        """Every file and folder that the study names, by its key."""
+        named: dict[str, Path | None] = {
+            "segmentation.labels": self.segmentation.labels,
+            "segmentation.contours": self.segmentation.contours,
+            "indenter.file": self.indenter.file,
+            **{f"sites.{site.name}.trace": site.trace for site in self.sites},
+        }
+        if self.image is not None:
+            named |= {"image.path": self.image.path, "image.markers": self.image.marked}
+        if self.surfaces is not None:
+            named["surfaces.skin"] = self.surfaces.skin
+            named |= {f"surfaces.bones.{name}": path for name, path in self.surfaces.bones.items()}
+        if self.markups is not None:
+            named["markups.file"] = self.markups.file
+        return {key: path for key, path in named.items() if path is not None}
+
+    def path(self, relative: Path) -> Path:
+        """A path of the study file as a path of this machine."""
+        return self.folder / relative
+
+    def site(self, name: str) -> Site:
+        for site in self.sites:
+            if site.name == name:
+                return site
+        raise StudyError(
+            f"no site is named {name!r}",
+            file=self.file,
+            place="sites",
+            remedy="the study has " + ", ".join(s.name for s in self.sites),
+        )
+
+    @field_validator("sites")
+    @classmethod
+    def _sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
+        names = [site.name for site in sites]
+        if not names:
+            raise ValueError("the study has no site")
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
+        return sites
+
+    @model_validator(mode="after")
+    def _materials_of_tissues(self) -> Study:
+        material, tissues = self.material, self.tissues
+        unknown = [tissue for tissue in material.tissues if tissue not in tissues]
+        if unknown:
+            known = ", ".join(tissues)
+            raise ValueError(
+                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
+            )
+        for name in PARAMETERS:
+            lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
+            upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
+            if not lower < upper:
+                raise ValueError(
+                    f"material: the tissues' bounds of {name} have no range in common, "
+                    "and the stage of one material needs one; widen them"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _one_door(self) -> Study:
+        if (self.image is None) == (self.surfaces is None):
+            raise ValueError("give either [image] or [surfaces]: geometry enters by one door")
+        if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
+            raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
+        if self.surfaces is not None or (self.image is not None and self.image.markers is None):
+            blind = [site.name for site in self.sites if site.position is None]
+            if blind:
+                raise ValueError(
+                    f"site {blind[0]}: 'near' needs image.markers; give 'position' where there are no markers"
+                )
+        return self
