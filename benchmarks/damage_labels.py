@@ -158,7 +158,7 @@ def labels_with_fractions(random: Random, whole: Whole, folder: Path) -> Inputs:
 @kind("labels", "refused", "soft tissue")
 def bones_only(random: Random, whole: Whole, folder: Path) -> Inputs:
     array = editable(whole)
-    array[array == 1] = 0
+    array[~np.isin(array, [whole.labels.value(name) for name in whole.labels.bone_names])] = 0
     return written(random, whole, folder, whole.labels.with_array(array))
 
 
