@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
+from scipy.spatial import KDTree
 
 from ..errors import InputError
 from ..mesh import dihedral_angles
@@ -189,7 +190,8 @@ def _thicknesses(store: Store, skin: Any) -> list[tuple[Any, str]]:
     fat = store.folder / "surfaces" / "fat-depth.vtp"
     if fat.is_file():
         depth = pv.read(fat)
-        found.append((np.asarray(depth.point_data[depth.array_names[0]]), "depth of the fat (mm)"))
+        same = KDTree(depth.points).query(skin.points)[1]  # a surface from STL numbers its vertices anew
+        found.append((np.asarray(depth.point_data["fat_depth_mm"])[same], "depth of the fat (mm)"))
     return found
 
 
