@@ -63,3 +63,14 @@ def test_other_units_are_refused_until_they_are_stated(tmp_path, unit):
     surface = read_surface(tmp_path / "ball.stl", unit=unit)
     check_closed(surface, "skin")
     assert np.allclose(np.ptp(surface.points, axis=0), 100, atol=1)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp"])
+def test_a_file_cut_short_is_refused_and_takes_nothing_down(tmp_path, suffix, share):
+    file = write(tmp_path / f"skin{suffix}", None)
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(SurfaceError) as refused:
+        check_closed(read_surface(file), "skin", file)
+    assert str(file) in str(refused.value)

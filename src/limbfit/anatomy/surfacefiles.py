@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
+import meshio
 import numpy as np
 import pyvista as pv
+from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkObject
 
 from ..errors import SurfaceError
@@ -79,8 +81,8 @@ def _read_poly(path: Path) -> pv.PolyData:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            poly = pv.read(str(path))
-    except Exception:  # VTK readers raise many kinds; all mean the same to the user
+            poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
+    except Exception:  # readers raise many kinds; all mean the same to the user
         raise SurfaceError(
             "the surface cannot be read", file=path, remedy="export the surface again"
         ) from None
@@ -88,7 +90,17 @@ def _read_poly(path: Path) -> pv.PolyData:
         vtkObject.SetGlobalWarningDisplay(shown)
     if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
         raise SurfaceError("the file holds no triangles", file=path, remedy="export the surface again")
+    corners = vtk_to_numpy(poly.GetPolys().GetConnectivityArray())
+    if len(corners) and not 0 <= corners.min() <= corners.max() < poly.n_points:  # VTK would take any memory
+        raise SurfaceError("faces of points that are not there", file=path, remedy="export the surface again")
     return poly
+
+
+def _read_ply(path: Path) -> pv.PolyData:
+    """By meshio: VTK's reader takes the whole process down with it when the file is cut short."""
+    found = meshio.read(path, "ply")
+    faces = [np.insert(block.data, 0, block.data.shape[1], axis=1).ravel() for block in found.cells]
+    return pv.PolyData(found.points.astype(float), np.concatenate(faces))
 
 
 def _merged(surface: Surface) -> Surface:
