@@ -85,6 +85,7 @@ def _in_child(words: list[str], folder: Path) -> None:
     with (folder / "stderr.txt").open("w") as err, (folder / "stdout.txt").open("w") as out:
         os.dup2(err.fileno(), 2)
         os.dup2(out.fileno(), 1)
+        sys.stderr, sys.stdout = err, out
         limbfit()
 
 

@@ -122,12 +122,16 @@ def simulate_site(
         "warnings": list(result.warnings),
         "element": result.statistics["element"],
         "unknowns": result.statistics["unknowns"],
-        "curve": str(curve),
-        "fields": str(fields) if fields.is_file() and (by_febio or result.states) else None,
-        "animation": None if played is None else str(played),
     }
-    write_json(folder / f"{name}.json", summary)
-    return summary
+    files = {
+        "curve": curve,
+        "fields": fields if fields.is_file() and (by_febio or result.states) else None,
+        "animation": played,
+    }
+    # A path may tell who the patient is: what is stored names the files as they lie beside it.
+    beside = {kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()}
+    write_json(folder / f"{name}.json", summary | beside)
+    return summary | {kind: file and str(file) for kind, file in files.items()}
 
 
 def site_problem(found: Indentation) -> Problem:
