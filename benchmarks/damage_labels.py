@@ -65,10 +65,15 @@ def limb_islands(random: Random, whole: Whole, folder: Path) -> Inputs:
     return written(random, whole, folder, whole.labels.with_array(array))
 
 
+def soft_inside(array: np.ndarray) -> np.ndarray:
+    """Soft tissue (label 1) well away from the skin and from everything else."""
+    return np.asarray(binary_erosion(array > 0, iterations=3) & ~binary_dilation(array > 1, iterations=3))
+
+
 @kind("labels", "repaired", "made soft tissue")
 def bone_islands(random: Random, whole: Whole, folder: Path) -> Inputs:
     array = editable(whole)
-    inner = binary_erosion(array > 0, iterations=3) & ~binary_dilation(array > 1, iterations=3)
+    inner = soft_inside(array)
     for _ in range(random.integers(1, 4)):
         array[spot(random, inner, 1)] = random.choice([2, 3, 4, 5])
     return written(random, whole, folder, whole.labels.with_array(array))
@@ -77,7 +82,7 @@ def bone_islands(random: Random, whole: Whole, folder: Path) -> Inputs:
 @kind("labels", "repaired", "inside the limb")
 def limb_holes(random: Random, whole: Whole, folder: Path) -> Inputs:
     array = editable(whole)
-    inner = binary_erosion(array > 0, iterations=3) & ~binary_dilation(array > 1, iterations=3)
+    inner = soft_inside(array)
     for _ in range(random.integers(1, 6)):
         array[spot(random, inner, 1)] = 0
     return written(random, whole, folder, whole.labels.with_array(array))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -129,19 +129,32 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
         if not point or not np.all(np.isfinite(point)):
             raise LabelError("not a point of a contour", file=path, place=f"line {line}", remedy=_FORMAT)
         found[name][key].append(point)
-    masks = []
     for name, contours in found.items():
         short = [key for key, points in contours.items() if len(points) < 3]
         if short:
             raise LabelError(
                 "a contour of fewer than 3 points", file=path, place=f"{name}, slice {short[0][0]}"
             )
+    polygons = {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
+    return labels_of(polygons, like, path)
+
+
+def labels_of(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -> LabelMap:
+    """Contours, LPS mm, of each structure as a label map on the grid of ``like``; ``path`` is for the error.
+
+    Raises
+    ------
+    LabelError
+        With the file, and the structure that cannot be rasterised.
+    """
+    masks = []
+    for name, polygons in contours.items():
         try:
-            masks.append(rasterise([np.array(points) for points in contours.values()], like))
+            masks.append(rasterise(polygons, like))
         except LabelError as error:
             raise LabelError(error.what, file=path, place=name, remedy=error.remedy) from None
     try:
-        array, names = flatten(masks, list(found))
+        array, names = flatten(masks, list(contours))
     except LabelError as error:
         raise LabelError(error.what, file=path, remedy=error.remedy) from None
     return LabelMap(array, like.spacing, like.origin, like.direction, names)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydicom.dataset import FileDataset
 
 from ..errors import LabelError
-from .contours import rasterise
+from .contours import labels_of
 from .dicom_headers import quiet
 from .grid import LabelMap, Volume
-from .naming import flatten, plain_name
+from .naming import plain_name
 
 Array = NDArray[np.float64]
 
@@ -35,17 +35,7 @@ def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
             contours = _contours(pydicom.dcmread(path))
     except Exception:  # pydicom's texts quote values of tags
         raise LabelError("the structure set is damaged", file=path, remedy="export it again") from None
-    masks = []
-    for name, found in contours.items():
-        try:
-            masks.append(rasterise(found, like))
-        except LabelError as error:
-            raise LabelError(error.what, file=path, place=name, remedy=error.remedy) from None
-    try:
-        array, names = flatten(masks, list(contours))
-    except LabelError as error:
-        raise LabelError(error.what, file=path, remedy=error.remedy) from None
-    return LabelMap(array, like.spacing, like.origin, like.direction, names)
+    return labels_of(contours, like, path)
 
 
 def _contours(data: FileDataset) -> dict[str, list[Array]]:

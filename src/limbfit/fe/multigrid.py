@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..mesh import TET10_EDGES
 from .linear import Index, NotPositiveDefiniteError, linear_solver
-from .system import System, node_graph, upper_pattern
+from .system import System, node_graph, place_of, upper_pattern
 
 Array = NDArray[np.float64]
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.
@@ -114,22 +114,11 @@ def _ends(cells: NDArray, nodes: int) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _find(cols, start, stop, column):  # type: ignore[no-untyped-def]
-    while start < stop:
-        middle = (start + stop) // 2
-        if cols[middle] < column:
-            start = middle + 1
-        else:
-            stop = middle
-    return start
-
-
-@njit(cache=True)
 def _places(rows, columns, ptr, cols):  # type: ignore[no-untyped-def]
     out = np.empty(len(rows), dtype=np.int64)
     for e in range(len(rows)):
         i, j = rows[e] // 3, columns[e] // 3
-        out[e] = 9 * _find(cols, ptr[i], ptr[i + 1], j) + 3 * (rows[e] % 3) + columns[e] % 3
+        out[e] = 9 * place_of(cols, ptr[i], ptr[i + 1], j) + 3 * (rows[e] % 3) + columns[e] % 3
     return out
 
 
@@ -145,7 +134,7 @@ def _coarse_targets(ptr, cols, parents, coarse_ptr, coarse_cols):  # type: ignor
                     I, J = parents[i, a], parents[cols[p], b]
                     if I >= 0 and J >= 0:
                         low, high = min(I, J), max(I, J)
-                        at = _find(coarse_cols, coarse_ptr[low], coarse_ptr[low + 1], high)
+                        at = place_of(coarse_cols, coarse_ptr[low], coarse_ptr[low + 1], high)
                         out[p, a, b] = 3 * at + (_TURNED if I > J else _BOTH if I == J else 0)
     return out
 

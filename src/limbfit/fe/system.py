@@ -293,6 +293,18 @@ def upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
+def place_of(columns, left, right, column):  # type: ignore[no-untyped-def]
+    """Place of a column among the sorted ``columns[left:right]`` of a row."""
+    while left < right:
+        middle = (left + right) // 2
+        if columns[middle] < column:
+            left = middle + 1
+        else:
+            right = middle
+    return left
+
+
+@njit(cache=True)
 def _positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
     """Place of each upper-triangle entry (component-major rows) of each cell in the sparse data."""
     m, k = cells.shape
@@ -307,13 +319,6 @@ def _positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
                 low, high = min(row, column), max(row, column)
                 out[e, at] = -1
                 if low >= 0:
-                    left, right = indptr[low], indptr[low + 1]
-                    while left < right:
-                        middle = (left + right) // 2
-                        if indices[middle] < high:
-                            left = middle + 1
-                        else:
-                            right = middle
-                    out[e, at] = left
+                    out[e, at] = place_of(indices, indptr[low], indptr[low + 1], high)
                 at += 1
     return out
