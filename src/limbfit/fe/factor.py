@@ -116,11 +116,10 @@ class Factor:
 
         ``blocks (c, 3, 3)``: the contact springs that are in ``data``.
         """
-        if not self.ready and self.lasting:
-            self._choose_precision(data)
+        made = not self.ready and self.lasting and self._single_suffices(data)
         started = time.perf_counter()
         shift = 0.1 * self._shift if self._shift > FIRST_SHIFT else 0.0
-        while not self._factorised(data, shift):
+        while not made and not self._factorised(data, shift):
             shift = max(10.0 * shift, FIRST_SHIFT)
             if shift > LARGEST_SHIFT:
                 raise NotPositiveDefiniteError
@@ -141,15 +140,16 @@ class Factor:
             return False
         return True
 
-    def _choose_precision(self, data: Array) -> None:
-        """Single precision, unless the first tangent (of the body at rest) is too much for it."""
+    def _single_suffices(self, data: Array) -> bool:
+        """Factorise the first tangent (of the body at rest) in single precision, if that is enough."""
         if self._single and self._factorised(data, 0.0):
             self.columns.clear(None)
             self._costs = [0.0]
             b = data[self._diagonal][:, None]
             if self.solve(data, b, None, 1e-8, limit=MOST_REFINEMENTS).converged:
-                return
+                return True
         self._use(single=False)
+        return False
 
     def apply(self, b: Array) -> Array:
         """The factor's solution for ``b (n,)`` or ``(n, r)``."""

@@ -109,20 +109,7 @@ def simulate_site(
         displacement_mm=np.interp(times, model.knots_s, model.knots_mm),
         force_N=result.force_at(times),
     )
-    summary = {
-        "site": name,
-        "solver": result.statistics["linear_solver"] if by_febio else "limbfit",
-        "parameters": found.parameters,
-        "parameters_from": found.origin,
-        "peak_force_N": result.peak_force,
-        "depth_mm": max(model.knots_mm),
-        "penetration_mm": None if by_febio else float(result.penetration.max(initial=0.0)),
-        "completed": result.completed,
-        "reason": result.reason,
-        "warnings": list(result.warnings),
-        "element": result.statistics["element"],
-        "unknowns": result.statistics["unknowns"],
-    }
+    summary = _summary(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
     files = {
         "curve": curve,
         "fields": fields if fields.is_file() and (by_febio or result.states) else None,
@@ -132,6 +119,25 @@ def simulate_site(
     beside = {kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()}
     write_json(folder / f"{name}.json", summary | beside)
     return summary | {kind: file and str(file) for kind, file in files.items()}
+
+
+def _summary(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
+    """What is told of a simulation; FEBio says nothing of its penetration."""
+    own = solver == "limbfit"
+    return {
+        "site": found.site.name,
+        "solver": solver,
+        "parameters": found.parameters,
+        "parameters_from": found.origin,
+        "peak_force_N": result.peak_force,
+        "depth_mm": max(found.model.knots_mm),
+        "penetration_mm": float(result.penetration.max(initial=0.0)) if own else None,
+        "completed": result.completed,
+        "reason": result.reason,
+        "warnings": list(result.warnings),
+        "element": result.statistics["element"],
+        "unknowns": result.statistics["unknowns"],
+    }
 
 
 def site_problem(found: Indentation) -> Problem:
