@@ -12,7 +12,7 @@ from ..study import Study
 from .context import Listener, Progress
 from .geometry_stages import given_anatomy, place_site
 from .inputs import marked_image, study_image, study_labels
-from .model_stages import read_site_trace
+from .traces_stage import read_site_trace
 
 
 def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from ..febio import Contact, Log, Verdict, find_febio, mean_penalty, read_log, r
 from ..indentation import Parameters, steps_of
 from ..study import Study
 from .context import Listener
-from .model_stages import write_curves
 from .simulate import Indentation, prepare_site, run_febio_site, site_problem
 from .store import write_json
+from .traces_stage import write_curves
 
 Array = NDArray[np.float64]
 

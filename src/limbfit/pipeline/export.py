@@ -11,8 +11,8 @@ from ..febio import Range, in_indenter_frame, write_feb, write_inp, write_optimi
 from ..indentation import KPA, Parameters
 from ..study import Site, Study
 from .context import Listener
-from .model_stages import site_record
 from .simulate import Indentation, feb_settings, prepare_site, site_problem
+from .traces_stage import site_record
 
 FORMATS = ("feb", "febio-optimize", "inp", "calculix")
 _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}

@@ -11,13 +11,15 @@ from .. import __version__
 from ..errors import InputError
 from ..execution import make_executor
 from ..study import Study
+from .calibrate_stage import run_calibrate
 from .context import Context, Listener
 from .corrections import keep_corrections
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
-from .model_stages import run_calibrate, run_predict, run_traces
+from .predict_stage import run_predict
 from .provenance import code_digest, input_digests, input_files, machine, settings_record, versions
 from .report_stage import run_report
 from .store import Store, digest, file_digest, lock, write_json
+from .traces_stage import run_traces
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,11 @@ class Stage:
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
 _UNSEEN: dict[str, Any] = {"region": "", "trace": None, "axis": None, "edge": None}
-_MECHANICS = ("fe", "indentation", "identify", "mesh", "pipeline/model_stages", "pipeline/simulations")
+_IDENTIFY = ("calibration", "objective", "parameters", "prediction", "trust_region", "uncertainty")
+_MECHANICS = (
+    *("fe", "indentation", "mesh", "pipeline/simulations", "pipeline/traces_stage"),
+    *(f"identify/{name}" for name in _IDENTIFY),
+)
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation"), rooms=("anatomy",)),
     Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=("anatomy",)),
@@ -47,7 +53,7 @@ STAGES = (
         ("sites", "traces", "mesh"),
         ("material", "calibration", "solver", "indenter"),
         ("name", "fitted", "edge"),
-        _MECHANICS,
+        (*_MECHANICS, "pipeline/calibrate_stage"),
     ),
     Stage(
         "predict",
@@ -55,7 +61,7 @@ STAGES = (
         ("sites", "traces", "mesh", "calibrate"),
         (),
         ("name", "edge"),
-        (*_MECHANICS, "fields"),
+        (*_MECHANICS, "pipeline/predict_stage", "fields"),
     ),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region"), ("report", "pipeline")),
 )

@@ -16,10 +16,10 @@ from ..indentation import Parameters, SiteModel, build_problem, simulate_fields,
 from ..mesh import read_vtu
 from ..study import Site, Study
 from .context import Context, Listener
-from .model_stages import write_curves
 from .run import keys, run_study
 from .simulations import CURVE_POINTS, planned_model, recorded_model
 from .store import Store, write_json
+from .traces_stage import write_curves
 
 FEB_NAME, FORCES = "model.feb", "forces.txt"
 

@@ -1,0 +1,129 @@
+"""Forces at every recorded site from the identified parameters: the stage ``predict``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..identify.prediction import error_percent, prediction_sd, summarise
+from ..indentation import Parameters, Simulation, SiteModel, simulate_fields, to_parameters, to_vector
+from .context import Context
+from .simulations import SimulationCache
+from .store import write_json
+from .traces_stage import SiteRecord, site_record, write_curves
+
+Array = NDArray[np.float64]
+
+
+def run_predict(context: Context, folder: Path) -> dict[str, Any]:
+    """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
+    study = context.study
+    calibration = context.stored("calibrate", "calibration.json")
+    found = [to_vector(stage["parameters"], study.tissues) for stage in calibration["stages"]]
+    one, best = found[0], found[-1]
+    covariance = np.array(calibration["uncertainty"]["covariance_log"])
+    records = [site_record(context, site) for site in study.sites if site.trace is not None]
+    cache = SimulationCache(
+        folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
+    )
+    jobs = [record.job(best) for record in records]
+    # At the fitted sites the calibration has simulated the one-material optimum already, with sensitivities.
+    if len(found) > 1:
+        jobs += [record.job(one, sensitivities=record.site.fitted) for record in records]
+    simulations = []
+    for simulation in cache.run(jobs, context.executor):
+        simulations.append(simulation)
+        context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
+    ours, simple = simulations[: len(records)], simulations[len(records) :]
+    _write_fields(context, folder, records, best, len(jobs))
+    rows = []
+    for record, with_all, with_one in zip_longest(records, ours, simple):
+        _write_prediction(folder, record, with_all, with_one, best, covariance)
+        rows.append(_row(record, with_all, with_one))
+    write_json(folder / "predict.json", {"sites": rows, **_means(rows)})
+    return {}
+
+
+@dataclass(frozen=True)
+class FieldJob:
+    """Fields at the deepest point of a site, to be computed and stored by a worker."""
+
+    model: SiteModel
+    parameters: Parameters
+    file: Path
+
+
+def store_fields(job: FieldJob) -> str:
+    simulate_fields(job.model, job.parameters, job.file)
+    return job.model.name
+
+
+def _write_fields(
+    context: Context, folder: Path, records: Sequence[SiteRecord], vector: Array, before: int
+) -> None:
+    parameters = to_parameters(vector, context.study.tissues)
+    jobs = [FieldJob(record.model, parameters, folder / f"{record.site.name}.vtu") for record in records]
+    missing = [job for job in jobs if not job.file.is_file()]
+    names = [job.model.name for job in missing]
+    for i, name in enumerate(context.executor.map(store_fields, missing, keys=names)):
+        total = before + len(missing)
+        context.tell("predict", before + i + 1, total, f"fields of site {name}")
+
+
+def _write_prediction(
+    folder: Path, record: SiteRecord, ours: Simulation, one: Simulation | None, best: Array, covariance: Array
+) -> None:
+    assert ours.jacobian is not None
+    sd = prediction_sd(ours.jacobian, best, covariance)
+    write_curves(
+        folder / f"{record.site.name}.csv",
+        time_s=record.times_s,
+        displacement_mm=record.displacement_mm,
+        force_measured_N=record.force_N,
+        force_simulated_N=ours.force_N,
+        **({} if one is None else {"force_one_material_N": one.force_N}),
+        force_low_N=np.maximum(ours.force_N - 1.96 * sd, 0.0),
+        force_high_N=ours.force_N + 1.96 * sd,
+    )
+
+
+def _row(record: SiteRecord, ours: Simulation, one: Simulation | None) -> dict[str, Any]:
+    def error(simulation: Simulation | None) -> float | None:
+        if simulation is None or not simulation.completed:
+            return None
+        return error_percent(simulation.force_N, record.force_N)
+
+    return {
+        "site": record.site.name,
+        "region": record.site.region,
+        "fitted": record.site.fitted,
+        "peak_force_N": float(record.force_N.max()),
+        "error_percent": error(ours),
+        "error_one_material_percent": error(one),
+        "penetration_mm": ours.penetration_mm,
+        "completed": ours.completed,
+        "reason": ours.reason,
+        "warnings": list(ours.warnings),
+        "steps": ours.facts["steps"],
+        "element": ours.facts["element"],
+    }
+
+
+def _means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none."""
+    found: dict[str, Any] = {}
+    for kind, fitted in (("fitted", True), ("heldout", False)):
+        errors = [
+            r["error_percent"] for r in rows if r["fitted"] == fitted and r["error_percent"] is not None
+        ]
+        summary = asdict(summarise(errors))
+        for key in ("mean_percent", "sd_percent"):
+            name = f"{key.removesuffix('_percent')}_error_{kind}_percent"
+            found[name] = None if np.isnan(summary[key]) else summary[key]
+    return found

@@ -1,0 +1,110 @@
+"""Records to regularised curves (the stage ``traces``), and a site with its record for what stands on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import TraceError
+from ..indentation import SimulationJob, SiteModel
+from ..study import Site, Study
+from ..traces import Regularised, Trace, find_touch_down, read_trace, regularise
+from .context import Context
+from .simulations import CURVE_POINTS, recorded_model
+from .store import write_json
+
+Array = NDArray[np.float64]
+
+
+def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[str, Any]]:
+    """A site's record, its regularised curves and the facts that ``traces.json`` holds."""
+    assert site.trace is not None
+    table = study.traces
+    file = study.path(site.trace)
+    trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
+    try:
+        touch = find_touch_down(trace)
+        smooth = regularise(trace, touch, table.smoothing)
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+    facts = {
+        "touch_down_s": touch.time_s,
+        "touch_down_mm": touch.displacement_mm,
+        "touch_down_uncertainty_mm": touch.uncertainty_mm,
+        "peak_force_N": smooth.peak_force_N,
+        "depth_mm": smooth.depth_mm,
+        "noise_N": smooth.noise_N,
+        "speed_load_mm_s": smooth.speed_load_mm_s,
+        "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
+        "knots_s": smooth.knots_s.tolist(),
+        "knots_mm": smooth.knots_mm.tolist(),
+    }
+    return trace, smooth, facts
+
+
+def run_traces(context: Context, folder: Path) -> dict[str, Any]:
+    """Records to regularised curves, counted from touch-down."""
+    recorded = [site for site in context.study.sites if site.trace is not None]
+    facts = {}
+    for i, site in enumerate(recorded):
+        context.tell("traces", i, len(recorded), f"site {site.name}")
+        trace, smooth, facts[site.name] = read_site_trace(context.study, site)
+        write_curves(
+            folder / f"{site.name}-raw.csv",
+            time_s=trace.time_s,
+            displacement_mm=trace.displacement_mm,
+            force_N=trace.force_N,
+        )
+        even = smooth.resample(CURVE_POINTS)
+        write_curves(
+            folder / f"{site.name}.csv",
+            time_s=even.time_s,
+            displacement_mm=even.displacement_mm,
+            force_N=even.force_N,
+        )
+    write_json(folder / "traces.json", {"sites": facts})
+    return {}
+
+
+def write_curves(file: Path, **columns: Array) -> None:
+    """A CSV with named columns."""
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
+
+
+def read_curves(file: Path) -> dict[str, Array]:
+    """The columns of a CSV that ``write_curves`` made."""
+    names = file.read_text(encoding="utf-8").split("\n", 1)[0].split(",")
+    return dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1, unpack=True), strict=True))
+
+
+@dataclass(frozen=True)
+class SiteRecord:
+    """A site with its record: what a simulation needs, and the forces it is compared with."""
+
+    site: Site
+    tissues: tuple[str, ...]
+    model: SiteModel
+    times_s: Array
+    displacement_mm: Array
+    force_N: Array
+
+    def job(self, parameters: Array, sensitivities: bool = True) -> SimulationJob:
+        values, times = tuple(map(float, parameters)), tuple(map(float, self.times_s))
+        return SimulationJob(self.model, self.tissues, values, times, sensitivities)
+
+
+def site_record(context: Context, site: Site) -> SiteRecord:
+    curves = read_curves(context.store["traces"] / f"{site.name}.csv")
+    return SiteRecord(
+        site=site,
+        tissues=context.study.tissues,
+        model=recorded_model(context, site),
+        times_s=curves["time_s"],
+        displacement_mm=curves["displacement_mm"],
+        force_N=curves["force_N"],
+    )
