@@ -1,6 +1,7 @@
 """Identification: calibration, uncertainty and prediction on callables that are handed in."""
 
 from .calibration import Calibration, CalibrationSettings, Iterate, StageResult, State, calibrate
+from .emulator import Emulator
 from .objective import Measured, SiteResponse
 from .parameters import FIXED, Space, Unknowns, search_space, separate, shared, two_stages
 from .prediction import Summary, error_percent, prediction_sd, summarise
@@ -22,6 +23,7 @@ __all__ = [
     "Calibration",
     "CalibrationSettings",
     "Combination",
+    "Emulator",
     "Iterate",
     "Measured",
     "SiteNoise",
