@@ -14,6 +14,7 @@ Everything the command line does is one call away:
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
+``limbfit EXPERIMENT``    ``run_experiment(load_study(path), "regions", listener=print)``, and others
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
 ``limbfit bench``         ``bench_febio_parity(tell=print)``, ``bench_forward(..)``, ``bench_scaling(..)``
 ========================  =========================================================
@@ -43,6 +44,7 @@ _HOME = {
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",
     "run_demo": "pipeline",
+    "run_experiment": "pipeline",
     "run_study": "pipeline",
     "show_stage": "pipeline",
     "simulate_feb": "pipeline",

@@ -16,6 +16,7 @@ _HOME = {
     "make_phantom_study": "demo",
     "report_study": "run",
     "run_demo": "demo",
+    "run_experiment": "run",
     "run_study": "run",
     "show_stage": "show",
     "simulate_feb": "febfile",

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from .. import __version__
@@ -14,25 +11,14 @@ from ..study import Study
 from .calibrate_stage import run_calibrate
 from .context import Context, Listener
 from .corrections import keep_corrections
+from .experiments import do_experiment, experiment_key, experiment_rows, find_experiment, options_of
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
+from .keys import Keys, Stage
 from .predict_stage import run_predict
-from .provenance import code_digest, input_digests, input_files, machine, settings_record, versions
+from .provenance import input_digests, machine, settings_record, versions
 from .report_stage import run_report
-from .store import Store, digest, file_digest, lock, write_json
+from .store import Store, lock, write_json
 from .traces_stage import run_traces
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stage: what it stands on, the study tables it reads, the rooms whose code makes it."""
-
-    name: str
-    run: Callable[[Context, Path], dict[str, Any]]
-    needs: tuple[str, ...] = ()
-    tables: tuple[str, ...] = ()
-    site_keys: tuple[str, ...] = ()
-    rooms: tuple[str, ...] = ()
-
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
 _UNSEEN: dict[str, Any] = {"region": "", "trace": None, "axis": None, "edge": None}
@@ -77,32 +63,18 @@ def keys(study: Study) -> dict[str, str]:
     """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
 
     The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
-    change, come and go without it.
+    change, come and go without it. The report's covers the experiments that it shows.
     """
-    named = {path for paths in input_files(study).values() for path in paths}
-    digests = {path: file_digest(study.path(path)) for path in named}
-    calibrate = _keys(_seen_by_calibration(study), digests)["calibrate"]
-    return _keys(study, digests, {"calibrate": calibrate})
+    return _chain(Keys(study))
 
 
-def _keys(
-    study: Study, digests: Mapping[Path, str], known: Mapping[str, str] | None = None
-) -> dict[str, str]:
-    stated = study.model_dump(mode="json")
-    files = {
-        stage: {str(path): digests[path] for path in paths} for stage, paths in input_files(study).items()
-    }
-    found: dict[str, str] = {}
-    for stage in stages_of(study):
-        found[stage.name] = (known or {}).get(stage.name) or digest(
-            stage.name,
-            {table: stated[table] for table in stage.tables},
-            [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
-            files.get(stage.name),
-            code_digest(stage.rooms),
-            [found.get(below) for below in stage.needs],
-        )
-    return found
+def _chain(known: Keys) -> dict[str, str]:
+    study = known.study
+    stages = stages_of(study)
+    calibrate = known.of(stages, study=_seen_by_calibration(study))["calibrate"]
+    found = known.of(stages[:-1], {"calibrate": calibrate})
+    shown = [row["key"] for row in experiment_rows(study, known, found) if row["state"] == "done"]
+    return found | known.of(stages[-1:], found, options={"report": {"experiments": shown} if shown else {}})
 
 
 def _seen_by_calibration(study: Study) -> Study:
@@ -115,9 +87,12 @@ def _seen_by_calibration(study: Study) -> Study:
 
 
 def study_status(study: Study) -> list[dict[str, Any]]:
-    """State of every stage: done, begun, stale (made from other inputs, settings or code) or missing."""
-    store, wanted = Store(study.results), keys(study)
-    rows = []
+    """State of every stage: done, begun, stale (made from other inputs, settings or code) or missing.
+
+    Below the stages: the experiments that were begun or done.
+    """
+    store, known = Store(study.results), Keys(study)
+    wanted, rows = _chain(known), []
     for stage in stages_of(study):
         state = store.state(stage.name, wanted[stage.name])
         rows.append(
@@ -128,6 +103,10 @@ def study_status(study: Study) -> list[dict[str, Any]]:
                 "finished": state.finished,
             }
         )
+    columns = ("state", "seconds", "finished")
+    for row in experiment_rows(study, known, wanted):
+        if row["state"] != "missing":
+            rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}})
     return rows
 
 
@@ -168,6 +147,43 @@ def run_study(study: Study, *, until: str | None = None, listener: Listener) -> 
     return summary
 
 
+def run_experiment(study: Study, name: str, *, listener: Listener, **options: Any) -> dict[str, Any]:
+    """Do an experiment of a study, and before it every stage that it needs and that is not done.
+
+    Its results lie in ``results/<name>``; ``limbfit report`` shows them.
+
+    Parameters
+    ----------
+    study : a checked study.
+    name : of the experiment.
+    listener : is told of progress.
+    options : as the experiment takes them; left out: its defaults.
+
+    Returns
+    -------
+    dict
+        What ``results/<name>/<name>.json`` holds, and ``folder``, where that is.
+
+    Raises
+    ------
+    InputError
+        For an experiment or option that there is not, or an input that cannot be used.
+    RunError
+        When another run holds the study, or the disk is full.
+    """
+    experiment = find_experiment(name)
+    chosen = options_of(experiment, options)
+    last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
+    if last:
+        run_study(study, until=last[0], listener=listener)
+    store = Store(study.results)
+    with lock(study.results), make_executor(study.execution.workers) as executor:
+        known = Keys(study)
+        key = experiment_key(experiment, known, _chain(known), chosen)
+        found = do_experiment(Context(study, store, executor, listener), experiment, key, chosen)
+    return found | {"folder": str(store[name])}
+
+
 def _do(context: Context, name: str, key: str) -> None:
     stage = next(stage for stage in STAGES if stage.name == name)
     if name == "report":
@@ -180,7 +196,7 @@ def run_record(study: Study) -> dict[str, Any]:
     """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
     store = Store(study.results)
     stamps = {stage.name: store.stamp(stage.name) for stage in stages_of(study)}
-    inputs = input_digests(study)
+    inputs, known = input_digests(study), Keys(study)
     return {
         "limbfit": __version__,
         "study": study.study.model_dump(mode="json"),
@@ -192,6 +208,11 @@ def run_record(study: Study) -> dict[str, Any]:
             name: {"seconds": stamp["seconds"], "finished": stamp["finished"], "key": stamp["key"]}
             for name, stamp in stamps.items()
             if stamp
+        },
+        "experiments": {
+            row["experiment"]: {key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
+            for row in experiment_rows(study, known, _chain(known))
+            if row["state"] in ("done", "stale")
         },
     }
 

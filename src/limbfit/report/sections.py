@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from . import figures, pictures, tables
 from .comparison import comparison
+from .experiments import experiment_sections
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
 from .slices import slices_figure
 from .store import PARAMETERS, Json, Store
@@ -29,6 +30,8 @@ def make_page(store: Store) -> Page:
         prediction,
         parameters,
         convergence,
+    )
+    closing: tuple[Callable[[Store], Section], ...] = (
         simulated,
         comparison,
         solver,
@@ -47,7 +50,11 @@ def make_page(store: Store) -> Page:
         subtitle=str(study.get("description") or ""),
         key_numbers=key_numbers(store),
         summary=summary(store),
-        sections=tuple(make(store) for make in makers if not absent.get(make)),
+        sections=(
+            *(make(store) for make in makers),
+            *experiment_sections(store),
+            *(make(store) for make in closing if not absent.get(make)),
+        ),
         footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
     )
 

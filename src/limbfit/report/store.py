@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,10 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Store:
-    """A results folder; every dictionary is empty where its file is not there (yet)."""
+    """A results folder; every dictionary is empty where its file is not there (yet).
+
+    ``experiments``: what each finished experiment stored, by its name; ``outdated``: those that are stale.
+    """
 
     folder: Path
     run: Json
@@ -34,6 +37,8 @@ class Store:
     simulated: tuple[Json, ...]
     compared: tuple[Json, ...]
     truth: Json
+    experiments: dict[str, Json] = field(default_factory=dict)
+    outdated: tuple[str, ...] = ()
 
     @property
     def site_names(self) -> tuple[str, ...]:
@@ -97,9 +102,12 @@ def load_store(results: Path) -> Store:
     if not results.is_dir():
         raise InputError("no results there", file=results, remedy="run the study first")
     sites = _read_json(results / "sites" / "sites.json").get("sites", [])
+    run = _read_json(results / "run.json")
+    states = {name: row.get("state") for name, row in (run.get("experiments") or {}).items()}
+    done = [name for name, state in states.items() if state == "done"]
     return Store(
         folder=results,
-        run=_read_json(results / "run.json"),
+        run=run,
         segment=_read_json(results / "segment" / "segment.json"),
         surfaces=_read_json(results / "surfaces" / "surfaces.json"),
         sites=tuple(sites),
@@ -110,6 +118,8 @@ def load_store(results: Path) -> Store:
         simulated=tuple(_read_json(file) for file in sorted((results / "simulate").glob("*.json"))),
         compared=tuple(_read_json(file) for file in sorted((results / "compare").glob("*.json"))),
         truth=_read_json(results / "truth.json"),
+        experiments={name: _read_json(results / name / f"{name}.json") for name in done},
+        outdated=tuple(name for name, state in states.items() if state == "stale"),
     )
 
 

@@ -1,0 +1,109 @@
+"""Experiments: what a study can be asked beyond the chain of stages, for more simulations.
+
+An experiment is stored like a stage, in ``results/<name>`` under a key of all that decides it, and is stale
+when any of it has changed. It writes ``<name>.json``, which its command prints and its section of the report
+reads, and CSV tables beside it. ``experiment_cache`` keeps its simulations, and finds those of the stages and
+of other experiments, so that a killed one goes on and nothing is simulated twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..study import Study
+from .context import Context
+from .keys import Keys, Stage
+from .simulations import SimulationCache
+from .store import Store, read_json
+
+MECHANICS = ("fe", "indentation", "mesh", "pipeline/simulations")  # rooms of every experiment that simulates
+
+
+@dataclass(frozen=True)
+class Experiment(Stage):
+    """A stage of its own, outside the chain: ``run(context, folder, **options)`` writes ``<name>.json``.
+
+    ``needs`` names stages of the chain; ``options`` are what it can be run with and their defaults, in plain
+    JSON. ``run`` returns facts for its stamp.
+    """
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+EXPERIMENTS: tuple[Experiment, ...] = ()
+
+
+def find_experiment(name: str) -> Experiment:
+    """The experiment of that name.
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    for experiment in EXPERIMENTS:
+        if experiment.name == name:
+            return experiment
+    known = ", ".join(experiment.name for experiment in EXPERIMENTS)
+    raise InputError(f"no experiment is named {name!r}", remedy=f"experiments are {known}")
+
+
+def options_of(experiment: Experiment, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The given options over the defaults."""
+    unknown = ", ".join(sorted(set(given) - set(experiment.options)))
+    if unknown:
+        raise InputError(f"{experiment.name} has no option {unknown}")
+    return {**experiment.options, **given}
+
+
+def experiment_key(
+    experiment: Experiment, keys: Keys, stages: Mapping[str, str], options: Mapping[str, Any]
+) -> str:
+    """The key of an experiment with its options; ``stages`` are the keys of the chain."""
+    return keys.of([experiment], stages, options={experiment.name: options})[experiment.name]
+
+
+def experiment_rows(study: Study, keys: Keys, stages: Mapping[str, str]) -> list[dict[str, Any]]:
+    """State of every experiment, as of a stage, each judged with the options that it was run with."""
+    store, rows = Store(study.results), []
+    for experiment in EXPERIMENTS:
+        stamp = store.stamp(experiment.name) or {}
+        options = {**experiment.options, **stamp.get("options", {})}
+        key = experiment_key(experiment, keys, stages, options)
+        state = store.state(experiment.name, key)
+        rows.append(
+            {
+                "experiment": experiment.name,
+                "state": state.state,
+                "seconds": state.seconds,
+                "finished": state.finished,
+                "options": options,
+                "key": key,
+            }
+        )
+    return rows
+
+
+def do_experiment(context: Context, experiment: Experiment, key: str, options: Mapping[str, Any]) -> Any:
+    """Run an experiment where its result is not there yet; what its ``<name>.json`` holds."""
+    store, name = context.store, experiment.name
+    if store.state(name, key).state == "done":
+        context.tell(name, 1, 1, "is up to date")
+    else:
+
+        def produce(folder: Path) -> dict[str, Any]:
+            return {**experiment.run(context, folder, **options), "options": dict(options)}
+
+        stamp = store.make(name, key, produce)
+        context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
+    return read_json(store[name] / f"{name}.json")
+
+
+def experiment_cache(context: Context, folder: Path) -> SimulationCache:
+    """Simulations of the experiment in ``folder``; all others of the study count as done."""
+    others = sorted(place for place in context.store.folder.glob("*/runs") if place.parent != folder)
+    return SimulationCache(folder / "runs", also=others)

@@ -1,0 +1,118 @@
+"""Experiments are stored like stages: done once, resumed, stale when what decides them changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from limbfit import run_experiment
+from limbfit.errors import InputError
+from limbfit.pipeline import Progress, experiments, study_status
+from limbfit.pipeline.experiments import EXPERIMENTS, Experiment
+from limbfit.pipeline.run import keys
+from limbfit.pipeline.store import write_json
+from limbfit.study import load_study
+
+
+def quiet(event: Progress) -> None:
+    """A listener that does nothing."""
+
+
+class StoppedError(Exception):
+    """Stands for a kill: nothing in limbfit catches it."""
+
+
+def run_peaks(context, folder, *, factor: float = 1.0):
+    """The largest forces of the records times a factor; halfway it can be stopped."""
+    seen = folder / "seen.txt"
+    if not seen.is_file():
+        seen.write_text("begun")
+        context.tell("peaks", 1, 2, "halfway")
+    sites = context.stored("traces", "traces.json")["sites"]
+    peaks = {name: factor * facts["peak_force_N"] for name, facts in sites.items()}
+    write_json(folder / "peaks.json", {"peaks_N": peaks})
+    return {}
+
+
+PEAKS = Experiment(
+    "peaks", run_peaks, needs=("traces",), tables=("material",), rooms=("errors",), options={"factor": 1.0}
+)
+
+
+@pytest.fixture(autouse=True)
+def peaks(monkeypatch):
+    monkeypatch.setattr(experiments, "EXPERIMENTS", (PEAKS,))
+
+
+def state(study, name: str = "peaks") -> str:
+    rows = {row["stage"]: row["state"] for row in study_status(load_study(study))}
+    return rows.get(name, "missing")
+
+
+def change(study, old: str, new: str) -> None:
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace(old, new))
+
+
+def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
+    assert state(study) == "missing"
+    found = run_experiment(load_study(study), "peaks", listener=quiet)
+    assert found["peaks_N"]["1"] == pytest.approx(6.0, abs=0.2)
+    assert state(study) == "done"
+    assert state(study, "traces") == "done"
+    told = []
+    run_experiment(load_study(study), "peaks", listener=told.append)
+    assert [event.text for event in told if event.stage == "peaks"] == ["is up to date"]
+
+
+def test_a_stopped_experiment_goes_on_in_its_own_folder(study):
+    def stop(event: Progress) -> None:
+        if event.text == "halfway":
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        run_experiment(load_study(study), "peaks", listener=stop)
+    assert state(study) == "begun"
+    run_experiment(load_study(study), "peaks", listener=stop)  # what it had begun is there: no second half
+    assert state(study) == "done"
+
+
+def test_options_settings_and_records_decide_an_experiment(study):
+    once = run_experiment(load_study(study), "peaks", listener=quiet)
+    twice = run_experiment(load_study(study), "peaks", factor=2.0, listener=quiet)
+    assert twice["peaks_N"]["1"] == pytest.approx(2 * once["peaks_N"]["1"])
+    assert state(study) == "done"  # judged with the options that it was run with
+    change(study, "[surfaces]", "[material]\nkappa_ratio = 50\n[surfaces]")
+    assert state(study) == "stale"
+    run_experiment(load_study(study), "peaks", listener=quiet)
+    change(study, 'trace = "2.csv"', 'trace = "1.csv"')
+    assert state(study) == "stale"
+
+
+def test_the_report_is_stale_once_there_is_an_experiment_to_show(study):
+    before = keys(load_study(study))
+    run_experiment(load_study(study), "peaks", listener=quiet)
+    after = keys(load_study(study))
+    assert after.pop("report") != before.pop("report")
+    assert after == before
+
+
+def test_an_experiment_changes_when_its_code_does(study, monkeypatch):
+    run_experiment(load_study(study), "peaks", listener=quiet)
+    monkeypatch.setattr(experiments, "EXPERIMENTS", (replace(PEAKS, rooms=("errors", "mesh")),))
+    assert state(study) == "stale"
+
+
+def test_what_there_is_not_is_refused(study):
+    with pytest.raises(InputError, match="no experiment is named 'nothing'"):
+        run_experiment(load_study(study), "nothing", listener=quiet)
+    with pytest.raises(InputError, match="peaks has no option colour"):
+        run_experiment(load_study(study), "peaks", colour="red", listener=quiet)
+
+
+def test_names_are_folders_that_do_not_shadow_each_other():
+    """Unfinished work lies in .work-<name>-<key>: no name may begin with another one and a dash."""
+    names = [experiment.name for experiment in EXPERIMENTS]
+    assert len(set(names)) == len(names)
+    assert not [(a, b) for a in names for b in names if b.startswith(f"{a}-")]
