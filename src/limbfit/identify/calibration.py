@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CalibrationError
+from ..errors import CalibrationError, ProblemError
 from .objective import Measured, Objective, Simulate, SiteResponse, check_responses, residuals
 from .parameters import Grouping, Space, Unknowns, search_space, two_stages
 from .prediction import error_percent
@@ -37,13 +37,16 @@ class CalibrationSettings:
     ``stopping="paper"`` ends where no parameter or no objective entry changed by more than 0.01, absolute
     (section 2.3); ``relative_tolerance`` is a relative change of parameters (see ``trust_region.minimise``),
     and the fall of the squared error per step below which a stage ends after four such steps.
-    ``max_iterations`` counts accepted steps, per stage.
+    ``max_iterations`` counts accepted steps, per stage.  ``force_error_percent`` sets forces against priors:
+    a prior that is one standard deviation off costs as much as the force of one site that is off by this, in
+    percent of its largest, throughout.
     """
 
     objective: Objective = "pointwise"
     relative_tolerance: float = 1e-3
     max_iterations: int = 25
     stopping: Literal["relative", "paper"] = "relative"
+    force_error_percent: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -187,13 +190,36 @@ def calibrate(
     ------
     CalibrationError
         Where no first simulation completes.
+    ProblemError
+        For priors beside the paper's objective.
     """
     groupings = tuple(stages) or two_stages(unknowns.names)
+    if unknowns.priors and settings is not None and settings.objective == "paper":
+        raise ProblemError("the paper's objective has no place for priors", remedy="use pointwise")
     run = _Run(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)
     for current in run.states(state):
         if on_iterate:
             on_iterate(current)
     return run.result(current)
+
+
+def iterate_at(
+    simulate: Simulate,
+    measured: Sequence[Measured],
+    unknowns: Unknowns,
+    settings: CalibrationSettings,
+    groupings: Sequence[Grouping],
+    state: State,
+) -> Iterate:
+    """The iterate that a state stands at as ``simulate`` sees it now; it is not counted as an evaluation.
+
+    Raises
+    ------
+    CalibrationError
+        Where it cannot be simulated.
+    """
+    run = _Run(simulate, tuple(measured), unknowns, settings, tuple(groupings))
+    return run.iterate(state.stage, run.again(state))
 
 
 class _Run:
@@ -229,7 +255,11 @@ class _Run:
                 return None
             self._responses[parameters.tobytes()] = responses
         residual, jacobian = residuals(self.settings.objective, responses, self.measured)
-        return Point(z, residual, space.pull_back(jacobian, parameters))
+        rows, target = self.unknowns.prior_rows()
+        scale = self.settings.force_error_percent / 100
+        known = scale * (rows @ space.logarithms(z) - target)
+        jacobian = np.concatenate([space.pull_back(jacobian, parameters), scale * rows @ space.tie])
+        return Point(z, np.concatenate([residual, known]), jacobian)
 
     def responses(self, parameters: Array) -> tuple[SiteResponse, ...]:
         return self._responses[parameters.tobytes()]
@@ -259,7 +289,7 @@ class _Run:
 
     def states(self, state: State | None) -> Iterator[State]:
         """The first or resumed state, then one for every accepted step, finished stage and new stage."""
-        state, point = self.first() if state is None else (state, self._again(state))
+        state, point = self.first() if state is None else (state, self.again(state))
         yield state
         while True:
             space = self.space(state.stage)
@@ -274,7 +304,7 @@ class _Run:
             state, point = self._next_stage(state, space.logarithms(point.z))
             yield state
 
-    def _again(self, state: State) -> Point:
+    def again(self, state: State) -> Point:
         """The point at which a run was interrupted; its evaluation was counted then."""
         space = self.space(state.stage)
         for _ in range(_TRIES):
@@ -286,15 +316,16 @@ class _Run:
 
     def _steps(self, space: Space, point: Point, state: State) -> Iterator[Step]:
         done = sum(1 for iterate in state.history if iterate.stage == state.stage) - 1
+        paper = self.settings.stopping == "paper"
         return minimise(
             lambda z: self.evaluate(space, z),
             point,
             space.lower,
             space.upper,
-            tolerance=self.settings.relative_tolerance,
+            tolerance=1e-9 if paper else self.settings.relative_tolerance,
             radius=state.radius,
             max_iterations=max(self.settings.max_iterations - done, 1),
-            stop=self._paper_rule(space) if self.settings.stopping == "paper" else self._valley_rule(state),
+            stop=self._paper_rule(space) if paper else self._valley_rule(state),
         )
 
     def _after(self, state: State, step: Step) -> State:
@@ -360,11 +391,15 @@ class _Run:
         def stop(before: Point, after: Point) -> str:
             if np.abs(space.expand(after.z) - space.expand(before.z)).max() < _PAPER_CHANGE:
                 return "no parameter changed by more than 0.01"
-            if np.abs(after.residual - before.residual).max() < _PAPER_CHANGE:
+            if np.abs(self._equation_8(space, after) - self._equation_8(space, before)).max() < _PAPER_CHANGE:
                 return "no entry of the objective changed by more than 0.01"
             return ""
 
         return stop
+
+    def _equation_8(self, space: Space, point: Point) -> Array:
+        """The paper's objective (sites,) N^2, whatever the objective that is followed."""
+        return residuals("paper", self.responses(space.expand(point.z)), self.measured)[0]
 
     def result(self, state: State) -> Calibration:
         parameters = np.array(state.history[-1].parameters)

@@ -7,7 +7,7 @@ full vector of positive parameters. Steps in ``z`` are relative changes, so kPa 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,20 +41,83 @@ def two_stages(names: Sequence[str]) -> tuple[Grouping, ...]:
     return (first,) if first == second else (first, second)
 
 
+def constrained(
+    grouping: Sequence[int],
+    names: Sequence[str],
+    fixed: Sequence[str] = (),
+    tied: Sequence[Sequence[str]] = (),
+) -> Grouping:
+    """``grouping`` with the parameters of each set of ``tied`` in one group, and those of ``fixed`` in none.
+
+    Raises
+    ------
+    ProblemError
+        For an unknown name, a tie of unlike parameters, or one that is fixed too.
+    """
+    for name in (*fixed, *(name for group in tied for name in group)):
+        if name not in names:
+            raise ProblemError(f"no parameter is named {name!r}", remedy=f"use {', '.join(names)}")
+    found = list(grouping)
+    for group in tied:
+        if len(group) < 2 or len({name.rpartition(".")[2] for name in group}) > 1:
+            what = f"{', '.join(group)} cannot be tied"
+            raise ProblemError(what, remedy="tie two or more of a kind, such as skin.tau_s and muscle.tau_s")
+        if set(group) & set(fixed):
+            raise ProblemError(f"{', '.join(group)}: tied and fixed", remedy="fix all of them, or none")
+        members = {found[names.index(name)] for name in group}
+        found = [min(members) if number in members else number for number in found]
+    return tuple(FIXED if name in fixed else number for name, number in zip(names, found, strict=True))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of a parameter beforehand: lognormal, its logarithm's standard deviation ln(factor)."""
+
+    name: str
+    median: float
+    factor: float
+
+    def __post_init__(self) -> None:
+        if not (self.median > 0 and self.factor > 1):
+            what = f"a prior needs median > 0 and factor > 1, has {self.median:g}, {self.factor:g}"
+            raise ProblemError(what, place=self.name)
+
+
 @dataclass(frozen=True)
 class Unknowns:
-    """The full parameter vector: ``names``, ``start``, ``lower`` and ``upper``, each (p,), all positive."""
+    """The full parameter vector: ``names``, ``start``, ``lower`` and ``upper``, each (p,), all positive.
+
+    ``priors`` of some of them count beside the forces.
+    """
 
     names: tuple[str, ...]
     start: Array
     lower: Array
     upper: Array
+    priors: tuple[Prior, ...] = ()
 
     def __post_init__(self) -> None:
+        for prior in self.priors:
+            if prior.name not in self.names:
+                remedy = f"use {', '.join(self.names)}"
+                raise ProblemError(f"a prior of {prior.name!r}, which is no parameter", remedy=remedy)
         for name, low, start, high in zip(self.names, self.lower, self.start, self.upper, strict=True):
             if not 0 < low <= start <= high or low == high:
                 what = f"needs 0 < lower <= start <= upper, has {low:g}, {start:g}, {high:g}"
                 raise ProblemError(what, place=name, remedy="give positive bounds around the start")
+
+    def from_start(self, start: Array) -> Unknowns:
+        """The same, started elsewhere."""
+        return replace(self, start=np.clip(start, self.lower, self.upper))
+
+    def prior_rows(self) -> tuple[Array, Array]:
+        """``(A, b)``: ``A @ log(parameters) - b`` is how many standard deviations off each prior is."""
+        rows = np.zeros((len(self.priors), len(self.names)))
+        target = np.zeros(len(self.priors))
+        for i, prior in enumerate(self.priors):
+            rows[i, self.names.index(prior.name)] = 1 / np.log(prior.factor)
+            target[i] = np.log(prior.median) / np.log(prior.factor)
+        return rows, target
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,15 @@ from scipy.optimize import lsq_linear
 Array = NDArray[np.float64]
 
 FIRST_RADIUS = 1.0
+AT_THE_FLOOR = "the error falls by no more than the simulations can tell"
 _LARGEST_RADIUS = 2.0
 _MAX_REJECTED = 8
 # Directions that the data hardly see are not followed: relative to the residual, in units of z.
 _DAMPING = 1e-2
+# Less than this share of the squared error cannot be relied on: simulations are not smooth to the last digit.
+_FLOOR = 1e-2
+# The same of three ever shorter steps in a row, however much each promised: what is smooth is not refused so.
+_ROUGH, _MAX_REFUSED = 0.1, 3
 _EXACT = 1e-9  # a residual this small (relative force) is a perfect fit
 
 
@@ -70,31 +75,40 @@ def minimise(
     ----------
     evaluate : the point at z, or None where it cannot be evaluated.
     tolerance : ends where a full Gauss-Newton step would change no entry of z by more than this, or would
-    lower
-        the cost by less than a tenth of this fraction.
+        lower the cost by less than this fraction. It also ends at the noise floor: where a step that promises
+        less than a hundredth of the cost is refused, or lowers it by less than this fraction; and where
+        three in a row are, each shorter than the one before, that promise less than a tenth.
     radius : half the width of the trust region, in z.
     stop : a further rule: from the last two points to a reason, empty to go on.
     """
-    rejected = accepted = 0
+    rejected = refused = accepted = 0
     while True:
         reason = _converged(point, lower, upper, tolerance)
         if reason:
             yield Step(point, radius, reason, converged=True)
             return
         step = _bounded_step(point, np.maximum(lower - point.z, -radius), np.minimum(upper - point.z, radius))
+        hopeless = _predicted(point, step) < _FLOOR * point.cost and not np.any(np.abs(step) > 0.99 * radius)
         trial = evaluate(np.clip(point.z + step, lower, upper))
         gain = _gain(point, trial, step)
         length = float(np.abs(step).max())
         radius = _next_radius(radius, length, gain)
         if trial is None or gain <= 1e-4:
+            refused = refused + 1 if trial is not None else 0
+            rough = refused >= _MAX_REFUSED and _predicted(point, step) < _ROUGH * point.cost
+            if trial is not None and (hopeless or rough):
+                yield Step(point, radius, AT_THE_FLOOR, converged=True)
+                return
             rejected += 1
             if rejected >= _MAX_REJECTED or radius < 1e-3 * tolerance:
                 why = "the simulations fail" if trial is None else "no smaller step lowers the error"
                 yield Step(point, radius, f"stuck: {why} around this point")
                 return
             continue
-        previous, point, rejected, accepted = point, trial, 0, accepted + 1
+        previous, point, rejected, refused, accepted = point, trial, 0, 0, accepted + 1
         reason = stop(previous, point) if stop else ""
+        if hopeless and previous.cost - point.cost < tolerance * previous.cost:
+            reason = reason or AT_THE_FLOOR
         if reason or accepted >= max_iterations:
             yield Step(point, radius, reason or "the limit of iterations is reached", bool(reason))
             return
@@ -137,6 +151,6 @@ def _converged(point: Point, lower: Array, upper: Array, tolerance: float) -> st
     step = _bounded_step(point, lower - point.z, upper - point.z)
     if np.abs(step).max() < tolerance:
         return f"no parameter would change by more than {tolerance:g} of itself"
-    if _predicted(point, step) < 0.1 * tolerance * point.cost:
-        return f"the squared error would fall by less than {0.1 * tolerance:g} of itself"
+    if _predicted(point, step) < tolerance * point.cost:
+        return f"the squared error would fall by less than {tolerance:g} of itself"
     return ""

@@ -1,0 +1,285 @@
+"""Coarse to fine: calibrate on cheap simulations whose forces are corrected by a few dear ones.
+
+``F(p) = F_fine(a) + s (F_coarse(p) - F_coarse(a))`` per site, with the anchor ``a`` and the scalar ``s`` that
+takes the coarse curve there to the fine one in least squares: exact in value at the anchor, scaled in slope
+(space mapping with a zero-order output map: Bandler 2004; the scaled slope is that of manifold mapping with
+one singular direction: Echeverria and Hemker 2005). Anchored anew at each optimum, the end of the iteration
+fits the fine forces themselves; only its derivatives are the coarse ones, scaled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .calibration import (
+    Calibration,
+    CalibrationSettings,
+    Iterate,
+    StageResult,
+    State,
+    calibrate,
+    iterate_at,
+)
+from .objective import Measured, Simulate, SiteResponse, check_responses
+from .parameters import Grouping, Unknowns, two_stages
+from .trust_region import FIRST_RADIUS
+
+Array = NDArray[np.float64]
+
+Forces = Callable[[Array], Sequence[SiteResponse]]
+_TRIES = 3  # of the fine simulations of a correction
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Where coarse and fine forces are both known: parameters (p,), forces (n,) per site, in N."""
+
+    parameters: Array
+    coarse: tuple[Array, ...]
+    fine: tuple[Array, ...]
+
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """Per site the factor that takes the coarse curve to the fine one."""
+        return tuple(float(f @ c / (c @ c)) for f, c in zip(self.fine, self.coarse))
+
+    @property
+    def differences_percent(self) -> tuple[float, ...]:
+        """Mean absolute difference of fine and coarse force, in percent of the largest fine one, per site."""
+        return tuple(
+            float(100 * np.mean(np.abs(f - c)) / np.max(np.abs(f))) for f, c in zip(self.fine, self.coarse)
+        )
+
+
+def corrected(response: SiteResponse, coarse_N: Array, fine_N: Array, scale: float) -> SiteResponse:
+    """A coarse response (force and derivatives) brought to the fine one of an anchor."""
+    if not response.completed:
+        return response
+    force = fine_N + scale * (response.force_N - coarse_N)
+    return replace(response, force_N=force, jacobian=scale * response.jacobian)
+
+
+@dataclass(frozen=True)
+class Round:
+    """One correction: the stage, where it was anchored, how far fine forces were from what was expected.
+
+    ``expected_percent``: mean absolute difference of the fine forces from the corrected coarse ones, in
+    percent of the largest, per site; nan where the fine simulation failed, and then ``reason`` says why.
+    """
+
+    stage: int
+    parameters: tuple[float, ...]
+    scales: tuple[float, ...]
+    difference_percent: tuple[float, ...]
+    expected_percent: tuple[float, ...]
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class FidelitySettings:
+    """At most ``rounds`` corrections per stage; one is enough where the fine forces are within
+    ``tolerance_percent`` of what was expected, at every site."""
+
+    rounds: int = 3
+    tolerance_percent: float = 0.1
+
+
+@dataclass
+class _Model:
+    """The corrected coarse model; remembers coarse responses, which the anchors need again."""
+
+    coarse: Simulate
+    anchor: Anchor | None = None
+    _known: dict[bytes, tuple[SiteResponse, ...]] = field(default_factory=dict)
+
+    def plain(self, parameters: Array) -> tuple[SiteResponse, ...]:
+        key = parameters.tobytes()
+        if key not in self._known:
+            self._known[key] = tuple(self.coarse(parameters))
+        return self._known[key]
+
+    def __call__(self, parameters: Array) -> tuple[SiteResponse, ...]:
+        responses = self.plain(parameters)
+        if self.anchor is None:
+            return responses
+        parts = zip(responses, self.anchor.coarse, self.anchor.fine, self.anchor.scales, strict=True)
+        return tuple(corrected(*part) for part in parts)
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """A calibration whose forces are the fine ones, and the corrections that led there."""
+
+    calibration: Calibration
+    rounds: tuple[Round, ...]
+    anchor: Anchor | None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"rounds": [vars(one) for one in self.rounds]}
+
+
+def calibrate_corrected(
+    coarse: Simulate,
+    fine: Forces,
+    measured: Sequence[Measured],
+    unknowns: Unknowns,
+    settings: CalibrationSettings | None = None,
+    fidelity: FidelitySettings | None = None,
+    *,
+    stages: Sequence[Grouping] = (),
+    on_iterate: Callable[[State], None] | None = None,
+) -> Corrected:
+    """Like :func:`calibrate`, on corrected coarse simulations.
+
+    Parameters
+    ----------
+    coarse : force and derivatives per site, cheap.
+    fine : forces per site, dear, without derivatives. Called once per round, again where it fails.
+    fidelity : when corrections end.
+
+    Notes
+    -----
+    Nothing is stored between calls: given simulations that remember what they computed, a run taken up again
+    repeats the interrupted one. Where a fine simulation fails, the correction before it is kept, and the
+    stage has not converged.
+
+    Raises
+    ------
+    CalibrationError
+        Where no first simulation completes.
+    """
+    run = _Outer(
+        _Model(coarse),
+        fine,
+        tuple(measured),
+        unknowns,
+        settings or CalibrationSettings(),
+        fidelity or FidelitySettings(),
+        tuple(stages) or two_stages(unknowns.names),
+        on_iterate,
+    )
+    for _ in run.stages:
+        run.next_stage()
+    return run.result()
+
+
+@dataclass
+class _Outer:
+    """The loop over stages and corrections; ``state`` is that of the inner calibration at its end."""
+
+    model: _Model
+    fine: Forces
+    measured: tuple[Measured, ...]
+    unknowns: Unknowns
+    settings: CalibrationSettings
+    fidelity: FidelitySettings
+    stages: tuple[Grouping, ...]
+    on_iterate: Callable[[State], None] | None
+    state: State | None = None
+    history: tuple[Iterate, ...] = ()
+    ended: tuple[StageResult, ...] = ()
+    rounds: tuple[Round, ...] = ()
+
+    def next_stage(self) -> None:
+        """One stage to its end, corrected until coarse and fine agree on it."""
+        stage, reason = len(self.ended), "the corrections have not settled"
+        before = 0 if self.state is None else self.state.evaluations
+        last = len(self.history)
+        settled = False
+        for _ in range(self.fidelity.rounds):
+            inner = self._inner(stage)
+            reached = self._correct(stage)
+            if reached.reason:
+                reason = f"the fine simulation fails: {reached.reason}"
+                break
+            if max(reached.expected_percent) <= self.fidelity.tolerance_percent:
+                settled = True
+                break
+        assert self.state is not None
+        end, converged = self.history[-1], inner.converged and settled
+        result = replace(
+            inner,
+            cost=end.cost,
+            iterations=len(self.history) - last - 1,
+            evaluations=self.state.evaluations - before,
+            converged=converged,
+            reason=inner.reason if settled else f"{reason} ({inner.reason})",
+        )
+        self.ended = (*self.ended, result)
+        self.state = replace(self.state, history=(end,), stages=self.ended)
+
+    def _inner(self, stage: int) -> StageResult:
+        """The optimum of the model as it is corrected now, from where the round or stage before ended."""
+        start = self.state
+
+        def keep(state: State) -> None:
+            fresh = state.history[len(() if start is None else start.history) :]
+            self.state = state
+            if self.on_iterate:
+                self.on_iterate(replace(state, history=(*self.history, *fresh), stages=self.ended))
+
+        found = calibrate(
+            self.model,
+            self.measured,
+            self.unknowns,
+            self.settings,
+            stages=self.stages[: stage + 1],
+            on_iterate=keep,
+            state=start,
+        )
+        self.history += found.history[len(() if start is None else start.history) :]
+        return found.stages[stage]
+
+    def _correct(self, stage: int) -> Round:
+        """Anchor the model at the optimum, and take the iterate there as the fine forces see it."""
+        assert self.state is not None
+        parameters = np.array(self.history[-1].parameters)
+        expected = [response.force_N for response in self.model(parameters)]
+        for _ in range(_TRIES):
+            responses = self.fine(parameters)
+            reason = check_responses(responses, self.measured, 0)
+            if not reason:
+                break
+        anchor = Anchor(
+            parameters,
+            tuple(response.force_N for response in self.model.plain(parameters)),
+            tuple(response.force_N for response in responses),
+        )
+        nothing = tuple(float("nan") for _ in self.measured)
+        found = Round(
+            stage,
+            tuple(parameters.tolist()),
+            nothing if reason else anchor.scales,
+            nothing if reason else anchor.differences_percent,
+            nothing if reason else replace(anchor, coarse=tuple(expected)).differences_percent,
+            reason,
+        )
+        self.rounds = (*self.rounds, found)
+        if not reason:
+            self.model.anchor = anchor
+            standing = replace(self.state, radius=FIRST_RADIUS, stages=self.ended)
+            here = iterate_at(self.model, self.measured, self.unknowns, self.settings, self.stages, standing)
+            here = replace(here, evaluations=self.state.evaluations, failures=self.history[-1].failures)
+            self.history = (*self.history, here)
+            self.state = replace(standing, history=(here,))
+        return found
+
+    def result(self) -> Corrected:
+        parameters = np.array(self.history[-1].parameters)
+        assert self.state is not None
+        calibration = Calibration(
+            names=self.unknowns.names,
+            sites=tuple(site.name for site in self.measured),
+            parameters=parameters,
+            stages=self.ended,
+            history=self.history,
+            evaluations=self.state.evaluations,
+            settings=self.settings,
+            responses=self.model(parameters),
+        )
+        return Corrected(calibration, self.rounds, self.model.anchor)

@@ -1,0 +1,176 @@
+"""Parameters that are fixed, tied or known beforehand; weights of records; several starts (see bars.py)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from zlib import crc32
+
+import numpy as np
+import pytest
+from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate
+
+from limbfit.errors import CalibrationError, ProblemError
+from limbfit.identify import (
+    FIXED,
+    CalibrationSettings,
+    Measured,
+    Prior,
+    SiteResponse,
+    calibrate,
+    constrained,
+    multistart,
+    random_starts,
+    separate,
+    shared,
+    two_stages,
+)
+from limbfit.identify.multistart import describe
+
+GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
+
+
+def test_fixed_names_move_in_no_stage():
+    start = PAPER.start.copy()
+    start[GAMMA] = TRUTH[GAMMA]
+    stages = [constrained(grouping, NAMES, ["skin.gamma"]) for grouping in two_stages(NAMES)]
+    assert [stage[GAMMA] for stage in stages] == [FIXED, FIXED]
+    found = calibrate(simulate, records(), replace(PAPER, start=start), stages=stages)
+    assert found.parameters[GAMMA] == TRUTH[GAMMA]
+    assert found.stages[0].parameters[GAMMA] == TRUTH[GAMMA]
+    assert found.parameters == pytest.approx(TRUTH, rel=2e-3)
+
+
+def test_tied_names_stay_equal_and_reach_a_truth_in_which_they_are():
+    truth = TRUTH.copy()
+    truth[TAU] = truth[TAU + 4]
+    grouping = constrained(separate(NAMES), NAMES, tied=[["skin.tau_s", "muscle.tau_s"]])
+    assert len(set(grouping)) == 7
+    stages = (shared(NAMES), grouping)
+    found = calibrate(simulate, records(truth=truth), PAPER, stages=stages)
+    assert found.parameters[TAU] == found.parameters[TAU + 4]
+    assert found.parameters == pytest.approx(truth, rel=2e-3)
+
+
+def test_all_tied_is_one_material():
+    ties = [[f"skin.{name}", f"muscle.{name}"] for name in ("c_kPa", "m", "gamma", "tau_s")]
+    assert constrained(separate(NAMES), NAMES, tied=ties) == shared(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "tied", "words"),
+    [
+        (["skin.kappa"], [], "no parameter is named 'skin.kappa'"),
+        ([], [["skin.m"]], "skin.m cannot be tied"),
+        ([], [["skin.m", "muscle.gamma"]], "cannot be tied"),
+        (["skin.m"], [["skin.m", "muscle.m"]], "tied and fixed"),
+    ],
+)
+def test_impossible_constraints_are_bad_input(fixed, tied, words):
+    with pytest.raises(ProblemError, match=words):
+        constrained(separate(NAMES), NAMES, fixed, tied)
+
+
+def test_a_prior_holds_what_the_data_do_not_show_and_hardly_what_they_do():
+    """At a site with hardly any skin the force says nothing about it."""
+    muscle = tuple(replace(site, sections=(0.002, site.sections[1])) for site in SITES)
+    data = records(0.03, sites=muscle)
+    known = Prior("skin.c_kPa", 12.0, 1.5), Prior("muscle.c_kPa", 12.0, 1.5)
+
+    def respond(parameters):
+        return [site.respond(parameters) for site in muscle]
+
+    with_priors = calibrate(respond, data, replace(PAPER, priors=known))
+    assert with_priors.converged, with_priors.reason
+    assert with_priors.parameters[0] == pytest.approx(12.0, rel=0.1)
+    assert with_priors.parameters[4] == pytest.approx(TRUTH[4], rel=0.1)
+
+
+def test_a_narrow_prior_wins_and_a_wide_one_yields():
+    def skin(factor):
+        known = replace(PAPER, priors=(Prior("skin.c_kPa", 5.0, factor),))
+        return calibrate(simulate, records(0.03), known).parameters[0]
+
+    assert skin(1.0001) == pytest.approx(5.0, rel=1e-3)
+    assert skin(1e4) == pytest.approx(calibrate(simulate, records(0.03), PAPER).parameters[0], rel=0.01)
+    assert skin(1.0001) < skin(1.01) < skin(2.0)
+
+
+def test_forces_weigh_less_against_priors_where_their_error_is_larger():
+    known = replace(PAPER, priors=(Prior("skin.c_kPa", 5.0, 1.05),))
+    found = [
+        calibrate(simulate, records(0.03), known, CalibrationSettings(force_error_percent=error)).parameters[
+            0
+        ]
+        for error in (0.1, 1.0, 10.0)
+    ]
+    assert found[0] > found[1] > found[2]
+
+
+def test_priors_that_make_no_sense_are_bad_input():
+    with pytest.raises(ProblemError, match="median > 0 and factor > 1"):
+        Prior("skin.m", 3.0, 1.0)
+    with pytest.raises(ProblemError, match=r"'skin\.k', which is no parameter"):
+        replace(PAPER, priors=(Prior("skin.k", 3.0, 2.0),))
+    known = replace(PAPER, priors=(Prior("skin.m", 3.0, 2.0),))
+    with pytest.raises(ProblemError, match="no place for priors"):
+        calibrate(simulate, records(), known, CalibrationSettings(objective="paper"))
+
+
+def test_a_heavier_record_is_fitted_closer():
+    wrong = [Measured(d.name, d.force_N * (1.15 if d.name == "s1" else 1.0)) for d in records()]
+    heavy = [replace(d, weight=100.0) if d.name == "s1" else d for d in wrong]
+    light, strong = (calibrate(simulate, data, PAPER).history[-1].errors_percent for data in (wrong, heavy))
+    assert strong[1] < 0.5 * light[1]
+    assert sum(strong) > sum(light)
+
+
+def test_twenty_random_starts_between_the_bounds_end_at_the_same_optimum():
+    data = records(0.03, seed=1)
+    found = multistart(lambda number, unknowns: calibrate(simulate, data, unknowns), PAPER, 20, seed=4)
+    assert found.reached == 20, [(start.start, start.reason) for start in found.starts if not start.same]
+    assert max(start.apart for start in found.starts) < 1.1
+    assert found.best.cost == min(start.cost for start in found.starts)
+    assert "20 of 20 starts end at the same error" in describe(found, NAMES)
+
+
+def test_random_starts_are_of_their_seed_and_within_the_bounds():
+    one, two, other = (random_starts(PAPER, 5, seed) for seed in (1, 1, 2))
+    assert np.array_equal(one, two)
+    assert not np.array_equal(one[1:], other[1:])
+    assert np.array_equal(one[0], PAPER.start)
+    assert np.all((one >= PAPER.lower) & (one <= PAPER.upper))
+    assert all(np.array_equal(start[:4], start[4:]) for start in one)
+
+
+def test_a_start_that_fails_is_told_and_the_others_count():
+    def run(number, unknowns):
+        failing = Counted(forbidden=lambda p: number == 1)
+        return calibrate(failing, records(), unknowns)
+
+    found = multistart(run, PAPER, 3, seed=1)
+    assert [start.parameters is None for start in found.starts] == [False, True, False]
+    assert "did not converge" in found.starts[1].reason
+    assert found.reached == 2
+    with pytest.raises(CalibrationError, match="no simulation completes"):
+        multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 1)
+    with pytest.raises(CalibrationError, match="none of 2 starts"):
+        multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 2)
+
+
+@pytest.mark.parametrize("roughness", [1e-4, 1e-3])
+def test_rough_forces_end_at_their_noise_floor_without_a_search_for_nothing(roughness):
+    """Simulations are smooth only to their tolerance; here they are off by a random amount everywhere."""
+
+    def rough(parameters):
+        rng = np.random.default_rng(crc32(parameters.tobytes()))
+        return [
+            SiteResponse(r.force_N * (1 + roughness * rng.standard_normal()), r.jacobian)
+            for r in simulate(parameters)
+        ]
+
+    run = Counted()
+    found = calibrate(lambda p: (run(p), rough(p))[1], records(0.03), PAPER)
+    assert found.converged, found.reason
+    assert run.calls <= 16
+    smooth = calibrate(simulate, records(0.03), PAPER)
+    assert found.parameters[4:] == pytest.approx(smooth.parameters[4:], rel=0.03 if roughness < 1e-3 else 0.2)

@@ -1,0 +1,164 @@
+"""Coarse simulations corrected by fine ones; closed-form models whose truth is known (see bars.py)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bars import NAMES, PAPER, SITES, TRUTH, Counted, coarsened, plain, records, simulate
+
+from limbfit.identify import CalibrationSettings, SiteResponse, calibrate
+from limbfit.identify.fidelity import Anchor, FidelitySettings, calibrate_corrected
+
+TIGHT = FidelitySettings(rounds=4, tolerance_percent=0.02)
+
+
+def counting(function, calls):
+    def run(parameters):
+        calls.append(tuple(parameters))
+        return function(parameters)
+
+    return run
+
+
+def test_the_coarse_model_alone_is_wrong_and_the_corrected_one_is_not():
+    biased = calibrate(coarsened, records(), PAPER)
+    assert biased.converged
+    assert biased.parameters[4] == pytest.approx(TRUTH[4] / 1.1, rel=0.03)
+    found = calibrate_corrected(coarsened, plain, records(), PAPER, fidelity=TIGHT)
+    assert found.calibration.converged, found.calibration.reason
+    assert found.calibration.parameters == pytest.approx(TRUTH, rel=0.02)
+    assert max(found.calibration.history[-1].errors_percent) < 0.05
+
+
+def test_few_coarse_and_fewer_fine_evaluations():
+    coarse, fine = [], []
+    found = calibrate_corrected(counting(coarsened, coarse), counting(plain, fine), records(0.03), PAPER)
+    assert found.calibration.converged, found.calibration.reason
+    assert found.calibration.evaluations == len(coarse) == len(set(coarse)) <= 13
+    assert len(fine) == len(found.rounds) <= 6
+    reference = calibrate(simulate, records(0.03), PAPER)
+    assert found.calibration.cost == pytest.approx(reference.cost, rel=0.1)
+
+
+def test_the_forces_at_the_end_are_the_fine_ones():
+    found = calibrate_corrected(coarsened, plain, records(0.03), PAPER)
+    exact = plain(found.calibration.parameters)
+    for response, site in zip(found.calibration.responses, exact, strict=True):
+        assert response.force_N == pytest.approx(site.force_N, abs=1e-12)
+    at = simulate(found.calibration.parameters)
+    for response, true in zip(found.calibration.responses, at, strict=True):
+        scale = np.abs(true.jacobian * TRUTH).max()
+        assert response.jacobian * TRUTH == pytest.approx(true.jacobian * TRUTH, abs=0.08 * scale)
+
+
+def test_every_stage_ends_with_fine_forces_and_history_is_whole():
+    found = calibrate_corrected(coarsened, plain, records(), PAPER).calibration
+    assert [stage.grouping for stage in found.stages] == [(0, 1, 2, 3) * 2, tuple(range(8))]
+    assert {iterate.stage for iterate in found.history} == {0, 1}
+    assert found.stages[0].evaluations + found.stages[1].evaluations == found.evaluations
+    for number, stage in enumerate(found.stages):
+        last = [iterate for iterate in found.history if iterate.stage == number][-1]
+        assert (last.parameters, last.cost) == (stage.parameters, stage.cost)
+        errors = [
+            100 * np.mean(np.abs(site.force(np.array(stage.parameters)) - data.force_N)) / data.force_N.max()
+            for site, data in zip(SITES, records(), strict=True)
+        ]
+        assert last.errors_percent == pytest.approx(errors, rel=1e-9)
+
+
+def test_a_run_killed_anywhere_and_begun_again_repeats_itself():
+    """Simulations are remembered, as the store of a study does; everything else is computed anew."""
+    memory: dict[tuple[str, bytes], list[SiteResponse]] = {}
+    left = [0]
+
+    class KilledError(Exception):
+        """What a signal would do."""
+
+    def remembered(kind, function):
+        def run(parameters):
+            key = kind, parameters.tobytes()
+            if key not in memory:
+                if left[0] == 0:
+                    raise KilledError
+                left[0] -= 1
+                memory[key] = function(parameters)
+            return memory[key]
+
+        return run
+
+    def run():
+        data = records(0.03)
+        return calibrate_corrected(remembered("coarse", coarsened), remembered("fine", plain), data, PAPER)
+
+    whole = calibrate_corrected(coarsened, plain, records(0.03), PAPER)
+    kills = 0
+    while True:
+        left[0] = 1
+        try:
+            again = run()
+        except KilledError:
+            kills += 1
+            continue
+        break
+    assert kills == whole.calibration.evaluations + len(whole.rounds) - 1
+    assert again.calibration.to_dict() == whole.calibration.to_dict()
+    assert again.rounds == whole.rounds
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_simulation_in_ten_may_fail_on_either_mesh(seed):
+    def failing(function, rate, offset):
+        rng = np.random.default_rng([seed, offset])
+
+        def run(parameters):
+            return [
+                SiteResponse(r.force_N, r.jacobian, False, "did not converge") if rng.random() < rate else r
+                for r in function(parameters)
+            ]
+
+        return run
+
+    reference = calibrate_corrected(coarsened, plain, records(0.03), PAPER)
+    found = calibrate_corrected(failing(coarsened, 0.1, 0), failing(plain, 0.1, 1), records(0.03), PAPER)
+    assert found.calibration.converged, found.calibration.reason
+    assert found.calibration.parameters == pytest.approx(reference.calibration.parameters, rel=0.03)
+
+
+def test_a_fine_simulation_that_always_fails_is_told():
+    def fails(parameters):
+        return [
+            SiteResponse(r.force_N, r.jacobian, k != 2, "folded") for k, r in enumerate(plain(parameters))
+        ]
+
+    found = calibrate_corrected(coarsened, fails, records(), PAPER).calibration
+    assert not found.converged
+    assert "the fine simulation fails: s2: folded" in found.reason
+
+
+def test_corrections_that_cannot_settle_are_not_called_converged():
+    rng = np.random.default_rng(0)
+
+    def restless(parameters):
+        return [SiteResponse(r.force_N * rng.uniform(0.9, 1.1), r.jacobian) for r in plain(parameters)]
+
+    found = calibrate_corrected(coarsened, restless, records(), PAPER).calibration
+    assert not found.converged
+    assert "have not settled" in found.reason
+
+
+def test_two_equal_models_need_one_correction_per_stage():
+    found = calibrate_corrected(simulate, plain, records(0.03), PAPER, CalibrationSettings())
+    assert [one.stage for one in found.rounds] == [0, 1]
+    assert max(found.rounds[0].expected_percent) < 1e-9
+    assert found.anchor.scales == pytest.approx([1.0] * 4)
+    alone = calibrate(simulate, records(0.03), PAPER)
+    assert found.calibration.parameters == pytest.approx(alone.parameters, rel=1e-6)
+
+
+def test_scale_of_an_anchor_is_the_least_squares_ratio():
+    force = np.array([0.0, 1.0, 2.0, 1.0])
+    anchor = Anchor(TRUTH, (force,), (1.1 * force + np.array([0, 0.1, -0.1, 0.1]),))
+    assert anchor.scales[0] == pytest.approx(1.1)
+    assert anchor.differences_percent[0] == pytest.approx(100 * np.mean([0, 0.2, 0.1, 0.2]) / 2.1)
+    assert len(NAMES) == len(TRUTH)
+    assert Counted(0.0)(TRUTH)[0].completed
