@@ -14,6 +14,7 @@ Everything the command line does is one call away:
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
+``limbfit cube``          ``compress_cube(folder)``, without a study
 ``limbfit EXPERIMENT``    ``run_experiment(load_study(path), "regions", listener=print)``, and others
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
 ``limbfit bench``         ``bench_febio_parity(tell=print)``, ``bench_forward(..)``, ``bench_scaling(..)``
@@ -33,6 +34,7 @@ _HOME = {
     "Study": "study",
     "load_study": "study",
     "Progress": "pipeline",
+    "bench_calibrate": "pipeline",
     "bench_febio_parity": "bench",
     "bench_forward": "bench",
     "bench_meshing": "bench",
@@ -40,6 +42,7 @@ _HOME = {
     "check_study": "pipeline",
     "describe_series": "anatomy.imaging",
     "compare_site": "pipeline",
+    "compress_cube": "pipeline",
     "export_study": "pipeline",
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",

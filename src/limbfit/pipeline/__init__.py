@@ -10,8 +10,10 @@ from .context import Listener, Progress
 
 _HOME = {
     "STAGE_NAMES": "run",
+    "bench_calibrate": "calibration_bench",
     "check_study": "check",
     "compare_site": "compare",
+    "compress_cube": "cube",
     "export_study": "export",
     "make_phantom_study": "demo",
     "report_study": "run",

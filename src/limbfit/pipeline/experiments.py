@@ -16,6 +16,7 @@ from typing import Any
 from ..errors import InputError
 from ..study import Study
 from .context import Context
+from .cube import COMPRESSION_PERCENT, run_cube
 from .keys import Keys, Stage
 from .simulations import SimulationCache
 from .store import Store, read_json
@@ -34,7 +35,16 @@ class Experiment(Stage):
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-EXPERIMENTS: tuple[Experiment, ...] = ()
+EXPERIMENTS: tuple[Experiment, ...] = (
+    Experiment(
+        "cube",
+        run_cube,
+        needs=("calibrate",),
+        tables=("material",),
+        rooms=("fe", "pipeline/cube", "pipeline/published"),
+        options={"compression_percent": COMPRESSION_PERCENT},
+    ),
+)
 
 
 def find_experiment(name: str) -> Experiment:

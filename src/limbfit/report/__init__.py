@@ -6,10 +6,11 @@ Graphics are loaded when a report is made, not when a study is run.
 from importlib import import_module
 from typing import Any
 
-__all__ = ["build_report"]
+_HOME = {"build_report": "build", "cube_drawing": "cube"}
+__all__ = [*_HOME]
 
 
 def __getattr__(name: str) -> Any:
-    if name != "build_report":
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return import_module(f"{__name__}.build").build_report
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from .cube import cube_section
 from .page import Note, Section
 from .store import Json, Store
 
 Maker = Callable[[Store, Json], Section]
 # By the name of the experiment; a maker is given the store and what ``<name>.json`` holds.
-MAKERS: dict[str, Maker] = {}
+MAKERS: dict[str, Maker] = {"cube": cube_section}
 
 
 def experiment_sections(store: Store) -> tuple[Section, ...]:

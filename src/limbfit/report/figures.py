@@ -8,7 +8,6 @@ from collections.abc import Iterable
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
 from .ink import (
@@ -21,6 +20,8 @@ from .ink import (
     SIMULATED,
     STYLE,
     TRUTH,
+    legend_above,
+    panels,
     svg,
     tissue_style,
     truth_style,
@@ -29,32 +30,13 @@ from .page import Figure
 from .store import PARAMETERS, Curves, Json, Store
 from .tables import SYMBOLS, UNITS, fixed, interval, number
 
-PANEL_WIDTH_IN, MOST_POINTS, LONGEST_TITLE, MOST_IN_A_ROW = 9.6, 2500, 44, 7
+MOST_POINTS, LONGEST_TITLE, MOST_IN_A_ROW = 2500, 44, 7
 
 
 def _thin(curves: Curves) -> Curves:
     """At most ``MOST_POINTS`` samples of every column: more cannot be seen."""
     stride = max(1, math.ceil(len(next(iter(curves.values()))) / MOST_POINTS))
     return {name: values[::stride] for name, values in curves.items()}
-
-
-def _panels(count: int, columns: int, height_in: float) -> tuple[Drawing, list[Axes]]:
-    """A drawing of ``count`` panels in rows of ``columns``."""
-    columns = min(columns, count)
-    rows = math.ceil(count / columns)
-    width = PANEL_WIDTH_IN if columns > 1 else PANEL_WIDTH_IN / 1.6
-    with matplotlib.rc_context(STYLE):
-        drawing = Drawing(figsize=(width, rows * height_in + 0.4), layout="constrained")
-        axes = [drawing.add_subplot(rows, columns, i + 1) for i in range(count)]
-    drawing.patch.set_alpha(0)
-    for ax in axes:
-        ax.patch.set_alpha(0)
-    return drawing, axes
-
-
-def _legend(drawing: Drawing, ax: Axes) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    drawing.legend(handles, labels, loc="outside upper left", ncols=len(labels), labelcolor=INK)
 
 
 def record_figure(store: Store, site: str) -> Figure | None:
@@ -64,10 +46,10 @@ def record_figure(store: Store, site: str) -> Figure | None:
         return None
     facts = store.traces.get(site, {})
     start = (facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0))
-    drawing, axes = _panels(3, 3, 2.5)
+    drawing, axes = panels(3, 3, 2.5)
     with matplotlib.rc_context(STYLE):
         _draw_record(axes, _thin(raw), regular, start)
-        _legend(drawing, axes[0])
+        legend_above(drawing, axes[0])
     peak, depth = fixed(facts.get("peak_force_N"), 2), fixed(facts.get("depth_mm"), 2)
     alt = f"Record of site {site}: displacement and force against time, and force against displacement"
     caption = (
@@ -99,7 +81,7 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
     pairs = [(row, curves) for row, curves in found if curves is not None]
     if not pairs:
         return None
-    drawing, axes = _panels(len(pairs), columns, 2.6 if columns < 3 else 2.1)
+    drawing, axes = panels(len(pairs), columns, 2.6 if columns < 3 else 2.1)
     words = {"time_s": ("Time (s)", "time"), "displacement_mm": ("Displacement (mm)", "displacement")}
     with matplotlib.rc_context(STYLE):
         for i, (ax, (row, curves)) in enumerate(zip(axes, pairs, strict=True)):
@@ -109,7 +91,7 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
                 ax.set_xlabel(words[against][0])
             if i % columns == 0:
                 ax.set_ylabel("Force (N)")
-        _legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
+        legend_above(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
     sites = ", ".join(f"{row['site']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words[against][1]}; site and error: {sites}"
     kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
@@ -146,7 +128,7 @@ def simulated_figure(store: Store) -> Figure | None:
     pairs = [(row, curves) for row, curves in found if curves is not None]
     if not pairs:
         return None
-    drawing, axes = _panels(2, 2, 2.6)
+    drawing, axes = panels(2, 2, 2.6)
     with matplotlib.rc_context(STYLE):
         for i, (row, curves) in enumerate(pairs):
             color, ls = (SIMULATED, ONE_MATERIAL, TRUTH, INK)[i % 4], ("-", "--", ":", "-.")[i % 4]
@@ -155,7 +137,7 @@ def simulated_figure(store: Store) -> Figure | None:
         for ax, label in zip(axes, ("Time (s)", "Displacement (mm)"), strict=True):
             ax.set_xlabel(label)
             ax.set_ylabel("Force (N)")
-        _legend(drawing, axes[0])
+        legend_above(drawing, axes[0])
     names = ", ".join(row["site"] for row, _ in pairs)
     svg_text = svg(drawing, "simulated", f"Simulated force against time and displacement, sites {names}")
     return Figure("simulated", svg_text, "Force of the simulated indentations.")
@@ -167,7 +149,7 @@ def compared_figure(store: Store) -> Figure | None:
     found = [(site, curves) for site, curves in pairs if curves is not None]
     if not found:
         return None
-    drawing, axes = _panels(len(found), 3, 2.5)
+    drawing, axes = panels(len(found), 3, 2.5)
     with matplotlib.rc_context(STYLE):
         for ax, (site, curves) in zip(axes, found, strict=True):
             at = curves["time_s"]
@@ -175,7 +157,7 @@ def compared_figure(store: Store) -> Figure | None:
             ax.plot(at, curves["limbfit_N"], color=SIMULATED, label="limbfit")
             ax.plot(at, curves["limbfit_matched_N"], "--", color=TRUTH, label="with FEBio's contact penalty")
             ax.set(title=f"Site {site}", xlabel="Time (s)", ylabel="Force (N)")
-        _legend(drawing, axes[0])
+        legend_above(drawing, axes[0])
     names = ", ".join(site for site, _ in found)
     text = svg(drawing, "compared", f"Force by FEBio and by limbfit against time, sites {names}")
     return Figure("compared", text, "Force of the same indentation by FEBio and by limbfit.")
@@ -186,7 +168,7 @@ def convergence_figure(store: Store) -> Figure | None:
     stages = [stage for stage in store.stages if stage.get("iterations")]
     if not stages:
         return None
-    drawing, axes = _panels(1 + len(PARAMETERS), 1 + len(PARAMETERS), 2.3)
+    drawing, axes = panels(1 + len(PARAMETERS), 1 + len(PARAMETERS), 2.3)
     with matplotlib.rc_context(STYLE):
         offset = 0
         for stage in stages:
@@ -248,7 +230,7 @@ def error_figure(store: Store) -> Figure | None:
     rows = [row for row in store.predicted if isinstance(row.get("error_percent"), int | float)]
     if not rows:
         return None
-    drawing, (ax,) = _panels(1, 1, 0.7 + 0.24 * len(rows))
+    drawing, (ax,) = panels(1, 1, 0.7 + 0.24 * len(rows))
     with matplotlib.rc_context(STYLE):
         for at, row in enumerate(rows):
             fitted = bool(row.get("fitted"))
@@ -277,7 +259,7 @@ def interval_figure(store: Store) -> Figure | None:
     names = [(t, n) for t in store.tissues for n in PARAMETERS if last.get(t, {}).get(n)]
     if not names:
         return None
-    drawing, (ax,) = _panels(1, 1, 0.7 + 0.3 * len(names))
+    drawing, (ax,) = panels(1, 1, 0.7 + 0.3 * len(names))
     with matplotlib.rc_context(STYLE):
         for at, (tissue, name) in enumerate(names):
             _draw_ratio(ax, store, at, tissue, name)
@@ -290,7 +272,7 @@ def interval_figure(store: Store) -> Figure | None:
         ax.set_xlabel("Ratio to the identified value (–)")
         ax.axvline(1, color=MUTED, lw=0.8)
         ax.grid(visible=False, axis="y")
-        _legend(drawing, ax)
+        legend_above(drawing, ax)
     caption = (
         "The identified parameters with their 95 % intervals, on a logarithmic scale so that all can be "
         "compared. A long bar is a parameter that the data leave open."

@@ -8,11 +8,13 @@ people with any colour-vision deficiency can tell apart.
 from __future__ import annotations
 
 import io
+import math
 import re
 from html import escape
 from typing import Any
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Drawing
 
@@ -24,6 +26,7 @@ FITTED, HELD_OUT = SIMULATED, ONE_MATERIAL
 _COLOURS, _MARKERS = (SIMULATED, ONE_MATERIAL, THIRD, INK), ("o", "s", "^", "D", "v", "P", "X")
 _LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (8, 2)))
 _TRUE_LINES: tuple[Any, ...] = (":", "-.", (0, (6, 2)), (0, (1, 3)), (0, (3, 1, 1, 1, 1, 1)))
+PANEL_WIDTH_IN = 9.6
 POINT_PX = 1.5  # a drawing of 9.6 in fills the page; smaller ones keep the same size of letters
 _VARIABLES = {
     INK: "--ink",
@@ -64,6 +67,26 @@ STYLE: dict[Any, Any] = {
 }
 
 
+def panels(count: int, columns: int, height_in: float) -> tuple[Drawing, list[Axes]]:
+    """A drawing of ``count`` panels in rows of ``columns``."""
+    columns = min(columns, count)
+    rows = math.ceil(count / columns)
+    width = PANEL_WIDTH_IN if columns > 1 else PANEL_WIDTH_IN / 1.6
+    with matplotlib.rc_context(STYLE):
+        drawing = Drawing(figsize=(width, rows * height_in + 0.4), layout="constrained")
+        axes = [drawing.add_subplot(rows, columns, i + 1) for i in range(count)]
+    drawing.patch.set_alpha(0)
+    for ax in axes:
+        ax.patch.set_alpha(0)
+    return drawing, axes
+
+
+def legend_above(drawing: Drawing, ax: Axes, columns: int | None = None) -> None:
+    """The legend of one panel over all of them."""
+    handles, labels = ax.get_legend_handles_labels()
+    drawing.legend(handles, labels, loc="outside upper left", ncols=columns or len(labels), labelcolor=INK)
+
+
 def tissue_style(index: int) -> dict[str, Any]:
     """Colour, marker and line of the curve of a tissue."""
     return {
@@ -102,3 +125,29 @@ def themed(text: str, name: str, alt: str) -> str:
     width = float(view.split()[2]) * POINT_PX
     head = f'<svg viewBox="{view}" style="max-width:{width:.0f}px" role="img"><title>{escape(alt)}</title>'
     return head + inside.strip()
+
+
+# The light theme of report.css, for drawings that leave the page.
+_LIGHT = {
+    "--ink": "#1c2126",
+    "--grid": "#e3e5e8",
+    "--muted": "#6a737c",
+    "--measured": "#1c2126",
+    "--simulated": "#0072b2",
+    "--one-material": "#c45500",
+    "--truth": "#00795a",
+    "--third": "#cc79a7",
+}
+
+
+def standalone(markup: str) -> str:
+    """An inline drawing as the text of an SVG file: on white, with its own colours and letters."""
+    for variable, colour in _LIGHT.items():
+        markup = markup.replace(f"var({variable})", colour)
+    left, top, width, height = markup[markup.index('viewBox="') + 9 :].split('"', 1)[0].split()
+    size = f'width="{float(width):g}pt" height="{float(height):g}pt" font-family="DejaVu Sans, sans-serif"'
+    names = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+    start = markup.index(">") + 1
+    page = f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="#ffffff"/>'
+    head = re.sub(r' style="[^"]*"', "", markup[:start].replace("<svg ", f"<svg {names} {size} ", 1))
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{head}{page}{markup[start:]}\n'

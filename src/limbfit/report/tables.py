@@ -55,11 +55,13 @@ def vector(values: Any) -> str:
     return ", ".join(fixed(value) for value in values) if values else NOTHING
 
 
-def _n(text: str, share: float | None = None) -> Cell:
+def numeric(text: str, share: float | None = None) -> Cell:
+    """A cell that holds a number."""
     return Cell(text, number=True, share=share)
 
 
-def _h(text: str) -> Cell:
+def heading(text: str) -> Cell:
+    """The cell that a row begins with."""
     return Cell(text, header=True)
 
 
@@ -107,11 +109,15 @@ def parameter_table(store: Store) -> Table:
 def _parameter_row(store: Store, tissue: str, name: str) -> Row:
     stages = store.stages
     values = [stages[0].get("start", {}), *(stage.get("parameters", {}) for stage in stages)]
-    cells = [_h(tissue_name(store, tissue)), Cell(f"{SYMBOLS[name]}, {MEANING[name]}"), Cell(UNITS[name])]
-    cells += [_n(number(tissues.get(tissue, {}).get(name))) for tissues in values]
-    cells += [_n(_limits(interval(store, tissue, name))), Cell(verdict(store, tissue, name))]
+    cells = [
+        heading(tissue_name(store, tissue)),
+        Cell(f"{SYMBOLS[name]}, {MEANING[name]}"),
+        Cell(UNITS[name]),
+    ]
+    cells += [numeric(number(tissues.get(tissue, {}).get(name))) for tissues in values]
+    cells += [numeric(_limits(interval(store, tissue, name))), Cell(verdict(store, tissue, name))]
     if store.truth:
-        cells.append(_n(number(store.truth.get("parameters", {}).get(tissue, {}).get(name))))
+        cells.append(numeric(number(store.truth.get("parameters", {}).get(tissue, {}).get(name))))
     return Row(tuple(cells))
 
 
@@ -141,13 +147,13 @@ def _site_row(store: Store, row: Json) -> Row:
     depth = store.traces.get(row["site"], {}).get("depth_mm")
     return Row(
         (
-            _h(str(row["site"])),
+            heading(str(row["site"])),
             Cell(str(row.get("region") or NOTHING)),
             Cell("fitted" if fitted else "held out"),
-            _n(fixed(row.get("peak_force_N"), 2)),
-            _n(fixed(depth, 2)),
-            _n(fixed(row.get("error_one_material_percent"))),
-            _n(fixed(row.get("error_percent"))),
+            numeric(fixed(row.get("peak_force_N"), 2)),
+            numeric(fixed(depth, 2)),
+            numeric(fixed(row.get("error_one_material_percent"))),
+            numeric(fixed(row.get("error_percent"))),
         ),
         marked=fitted,
     )
@@ -161,13 +167,13 @@ def _mean_rows(store: Store) -> Iterable[Row]:
         if chosen:
             yield Row(
                 (
-                    _h(f"Mean, {word}"),
+                    heading(f"Mean, {word}"),
                     Cell(f"{len(chosen)} site{'s' if len(chosen) > 1 else ''}"),
                     Cell(word),
-                    _n(""),
-                    _n(""),
-                    _n(fixed(sum(one) / len(one)) if one else NOTHING),
-                    _n(mean_and_deviation(store, key)),
+                    numeric(""),
+                    numeric(""),
+                    numeric(fixed(sum(one) / len(one)) if one else NOTHING),
+                    numeric(mean_and_deviation(store, key)),
                 )
             )
 
@@ -187,7 +193,7 @@ def correlation_table(store: Store) -> Table | None:
         return None
     short = tuple(_short(str(name)) for name in names)
     rows = tuple(
-        Row((_h(label), *(Cell(fixed(value, 2), number=True, shade=_shade(value)) for value in values)))
+        Row((heading(label), *(Cell(fixed(value, 2), number=True, shade=_shade(value)) for value in values)))
         for label, values in zip(short, matrix, strict=True)
     )
     return Table(
@@ -232,7 +238,10 @@ def trace_table(store: Store) -> Table:
         ("speed_unload_mm_s", 3),
     )
     rows = tuple(
-        Row((_h(site), *(_n(fixed(facts.get(key), digits)) for key, digits in keys)), site in store.fitted)
+        Row(
+            (heading(site), *(numeric(fixed(facts.get(key), digits)) for key, digits in keys)),
+            site in store.fitted,
+        )
         for site, facts in store.traces.items()
     )
     return Table("trace-facts", "What was found in each indentation record.", head, rows)
@@ -255,11 +264,11 @@ def _place_row(row: Json) -> Row:
         )
     axis = ", ".join(fixed(value, 3) for value in row.get("axis") or ()) or NOTHING
     cells = (
-        _h(str(row["site"])),
+        heading(str(row["site"])),
         Cell(str(row.get("region") or NOTHING)),
-        _n(vector(row.get("position_mm"))),
-        _n(axis),
-        _n(fixed(row.get("off_skin_mm"), 2)),
+        numeric(vector(row.get("position_mm"))),
+        numeric(axis),
+        numeric(fixed(row.get("off_skin_mm"), 2)),
         Cell(evidence),
     )
     return Row(cells, bool(row.get("fitted")))
@@ -274,7 +283,8 @@ def volume_table(store: Store) -> Table | None:
     if not names:
         return None
     rows = tuple(
-        Row((_h(str(name)), _n(fixed(labels.get(name))), _n(fixed(closed.get(name))))) for name in names
+        Row((heading(str(name)), numeric(fixed(labels.get(name))), numeric(fixed(closed.get(name)))))
+        for name in names
     )
     head = ("Structure", "Label map (cm³)", "Inside the surface (cm³)")
     return Table("volumes", "Volumes of the segmented structures and of the smooth surfaces.", head, rows)
@@ -300,14 +310,14 @@ def mesh_table(store: Store) -> Table:
 def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
     trimmed = [bone.get("volume_mm3", 0.0) for bone in (facts.get("trimmed_bone") or {}).values()]
     cells = (
-        _h(site),
+        heading(site),
         Cell(str(facts.get("element", NOTHING))),
-        _n(_count(facts.get("nodes"))),
-        _n(_count(facts.get("cells"))),
-        _n(fixed(facts.get("min_dihedral_deg"))),
-        _n(_layers(facts)),
-        _n(fixed(sum(trimmed), 0)),
-        _n(duration(facts.get("seconds"))),
+        numeric(_count(facts.get("nodes"))),
+        numeric(_count(facts.get("cells"))),
+        numeric(fixed(facts.get("min_dihedral_deg"))),
+        numeric(_layers(facts)),
+        numeric(fixed(sum(trimmed), 0)),
+        numeric(duration(facts.get("seconds"))),
     )
     return Row(cells, marked)
 
@@ -332,10 +342,10 @@ def solver_table(store: Store) -> Table:
     rows = tuple(
         Row(
             (
-                _h(str(row["site"])),
+                heading(str(row["site"])),
                 Cell(str(row.get("element", NOTHING))),
-                _n(_count(row.get("steps"))),
-                _n(fixed(row.get("penetration_mm"), 3)),
+                numeric(_count(row.get("steps"))),
+                numeric(fixed(row.get("penetration_mm"), 3)),
                 Cell("yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"),
             ),
             bool(row.get("fitted")),
@@ -351,10 +361,10 @@ def simulated_table(store: Store) -> Table:
     rows = tuple(
         Row(
             (
-                _h(str(row["site"])),
-                _n(fixed(row.get("depth_mm"), 2)),
-                _n(fixed(row.get("peak_force_N"), 2)),
-                _n(fixed(row.get("penetration_mm"), 3)),
+                heading(str(row["site"])),
+                numeric(fixed(row.get("depth_mm"), 2)),
+                numeric(fixed(row.get("peak_force_N"), 2)),
+                numeric(fixed(row.get("penetration_mm"), 3)),
                 Cell(str(row.get("parameters_from", NOTHING))),
                 Cell("yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"),
             )
@@ -377,10 +387,10 @@ def iteration_table(stage: Json) -> Table:
     rows = tuple(
         Row(
             (
-                _h(str(step.get("iteration"))),
-                _n(number(step.get("cost"), 4)),
-                _n(fixed(step.get("error_percent"), 2)),
-                *(_n(number(step.get("parameters", {}).get(t, {}).get(name))) for t, name in columns),
+                heading(str(step.get("iteration"))),
+                numeric(number(step.get("cost"), 4)),
+                numeric(fixed(step.get("error_percent"), 2)),
+                *(numeric(number(step.get("parameters", {}).get(t, {}).get(name))) for t, name in columns),
             )
         )
         for step in iterations
@@ -406,10 +416,10 @@ def timing_table(store: Store) -> Table:
     longest = max([*known.values(), 1e-9])
     finished = {name: _moment(facts.get("finished")) for name, facts in store.run["stages"].items()}
     rows = tuple(
-        Row((_h(name), _n(duration(value), share=value / longest), Cell(finished[name])))
+        Row((heading(name), numeric(duration(value), share=value / longest), Cell(finished[name])))
         for name, value in known.items()
     )
-    total = Row((_h("Total"), _n(duration(sum(known.values()))), Cell("")))
+    total = Row((heading("Total"), numeric(duration(sum(known.values()))), Cell("")))
     caption = "How long each stage took."
     return Table("timing", caption, ("Stage", "Time", "Finished"), rows, (total,))
 
@@ -421,7 +431,7 @@ def _moment(text: Any) -> str:
 
 def pair_table(name: str, caption: str, head: tuple[str, str], pairs: Mapping[str, Any]) -> Table:
     """Two columns: a key and its value; long ones are folded away on the screen."""
-    rows = tuple(Row((_h(str(key)), Cell(str(value)))) for key, value in pairs.items())
+    rows = tuple(Row((heading(str(key)), Cell(str(value)))) for key, value in pairs.items())
     return Table(name, caption, head, rows, folded=len(rows) > 12)
 
 

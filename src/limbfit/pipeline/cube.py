@@ -1,0 +1,219 @@
+"""The cube of the paper's figures 8 and 9: tissues compared by their stress in uniaxial compression.
+
+A cube of 10 mm between frictionless plates that hold on to it: compressed over 0.5 s, brought back over
+0.5 s, held for 1 s, its sides free. The paper does not say how far it was compressed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import report
+from ..bench.blocks import HEX, boxes
+from ..errors import InputError, RunError
+from ..fe import History, Material, OgdenQLV, Problem, StepControl, Support, System, iterate
+from ..fe.laws import Laws
+from ..fe.observables import element_fields
+from ..indentation import KPA, materials
+from ..mesh import Mesh
+from .context import Context
+from .published import PUBLISHED
+from .store import read_json, write_json
+
+Array = NDArray[np.float64]
+SIDE_MM, RAMP_S, HOLD_S = 10.0, 0.5, 1.0
+STEPS = 40  # in each ramp, and in the time held
+COMPRESSION_PERCENT = 20.0
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A tissue to be compressed; ``row`` is what is told of it beside its stress."""
+
+    name: str
+    kind: str
+    material: Material
+    row: dict[str, Any]
+
+
+def compress_cube(
+    output: Path | None = None,
+    *,
+    parameters: dict[str, dict[str, float]] | None = None,
+    kappa_ratio: float = 100.0,
+    compression_percent: float = COMPRESSION_PERCENT,
+) -> dict[str, Any]:
+    """Compress a cube of each given tissue, of the paper's and of the published ones.
+
+    Parameters
+    ----------
+    output : folder for ``cube.json``, ``cube.csv`` and ``cube.svg``; None: nothing is written.
+    parameters : ``{tissue: {c_kPa, m, gamma, tau_s}}``, outermost first; the last one stands beside published
+        muscle, all others beside published skin. None: published tissues only.
+    kappa_ratio : bulk modulus over ``c`` of the given tissues.
+    compression_percent : of the side of the cube.
+
+    Returns
+    -------
+    dict
+        ``tissues``: for each its name, kind, law, peak stress, what is left of it and its change of volume;
+        ``time_s``, and ``stress_kPa`` for each tissue (Cauchy stress along the compression, positive when
+        pushing).
+
+    Raises
+    ------
+    InputError
+        For a compression that is no compression.
+    """
+    if not 0.0 < compression_percent <= 60.0:
+        raise InputError(
+            f"a compression of {compression_percent:g} % is not possible here",
+            place="compression",
+            remedy="give one above 0 and up to 60 %",
+        )
+    times = _times()
+    rows, stresses = [], {}
+    for specimen in _specimens(parameters or {}, kappa_ratio):
+        stress, least, most = _compress(specimen.material, times, compression_percent)
+        stresses[specimen.name] = stress
+        rows.append(specimen.row | _summary(times, stress) | {"J_min": least, "J_max": most})
+    content = {
+        "side_mm": SIDE_MM,
+        "compression_percent": compression_percent,
+        "ramp_s": RAMP_S,
+        "hold_s": HOLD_S,
+        "element": "hex8",
+        "tissues": rows,
+        "time_s": times.tolist(),
+        "stress_kPa": {name: stress.tolist() for name, stress in stresses.items()},
+    }
+    if output is not None:
+        _write(output, content)
+    return content
+
+
+def run_cube(context: Context, folder: Path, *, compression_percent: float) -> dict[str, Any]:
+    """The experiment: this study's identified tissues beside the published ones."""
+    context.tell("cube", 0, 1, "compressing")
+    stages = context.stored("calibrate", "calibration.json")["stages"]
+    compress_cube(
+        folder,
+        parameters=stages[-1]["parameters"],
+        kappa_ratio=context.study.material.kappa_ratio,
+        compression_percent=compression_percent,
+    )
+    return {}
+
+
+def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float) -> list[Specimen]:
+    own = materials(parameters, kappa_ratio)
+    found = []
+    for i, (tissue, values) in enumerate(parameters.items()):
+        words = ", ".join(f"{key} = {values[key]:.4g}{unit}" for key, unit in _UNITS.items())
+        kind = "muscle" if i == len(parameters) - 1 else "skin"
+        row = {"values": words, "conversion": "none", "source": "this study"}
+        found.append(_specimen(f"{tissue} (this study)", kind, own[tissue], row))
+    relaxation = {"skin": (3.57, 0.32), "muscle": (3.47, 0.34)}  # the paper's, where no study gives its own
+    if parameters:
+        first, last = (list(parameters.values())[i] for i in (0, -1))
+        relaxation = {"skin": _relaxation(first), "muscle": _relaxation(last)}
+    for known in PUBLISHED:
+        row = {"values": known.values, "conversion": known.conversion, "source": known.source}
+        found.append(_specimen(known.name, known.kind, known.material(relaxation[known.kind]), row))
+    return found
+
+
+_UNITS = {"c_kPa": " kPa", "m": "", "gamma": "", "tau_s": " s"}
+
+
+def _relaxation(values: dict[str, float]) -> tuple[float, float]:
+    return values["gamma"], values["tau_s"]
+
+
+def _specimen(name: str, kind: str, material: Material, row: dict[str, Any]) -> Specimen:
+    table = material.table()
+    facts = {
+        "tissue": name,
+        "kind": kind,
+        "shear_modulus_kPa": float(table.terms[:, 0].sum() / 2.0 / KPA),
+        "instantaneous_modulus_kPa": material.instantaneous_modulus / KPA,
+        "bulk_modulus_kPa": table.kappa / KPA,
+        "prony": table.prony.tolist(),
+        "law": "second-order Ogden" if isinstance(material, OgdenQLV) else "sum of Ogden terms",
+        "terms": [[c / KPA, m] for c, m in table.terms.tolist()],
+    }
+    return Specimen(name, kind, material, facts | row)
+
+
+def _times() -> Array:
+    """Steps (k,) in s: even in each ramp, dense at first while the cube is held."""
+    ramp = np.arange(1, STEPS + 1) / STEPS
+    return np.concatenate([RAMP_S * ramp, RAMP_S * (1 + ramp), 2 * RAMP_S + HOLD_S * ramp**1.5])
+
+
+def cube_mesh(cells: int = 1) -> Mesh:
+    """The cube of ``cells`` hexahedra along a side, from the origin, mm."""
+    lines = np.linspace(0.0, SIDE_MM, cells + 1)
+    points, corners = boxes(lines, lines, lines)
+    return Mesh(points, corners[:, HEX], "hex8", np.zeros(len(corners), dtype=int), ("cube",), {}, {})
+
+
+def _compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:
+    """Stress (k,) in kPa at ``times`` s, and the least and largest ratio of volumes."""
+    depth = SIDE_MM * compression_percent / 100.0
+    ramp = np.array([0.0, RAMP_S, 2 * RAMP_S, 2 * RAMP_S + HOLD_S])
+    mesh = cube_mesh()
+    planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
+    top = Support(np.flatnonzero(mesh.points[:, 2] == SIDE_MM), 2, -1.0)
+    problem = Problem(
+        mesh=mesh,
+        materials={"cube": material},
+        fixed=np.zeros(0, dtype=int),
+        contact_faces=np.zeros((0, 4), dtype=int),
+        indenter=None,
+        history=History(ramp, np.array([0.0, depth, 0.0, 0.0])),
+        supports=(*planes, top),
+    )
+    system, laws = System(problem), Laws.build([material])
+    found: dict[float, tuple[float, float]] = {}
+    for step in iterate(problem, StepControl(times=tuple(times), tolerance=1e-7)):
+        fields = element_fields(system, laws, step.state)
+        found[step.time] = (-float(fields.cauchy[0, 2]), float(fields.J[0]))
+    missing = [t for t in times if t not in found]
+    if missing:
+        raise RunError(f"the cube could not be solved beyond {missing[0]:.3g} s; compress it less far")
+    stress, volume = np.array([found[t] for t in times]).T
+    return stress / KPA, float(volume.min()), float(volume.max())
+
+
+def _summary(times: Array, stress: Array) -> dict[str, float]:
+    """Peak, and the tension that stays when the cube is back at its height, at once and at the end."""
+    back = int(np.argmin(np.abs(times - 2 * RAMP_S)))
+    return {
+        "peak_kPa": float(stress.max()),
+        "back_kPa": float(stress[back]),
+        "end_kPa": float(stress[-1]),
+    }
+
+
+def _write(folder: Path, content: dict[str, Any]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "cube.json", content)
+    stored = read_json(folder / "cube.json")
+    columns = [np.array([0.0, *content["time_s"]])]
+    columns += [np.array([0.0, *values]) for values in content["stress_kPa"].values()]
+    heads = ["time_s", *(_column(name) for name in content["stress_kPa"])]
+    table = np.column_stack(columns)
+    np.savetxt(folder / "cube.csv", table, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
+    (folder / "cube.svg").write_text(report.cube_drawing(stored), encoding="utf-8")
+
+
+def _column(name: str) -> str:
+    """A tissue's name as the head of a CSV column, with the unit."""
+    plain = "".join(c if c.isalnum() and c.isascii() else " " for c in name)
+    return "_".join(plain.split()) + "_kPa"
