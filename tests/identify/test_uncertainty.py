@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, records, simulate, three_tissues
-from scipy.stats import t as student
 
 from limbfit.identify import (
     DETERMINED,
+    GIVEN,
     UNDETERMINED,
     Measured,
     calibrate,
@@ -20,6 +20,8 @@ from limbfit.identify import (
     separate,
     summarise,
 )
+from limbfit.identify.discrepancy import _Rows, matern
+from limbfit.identify.noise import curve_noise
 
 
 def fitted(data, run=simulate):
@@ -28,25 +30,35 @@ def fitted(data, run=simulate):
 
 
 def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER):
-    """Uncertainty at the truth, without the nonlinear part: one Gauss-Newton step from there."""
+    """Uncertainty at the truth, without the nonlinear part: one Gauss-Newton step from there.
+
+    Also how far its most probable parameters are from the truth, in logarithms.
+    """
     responses = [site.respond(truth) for site in sites]
     J = np.concatenate([r.jacobian * truth * d.scale for r, d in zip(responses, data)])
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
-    return step, estimate_uncertainty(truth, moved, data, unknowns)
+    found = estimate_uncertainty(truth, moved, data, unknowns)
+    return step + np.log(found.centre / truth), found
 
 
-def coverage(noise_of, repeats=200, truth=TRUTH, sites=SITES, unknowns=PAPER):
+def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER):
     """Share of repeats in which each combination's 95 % interval holds the truth, the best known half."""
     inside, clean = [], records(truth=truth, sites=sites)
     for seed in range(repeats):
         rng = np.random.default_rng(seed)
         data = [Measured(d.name, d.force_N + noise_of(rng, d.force_N.size)) for d in clean]
-        step, u = linear_fit(data, truth, sites, unknowns)
-        t = student.ppf(0.975, u.degrees_of_freedom)
-        inside.append([abs(c.weights @ step) < t * c.sd_log for c in u.combinations[: len(truth) // 2]])
+        off, u = linear_fit(data, truth, sites, unknowns)
+        best = u.combinations[: len(truth) // 2]
+        inside.append([abs(c.weights @ off) < np.log(c.factor_95) for c in best])
     return np.mean(inside, axis=0)
+
+
+def smooth_misfit(rng, n, length=0.2, size=0.05):
+    """A misfit that wanders along the record, and a little noise."""
+    L = np.linalg.cholesky(matern(np.arange(float(n)), length) + 1e-9 * np.eye(n))
+    return size * L @ rng.standard_normal(n) + 0.004 * rng.standard_normal(n)
 
 
 def test_intervals_cover_the_truth_under_white_noise():
@@ -57,13 +69,53 @@ def test_intervals_cover_the_truth_under_white_noise():
 def test_intervals_of_three_tissues_cover_the_truth_with_four_sites():
     shares = coverage(
         lambda rng, n: 0.03 * rng.standard_normal(n),
-        repeats=100,
+        repeats=80,
         truth=TRUE_THREE,
         sites=BARS[:4],
         unknowns=three_tissues(),
     )
-    assert np.all(shares > 0.88), shares
-    assert shares.mean() < 0.99
+    assert np.all(shares > 0.85), shares
+    assert shares.mean() < 0.995
+
+
+def test_intervals_cover_the_truth_where_the_model_is_wrong():
+    shares = coverage(smooth_misfit, repeats=100)
+    assert np.all(shares > 0.86), shares
+    assert 0.90 < shares.mean() < 0.99
+
+
+def test_misfit_and_noise_are_told_apart():
+    rng = np.random.default_rng(1)
+    data = [Measured(d.name, d.force_N + smooth_misfit(rng, d.force_N.size)) for d in records()]
+    model = linear_fit(data)[1].residual_model
+    noise = [site.sd_N for site in model.noise]
+    assert noise == pytest.approx([0.004] * 4, rel=0.5)
+    assert np.median(model.misfit * model.peaks_N) == pytest.approx(0.05, rel=0.5)
+    assert 0.07 < model.correlation < 0.6
+    assert model.known_scale > 10
+    only_noise = linear_fit(records(0.03, seed=2))[1].residual_model
+    assert np.median(only_noise.misfit * only_noise.peaks_N) < 0.015
+    assert only_noise.effective_samples() > 3 * model.effective_samples()
+
+
+def test_intervals_are_useful_where_the_model_is_wrong_a_little():
+    """Misfit of one percent of the force, smooth: well narrower than the bounds, unlike one free residual."""
+    rng = np.random.default_rng(3)
+    data = [
+        Measured(d.name, d.force_N + smooth_misfit(rng, d.force_N.size, 0.2, 0.01 * d.force_N.max()))
+        for d in records()
+    ]
+    u = linear_fit(data)[1]
+    assert u.verdicts[4] == DETERMINED
+    assert sum(verdict != UNDETERMINED for verdict in u.verdicts) >= 6
+    assert np.min(u.degrees_of_freedom) > 5
+
+
+def test_uninformative_data_flip_the_verdict():
+    said = [linear_fit(records(noise, seed=5))[1].verdicts for noise in (0.003, 3.0, 30.0)]
+    assert said[0].count(DETERMINED) >= 6
+    assert said[1].count(DETERMINED) == 0
+    assert said[2].count(UNDETERMINED) >= 6
 
 
 def test_intervals_still_cover_where_the_noise_drifts():
@@ -84,7 +136,7 @@ def test_verdicts_after_a_calibration_and_intervals_around_the_answer():
     assert np.mean((u.intervals_95[:, 0] < TRUTH) & (u.intervals_95[:, 1] > TRUTH)) >= 0.75
     assert u.verdicts[0] == u.verdicts[4] == DETERMINED
     assert not any(u.at_bound)
-    assert [n.sd_N for n in u.noise] == pytest.approx([0.01] * 4, rel=0.3)
+    assert [n.sd_N for n in u.residual_model.noise] == pytest.approx([0.01] * 4, rel=0.3)
     json.dumps(u.to_dict(), allow_nan=False)
 
 
@@ -127,16 +179,12 @@ def test_two_tissues_that_cannot_be_told_apart_are_correlated():
     assert known[:4] == pytest.approx(known[4:], abs=1e-6)
 
 
-def test_drifting_residuals_widen_the_intervals():
-    rng = np.random.default_rng(0)
-    white = rng.standard_normal(60)
-    drift = np.cumsum(white) - np.linspace(0, white.sum(), 60)
-    drift *= white.std() / drift.std()
-    wide, narrow = (
-        linear_fit([Measured(d.name, d.force_N + 0.03 * e) for d in records()])[1] for e in (drift, white)
-    )
-    assert wide.noise[0].effective_samples < 0.5 * narrow.noise[0].effective_samples
-    assert np.median(wide.sd_log / narrow.sd_log) > 1.5
+def test_what_is_given_is_not_called_identified():
+    data, grouping = records(0.01), (0, 1, 2, -1, 3, 4, 5, -1)
+    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, grouping=grouping)
+    assert u.verdicts[3] == u.verdicts[7] == GIVEN
+    assert u.sd_log[3] == 0
+    assert len(u.combinations) == 6
 
 
 def test_an_answer_on_its_bound_is_flagged():
@@ -191,3 +239,15 @@ def test_the_error_is_the_papers():
     assert (summary.sites, summary.mean_percent, summary.largest_percent) == (3, 3.0, 6.0)
     assert summary.sd_percent == pytest.approx(np.std([1, 2, 6], ddof=1))
     assert np.isnan(summarise([]).mean_percent)
+
+
+def test_the_slope_of_the_restricted_likelihood_is_its_derivative():
+    data = records(0.02, seed=1)
+    left = [r.force_N - d.force_N for r, d in zip(simulate(TRUTH), data)]
+    noise = [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
+    peaks = np.array([d.force_N.max() for d in data])
+    scaled = [r.jacobian * TRUTH for r in simulate(TRUTH)]
+    rows = _Rows(left, scaled, noise, peaks, np.eye(8), 0.2)
+    at, h = np.log([0.01, 0.02, 0.005, 0.03]), 1e-5
+    slopes = [(rows.criterion(at + h * e)[0] - rows.criterion(at - h * e)[0]) / (2 * h) for e in np.eye(4)]
+    assert rows.criterion(at)[1] == pytest.approx(np.array(slopes), rel=1e-4)

@@ -315,7 +315,10 @@ def _calibration(sites: tuple) -> dict:
         "correlation": {"names": NAMES, "matrix": matrix.tolist()},
         "verdict": verdict,
         "combinations": ["The data determine c·(1 + γ) of the muscle to 2 %."],
-        "residual_sd_N": {row[0]: 0.05 for row in sites if row[2]},
+        "residuals": {
+            "sites": {row[0]: {"noise_sd_N": 0.05, "misfit_sd_N": 0.1} for row in sites if row[2]},
+            "correlation": 0.2,
+        },
     }
     return {
         "stages": [

@@ -21,6 +21,7 @@ from .parameters import (
 from .prediction import Summary, error_percent, prediction_sd, summarise
 from .uncertainty import (
     DETERMINED,
+    GIVEN,
     UNDETERMINED,
     WEAK,
     Combination,
@@ -31,6 +32,7 @@ from .uncertainty import (
 __all__ = [
     "DETERMINED",
     "FIXED",
+    "GIVEN",
     "UNDETERMINED",
     "WEAK",
     "Calibration",

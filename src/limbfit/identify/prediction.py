@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
 
@@ -46,3 +48,47 @@ def prediction_sd(jacobian: Array, parameters: Array, covariance_log: Array, noi
     """
     scaled = jacobian * parameters
     return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a prediction interval needs of a stored uncertainty (``Uncertainty``, ``ResidualModel.to_dict``).
+
+    ``sites`` are noise and misfit of the fitted sites; ``known_scale`` the independent residuals on which the
+    size of the misfit rests.
+    """
+
+    covariance_log: Array
+    sites: dict[str, dict[str, float]]
+    misfit_elsewhere: float
+    known_scale: float
+
+    @classmethod
+    def of(cls, uncertainty: dict[str, Any]) -> Known:
+        """From the part ``uncertainty`` of ``calibration.json``."""
+        residuals = uncertainty["residuals"]
+        return cls(
+            np.array(uncertainty["covariance_log"]),
+            residuals["sites"],
+            float(residuals["misfit_elsewhere"]),
+            float(residuals["known_scale"]),
+        )
+
+    def residual(self, site: str) -> tuple[float, float]:
+        """Noise (N) and misfit (over the largest force) of a site; of a typical one where not fitted."""
+        if site in self.sites:
+            return self.sites[site]["compared_noise_sd_N"], self.sites[site]["misfit_share"]
+        noise = [found["compared_noise_sd_N"] for found in self.sites.values()]
+        return float(np.median(noise)), self.misfit_elsewhere
+
+    def half_width_95(self, jacobian: Array, parameters: Array, peak_N: float, site: str) -> Array:
+        """Half the 95 % interval (n,) N of a new record at a site: parameters, misfit of the model, noise.
+
+        As few residuals as the misfit is known from widen it (Student; Satterthwaite's freedom).
+        """
+        noise_N, misfit = self.residual(site)
+        misfit_N = misfit * peak_N
+        sd = prediction_sd(jacobian, parameters, self.covariance_log, float(np.hypot(noise_N, misfit_N)))
+        share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
+        freedom = np.clip(self.known_scale / np.maximum(share, 1e-3) ** 2, 3.0, 1e6)
+        return stdtrit(freedom, 0.975) * sd

@@ -1,12 +1,11 @@
 """What the data tell about the parameters, and what they do not.
 
-Linearised at the answer, in logarithms of the parameters. The fit weighs sites by their largest force, not by
-their noise, and what is left over is mostly the model's own misfit, which drifts along the trace instead of
-scattering. So the covariance is the sandwich of weighted least squares (White 1980; Newey and West 1987 for
-correlated residuals): ``H^-1 M H^-1`` with ``H = J' W J`` and ``M = J' W S W J``, where S holds each site's
-residual variance and an exponential autocorrelation estimated from its residuals. The bounds enter as the
-spread of a uniform distribution between them: where the data say nothing, that is all that is known, and the
-interval says so.
+Linearised at the answer, in logarithms of the parameters. The residuals have one covariance C, noise of the
+records plus misfit of the model (``noise``, ``discrepancy``); what is most probable under it lies one
+generalised least-squares step from the calibrated parameters, with covariance ``(J' C^-1 J + P)^-1``. P is
+what the bounds say, the spread of a uniform distribution between them, and what stated priors say: where the
+data are silent, that is all that is known, and the interval says so. The size of the misfit is itself
+estimated from few independent residuals, so intervals take Student's quantiles (Satterthwaite 1946).
 """
 
 from __future__ import annotations
@@ -17,64 +16,61 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import toeplitz
 from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
 
+from .discrepancy import ResidualModel, estimate_discrepancy
+from .noise import SiteNoise, curve_noise
 from .objective import Measured, SiteResponse
-from .parameters import Unknowns
+from .parameters import Grouping, Space, Unknowns, search_space, separate
 
 Array = NDArray[np.float64]
 
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
+GIVEN = "given, not identified"
 # A 95 % interval of at most -20 to +25 % is called determined, one of a half to twofold weakly so.
 _DETERMINED_FACTOR, _WEAK_FACTOR = 1.25, 2.0
 # Whatever the width: an interval that is hardly narrower than the bounds comes from the bounds.
 _PRIOR_SHARE = 0.5
 _EDGE = 1e-3  # this close to a bound, in the logarithm, is on it
+_MOST_FREEDOM = 1e6
 
 
 @dataclass(frozen=True)
 class Combination:
     """A product of powers of the parameters, ``exp(weights @ log(parameters))``, and how well it is known.
 
-    ``weights`` (p,) has unit length; ``sd_log`` is the standard deviation of its logarithm.
+    ``sd_log`` is the standard deviation of its logarithm, ``factor_95`` the half-width of its 95 % interval
+    as a factor.
     """
 
     weights: Array
     sd_log: float
+    factor_95: float
     text: str
     verdict: str
-
-
-@dataclass(frozen=True)
-class SiteNoise:
-    """Residuals of a site: standard deviation, correlation of neighbours, and the equivalent free samples."""
-
-    name: str
-    sd_N: float
-    autocorrelation: float
-    effective_samples: float
 
 
 @dataclass(frozen=True)
 class Uncertainty:
     """Linearised uncertainty at the answer.
 
-    ``covariance`` and ``correlation`` (p, p) are of the logarithms; ``intervals_95`` (p, 2) are of the
-    parameters, kept between the bounds; ``combinations`` are the principal axes of the covariance, the best
-    known first.
+    ``centre`` (p,) are the most probable parameters; ``covariance`` and ``correlation`` (p, p) are of the
+    logarithms; ``intervals_95`` (p, 2) are of the parameters, around the centre and kept between the bounds;
+    ``degrees_of_freedom`` (p,) belong to them. ``combinations`` are the principal axes of the covariance, the
+    best known first.
     """
 
     names: tuple[str, ...]
     parameters: Array
+    centre: Array
     covariance: Array
     correlation: Array
     intervals_95: Array
     verdicts: tuple[str, ...]
     at_bound: tuple[bool, ...]
     combinations: tuple[Combination, ...]
-    noise: tuple[SiteNoise, ...]
-    degrees_of_freedom: float
+    residual_model: ResidualModel
+    degrees_of_freedom: Array
 
     @property
     def sd_log(self) -> Array:
@@ -82,7 +78,9 @@ class Uncertainty:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like values."""
+        model = self.residual_model
         return {
+            "centre": dict(zip(self.names, self.centre.tolist())),
             "intervals_95": dict(zip(self.names, self.intervals_95.tolist())),
             "sd_log": dict(zip(self.names, self.sd_log.tolist())),
             "verdicts": dict(zip(self.names, self.verdicts)),
@@ -90,18 +88,17 @@ class Uncertainty:
             "correlation": self.correlation.tolist(),
             "covariance_log": self.covariance.tolist(),
             "combinations": [
-                {"text": c.text, "weights": c.weights.tolist(), "sd_log": c.sd_log, "verdict": c.verdict}
+                {
+                    "text": c.text,
+                    "weights": c.weights.tolist(),
+                    "sd_log": c.sd_log,
+                    "factor_95": c.factor_95,
+                    "verdict": c.verdict,
+                }
                 for c in self.combinations
             ],
-            "noise": {
-                n.name: {
-                    "sd_N": n.sd_N,
-                    "autocorrelation": n.autocorrelation,
-                    "effective_samples": n.effective_samples,
-                }
-                for n in self.noise
-            },
-            "degrees_of_freedom": self.degrees_of_freedom,
+            "degrees_of_freedom": dict(zip(self.names, self.degrees_of_freedom.tolist())),
+            "residuals": model.to_dict(),
         }
 
 
@@ -110,75 +107,124 @@ def estimate_uncertainty(
     responses: Sequence[SiteResponse],
     measured: Sequence[Measured],
     unknowns: Unknowns,
+    noise: Sequence[SiteNoise] | None = None,
+    grouping: Grouping | None = None,
 ) -> Uncertainty:
-    """Covariance, intervals and verdicts at calibrated ``parameters`` (p,), all of them free.
+    """Covariance, intervals and verdicts at calibrated ``parameters`` (p,).
 
     Parameters
     ----------
     responses : forces and derivatives there (``Calibration.responses``).
+    noise : of each site's record (``record_noise``); by default white, from the scatter of the residuals
+        (``curve_noise``), which suits curves that were not smoothed.
+    grouping : of the last stage; by default every parameter is free.
     """
     left = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
-    noise = _noise(left, [site.name for site in measured], len(parameters))
-    scaled = [response.jacobian * parameters for response in responses]
-    prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
-    covariance = _sandwich(scaled, measured, noise, prior_sd)
-    freedom = max(sum(n.effective_samples for n in noise) - len(parameters), 1.0)
-    sd = np.sqrt(np.diag(covariance))
-    factor = np.exp(np.minimum(stdtrit(freedom, 0.975) * sd, 50.0))
-    low, high = (
-        np.maximum(parameters / factor, unknowns.lower),
-        np.minimum(parameters * factor, unknowns.upper),
-    )
-    axes = _combinations(covariance, unknowns.names, prior_sd, freedom)
+    if noise is None:
+        noise = [
+            curve_noise(site.name, np.arange(float(r.size)), r, site.force_N)
+            for site, r in zip(measured, left)
+        ]
+    space = search_space(unknowns, grouping or separate(unknowns.names))
+    scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
+    z = space.reduce(np.log(parameters))
+    prior = Beliefs.of(unknowns, space)
+    peaks = np.array([site.force_N.max() for site in measured])
+    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision)
+    linear = _Linear.at(left, scaled, model, prior, z)
+    return _told(np.asarray(parameters), linear, model, unknowns, space, prior)
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """What is known before the data, in the search space: ``precision`` (k, k), ``sd`` (k,) of the bounds.
+
+    ``rows @ z - target`` are the deviations from stated priors in their standard deviations.
+    """
+
+    precision: Array
+    sd: Array
+    rows: Array
+    target: Array
+
+    @classmethod
+    def of(cls, unknowns: Unknowns, space: Space) -> Beliefs:
+        sd = (space.upper - space.lower) / np.sqrt(12.0)
+        rows, target = unknowns.prior_rows()
+        own = rows @ space.tie
+        return cls(np.diag(sd**-2) + own.T @ own, sd, own, target - rows @ space.fixed)
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Generalised least squares: ``centre`` (k,), ``covariance``, and the part of it that misfit causes."""
+
+    centre: Array
+    covariance: Array
+    by_misfit: Array
+    known_scale: float
+
+    @classmethod
+    def at(
+        cls, left: Sequence[Array], scaled: Sequence[Array], model: ResidualModel, prior: Beliefs, z: Array
+    ) -> _Linear:
+        A, g = prior.precision.copy(), prior.rows.T @ (prior.rows @ z - prior.target)
+        by_misfit = np.zeros_like(A)
+        for i, (r, J) in enumerate(zip(left, scaled)):
+            weighted = np.linalg.solve(model.covariance(i), J)
+            A += J.T @ weighted
+            g += weighted.T @ r
+            by_misfit += weighted.T @ model.discrepancy(i) @ weighted
+        covariance = np.linalg.inv(A)
+        covariance = (covariance + covariance.T) / 2
+        caused = covariance @ by_misfit @ covariance
+        return cls(z - covariance @ g, covariance, caused, model.known_scale)
+
+    def freedom(self, weights: Array) -> float:
+        """Degrees of freedom of the variance of ``weights @ z`` (Satterthwaite 1946)."""
+        variance, caused = weights @ self.covariance @ weights, weights @ self.by_misfit @ weights
+        if caused * np.sqrt(_MOST_FREEDOM) <= variance:
+            return _MOST_FREEDOM
+        return float(np.clip(self.known_scale * (variance / caused) ** 2, 1.0, _MOST_FREEDOM))
+
+    def sd(self, weights: Array) -> float:
+        return float(np.sqrt(weights @ self.covariance @ weights))
+
+    def half_width(self, weights: Array) -> float:
+        """Half the 95 % interval of ``weights @ z``."""
+        return float(min(stdtrit(self.freedom(weights), 0.975) * self.sd(weights), 50.0))
+
+
+def _told(
+    parameters: Array, linear: _Linear, model: ResidualModel, unknowns: Unknowns, space: Space, prior: Beliefs
+) -> Uncertainty:
+    """The answer in the search space as an answer about every parameter."""
+    moved = np.asarray(space.tie.any(axis=1))
+    centre = space.logarithms(np.clip(linear.centre, space.lower, space.upper))
+    half = np.array([linear.half_width(row) for row in space.tie])
+    low = np.maximum(np.exp(centre - half), np.where(moved, unknowns.lower, 0.0))
+    high = np.minimum(np.exp(centre + half), np.where(moved, unknowns.upper, np.inf))
+    shares = [linear.sd(row) / max(float(row @ prior.sd), 1e-300) for row in space.tie]
+    verdicts = [
+        _verdict(float(np.exp(h)), share) if free else GIVEN for h, share, free in zip(half, shares, moved)
+    ]
+    covariance = space.tie @ linear.covariance @ space.tie.T
+    sd = np.sqrt(np.where(moved, np.diag(covariance), 1.0))
     return Uncertainty(
         names=unknowns.names,
         parameters=parameters,
+        centre=np.exp(centre),
         covariance=covariance,
         correlation=covariance / np.outer(sd, sd),
         intervals_95=np.stack([low, high], axis=1),
-        verdicts=tuple(_verdict(f, s / p) for f, s, p in zip(factor, sd, prior_sd)),
+        verdicts=tuple(verdicts),
         at_bound=tuple(_at_bound(parameters, unknowns)),
-        combinations=axes,
-        noise=noise,
-        degrees_of_freedom=float(freedom),
+        combinations=_combinations(linear, space, unknowns.names, prior),
+        residual_model=model,
+        degrees_of_freedom=np.array(
+            [linear.freedom(row) if row.any() else _MOST_FREEDOM for row in space.tie]
+        ),
     )
-
-
-def _noise(residuals: Sequence[Array], names: Sequence[str], parameters: int) -> tuple[SiteNoise, ...]:
-    """Standard deviation and first-order autocorrelation per site, corrected for what the fit took away."""
-    lags = [_autocorrelation(residual, parameters / len(residuals)) for residual in residuals]
-    effective = [r.size * (1 - lag) / (1 + lag) for r, lag in zip(residuals, lags)]
-    kept = max(1 - parameters / sum(effective), 0.1)
-    sd = [float(np.sqrt(residual @ residual / (residual.size * kept))) for residual in residuals]
-    return tuple(SiteNoise(*entry) for entry in zip(names, sd, lags, effective))
-
-
-def _autocorrelation(residual: Array, fitted: float) -> float:
-    """Correlation of neighbours; its bias grows with ``fitted`` parameters per site (Marriott and Pope 1954).
-
-    A perfect fit says nothing about it.
-    """
-    n, squares = residual.size, float(residual @ residual)
-    lag = float(residual[1:] @ residual[:-1]) / squares if squares > 0 else 0.0
-    return float(np.clip(lag + (1 + 3 * lag) * fitted / n, 0.0, 1 - 2 / n))
-
-
-def _sandwich(
-    scaled: Sequence[Array], measured: Sequence[Measured], noise: Sequence[SiteNoise], prior_sd: Array
-) -> Array:
-    """Covariance (p, p) of the logarithms; the prior carries the directions that H does not see."""
-    weights = [site.scale**2 for site in measured]
-    H = sum(w * J.T @ J for w, J in zip(weights, scaled))
-    M = sum(w**2 * J.T @ _noise_covariance(n, len(J)) @ J for w, J, n in zip(weights, scaled, noise))
-    spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
-    prior = np.diag(prior_sd**-2)
-    inverse = np.linalg.inv(H / spread + prior)
-    covariance = inverse @ (M / spread**2 + prior) @ inverse
-    return (covariance + covariance.T) / 2
-
-
-def _noise_covariance(noise: SiteNoise, n: int) -> Array:
-    return noise.sd_N**2 * toeplitz(noise.autocorrelation ** np.arange(n))
 
 
 def _at_bound(parameters: Array, unknowns: Unknowns) -> list[bool]:
@@ -196,17 +242,19 @@ def _verdict(factor: float, share_of_prior: float) -> str:
 
 
 def _combinations(
-    covariance: Array, names: tuple[str, ...], prior_sd: Array, freedom: float
+    linear: _Linear, space: Space, names: tuple[str, ...], prior: Beliefs
 ) -> tuple[Combination, ...]:
-    """Principal axes, best known first."""
-    values, vectors = np.linalg.eigh(covariance)
+    """Principal axes, best known first; the weight of tied parameters is shared among them."""
+    values, vectors = np.linalg.eigh(linear.covariance)
+    members = space.tie.sum(axis=0)
     found = []
-    for value, weights in zip(values, vectors.T):
-        weights = weights * np.sign(weights[np.argmax(np.abs(weights))])
+    for value, axis in zip(values, vectors.T):
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         sd = float(np.sqrt(max(value, 0.0)))
-        factor = float(np.exp(min(stdtrit(freedom, 0.975) * sd, 50.0)))
-        share = sd / float(np.linalg.norm(weights * prior_sd))
-        found.append(Combination(weights, sd, _product(weights, names), _verdict(factor, share)))
+        factor = float(np.exp(linear.half_width(axis)))
+        verdict = _verdict(factor, sd / float(np.linalg.norm(axis * prior.sd)))
+        weights = space.tie @ (axis / members)
+        found.append(Combination(weights, sd, factor, _product(weights, names), verdict))
     return tuple(found)
 
 

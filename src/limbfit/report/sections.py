@@ -247,17 +247,26 @@ def parameters(store: Store) -> Section:
     blocks = _blocks(*found, otherwise="No parameters have been identified yet.")
     if store.stages and not store.calibration.get("uncertainty"):
         blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
-    noise = _noise(store)
-    if noise:
-        text = f"The intervals rest on the residuals at the fitted sites, standard deviation {noise}."
-        blocks = (*blocks, Prose(text))
+    residuals = _residuals(store)
+    if residuals:
+        blocks = (*blocks, Prose(residuals))
     return Section("parameters", "Parameters", blocks)
 
 
-def _noise(store: Store) -> str:
-    """Standard deviations of the residuals, site by site."""
-    sites = (store.calibration.get("uncertainty") or {}).get("residual_sd_N") or {}
-    return ", ".join(f"{tables.fixed(value, 3)} N ({name})" for name, value in sites.items())
+def _residuals(store: Store) -> str:
+    """What the intervals rest on: noise of the records and misfit of the model, site by site."""
+    found = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
+    sites = ", ".join(
+        f"{name} {tables.fixed(site['noise_sd_N'], 3)} N and {tables.fixed(site['misfit_sd_N'], 3)} N"
+        for name, site in (found.get("sites") or {}).items()
+    )
+    if not sites:
+        return ""
+    return (
+        "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
+        f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
+        f"{tables.fixed(100 * found['correlation'], 0)} % of a record."
+    )
 
 
 def convergence(store: Store) -> Section:

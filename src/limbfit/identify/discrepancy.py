@@ -1,0 +1,211 @@
+"""What is wrong with the model: a smooth misfit of its own at every site, told apart from noise.
+
+The residuals of a good fit are mostly the model's: they wander along the record instead of scattering. Each
+site gets a Gaussian process of its own (Kennedy and O'Hagan 2001; Matern 3/2), with a standard deviation in
+shares of its largest force and a correlation in shares of the record, common to all sites. Both are found by
+restricted maximum likelihood (Patterson and Thompson 1971), which counts what the parameters have absorbed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.optimize import minimize
+
+from .noise import SiteNoise
+
+Array = NDArray[np.float64]
+
+CORRELATIONS = (0.04, 0.07, 0.12, 0.2, 0.35, 0.6)  # of a record; longer ones cannot be told from an offset
+_LEAST, _MOST = 1e-5, 1.0  # of the largest force
+_ALIKE = 0.5  # sd of log(sd) between sites: a site with a lucky fit is not trusted beyond its fellows
+
+
+def matern(times_s: Array, correlation: float) -> Array:
+    """Matern 3/2 correlation (n, n); ``correlation`` is its length over the length of the record."""
+    share = times_s / (correlation * np.ptp(times_s))
+    distance = np.sqrt(3.0) * np.abs(share[:, None] - share[None, :])
+    return (1 + distance) * np.exp(-distance)
+
+
+@dataclass(frozen=True)
+class ResidualModel:
+    """Covariance of the residuals, site by site: noise of the record plus the model's misfit.
+
+    ``misfit`` (sites,) is the standard deviation of the misfit over the largest force ``peaks_N`` (sites,).
+    ``known_scale`` is the number of independent residuals on which the size of the misfit rests.
+    """
+
+    noise: tuple[SiteNoise, ...]
+    peaks_N: Array
+    misfit: Array
+    correlation: float
+    known_scale: float
+    criterion: float = field(default=0.0, repr=False)
+
+    @property
+    def misfit_elsewhere(self) -> float:
+        """Misfit to expect at a site that was not fitted, over its largest force: root mean square."""
+        return float(np.sqrt(np.mean(self.misfit**2)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like values; forces in N, misfits over the largest force."""
+        return {
+            "sites": {
+                noise.name: {
+                    "noise_sd_N": noise.sd_N,
+                    "noise_autocorrelation": noise.autocorrelation,
+                    "touch_down_sd_mm": noise.touch_down_mm,
+                    "compared_noise_sd_N": float(np.sqrt(np.trace(noise.covariance) / len(noise.times_s))),
+                    "misfit_sd_N": float(misfit * peak),
+                    "misfit_share": float(misfit),
+                }
+                for noise, misfit, peak in zip(self.noise, self.misfit, self.peaks_N)
+            },
+            "misfit_elsewhere": self.misfit_elsewhere,
+            "correlation": self.correlation,
+            "known_scale": self.known_scale,
+            "effective_samples": self.effective_samples(),
+        }
+
+    def discrepancy(self, i: int) -> Array:
+        """Covariance (n, n) of the misfit of site i."""
+        return (self.misfit[i] * self.peaks_N[i]) ** 2 * matern(self.noise[i].times_s, self.correlation)
+
+    def covariance(self, i: int) -> Array:
+        """Covariance (n, n) of the residuals of site i."""
+        return self.noise[i].covariance + self.discrepancy(i)
+
+    def at(self, times_s: Array, peak_N: float) -> Array:
+        """Covariance (n, n) of the misfit at another site."""
+        return (self.misfit_elsewhere * peak_N) ** 2 * matern(times_s, self.correlation)
+
+    def effective_samples(self) -> float:
+        """How many independent residuals there are: n^2 / ||R||^2 of the correlations R, summed."""
+        total = 0.0
+        for i in range(len(self.noise)):
+            C = self.covariance(i)
+            sd = np.sqrt(np.diag(C))
+            total += len(C) ** 2 / float(np.sum((C / np.outer(sd, sd)) ** 2))
+        return total
+
+    def spectra(self) -> tuple[Spectrum, ...]:
+        return tuple(Spectrum.of(noise.covariance, self.discrepancy(i)) for i, noise in enumerate(self.noise))
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A site's residuals in coordinates in which noise has variance 1 and misfit ``values`` (n,)."""
+
+    transform: Array
+    values: Array
+    log_determinant: float  # of the noise
+
+    @classmethod
+    def of(cls, noise: Array, misfit: Array) -> Spectrum:
+        L = cholesky(noise, lower=True)
+        inner = solve_triangular(L, solve_triangular(L, misfit, lower=True).T, lower=True)
+        values, vectors = eigh((inner + inner.T) / 2)
+        transform = solve_triangular(L, vectors, lower=True, trans="T").T
+        return cls(transform, np.maximum(values, 0.0), 2 * float(np.log(np.diag(L)).sum()))
+
+
+def estimate_discrepancy(
+    residuals: Sequence[Array],
+    jacobians: Sequence[Array],
+    noise: Sequence[SiteNoise],
+    peaks_N: Array,
+    precision: Array,
+) -> ResidualModel:
+    """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per site.
+
+    Derivatives are with respect to the logarithms of the parameters, ``precision`` (p, p) is what is known of
+    them beforehand. Misfits of sites are alike within a factor of about two unless residuals say otherwise.
+    """
+    best: tuple[float, Array, float, _Rows] | None = None
+    start = np.array([_first_guess(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
+    for correlation in CORRELATIONS:
+        rows = _Rows(residuals, jacobians, noise, peaks_N, precision, correlation)
+        bounds = [(np.log(_LEAST), np.log(_MOST))] * len(start)
+        found = minimize(rows.criterion, start, jac=True, method="L-BFGS-B", bounds=bounds)
+        if best is None or found.fun < best[0]:
+            best = float(found.fun), found.x, correlation, rows
+        start = found.x
+    assert best is not None
+    value, logs, correlation, rows = best
+    misfit = np.exp(logs)
+    return ResidualModel(
+        tuple(noise), np.asarray(peaks_N), misfit, correlation, rows.known_scale(logs), value
+    )
+
+
+def _first_guess(residual: Array, noise: SiteNoise, peak: float) -> float:
+    excess = max(float(np.mean(residual**2) - np.trace(noise.covariance) / residual.size), 0.0)
+    return float(np.log(np.clip(np.sqrt(excess) / peak, 10 * _LEAST, 0.5)))
+
+
+class _Rows:
+    """All sites in coordinates in which noise and misfit are diagonal, for one correlation."""
+
+    def __init__(
+        self,
+        residuals: Sequence[Array],
+        jacobians: Sequence[Array],
+        noise: Sequence[SiteNoise],
+        peaks_N: Array,
+        precision: Array,
+        correlation: float,
+    ) -> None:
+        spectra = [
+            Spectrum.of(site.covariance, peak**2 * matern(site.times_s, correlation))
+            for site, peak in zip(noise, peaks_N)
+        ]
+        self.site = np.concatenate([np.full(len(s.values), i) for i, s in enumerate(spectra)])
+        self.values = np.concatenate([s.values for s in spectra])
+        self.residual = np.concatenate([s.transform @ r for s, r in zip(spectra, residuals)])
+        self.jacobian = np.concatenate([s.transform @ J for s, J in zip(spectra, jacobians)])
+        self.precision = precision
+
+    def variances(self, logs: Array) -> Array:
+        return 1.0 + np.exp(2 * logs)[self.site] * self.values
+
+    def criterion(self, logs: Array) -> tuple[float, Array]:
+        """Minus twice the restricted log-likelihood, with what keeps sites alike; its gradient (sites,)."""
+        variances = self.variances(logs)
+        share = (variances - 1) / variances
+        J = self.jacobian / variances[:, None]
+        A = self.jacobian.T @ J + self.precision
+        inverse = np.linalg.inv(A)
+        step = inverse @ (J.T @ self.residual)
+        left = self.residual - self.jacobian @ step
+        fit = left**2 / variances
+        leverage = np.einsum("ni,ij,nj->n", J, inverse, self.jacobian)
+        from_mean = logs - logs.mean()
+        value = (
+            float(fit.sum() + step @ self.precision @ step + np.log(variances).sum())
+            + float(np.linalg.slogdet(A)[1])
+            + float(from_mean @ from_mean) / _ALIKE**2
+        )
+        slope = 2 * np.bincount(self.site, share * (1 - fit - leverage), minlength=len(logs))
+        return value, slope + 2 * from_mean / _ALIKE**2
+
+    def known_scale(self, logs: Array) -> float:
+        """Twice the information on the logarithm of the misfit's variance (Satterthwaite's freedom)."""
+        variances = self.variances(logs)
+        share = (variances - 1) / variances
+        half = self.jacobian / np.sqrt(variances)[:, None]
+        A = half.T @ half + self.precision
+        inner = half.T @ (share[:, None] * half)
+        solved = np.linalg.solve(A, inner)
+        double = np.linalg.solve(A, half.T @ (share[:, None] ** 2 * half))
+        return float(np.sum(share**2) - 2 * np.trace(double) + np.trace(solved @ solved))
+
+
+def scaled(model: ResidualModel, factor: float) -> ResidualModel:
+    """The same model with a misfit that is ``factor`` times as large."""
+    return replace(model, misfit=factor * model.misfit)

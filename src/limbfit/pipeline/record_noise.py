@@ -1,0 +1,25 @@
+"""The noise of a study's records, from what regularising took away from them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..identify.noise import SiteNoise, record_noise
+from ..study import Study
+from .traces_stage import SiteRecord, read_site_trace
+
+
+def site_noise(study: Study, record: SiteRecord) -> SiteNoise:
+    """Noise of a site's record at the times of comparison, its touch-down included."""
+    trace, smooth, facts = read_site_trace(study, record.site)
+    since = trace.time_s - facts["touch_down_s"]
+    inside = (since >= 0) & (since <= smooth.time_s[-1])
+    residual = trace.force_N[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+    return record_noise(
+        record.site.name,
+        record.times_s,
+        residual,
+        record.force_N,
+        record.displacement_mm,
+        facts["touch_down_uncertainty_mm"],
+    )
