@@ -1,0 +1,257 @@
+"""Records judged before anything is simulated: units, names, axes and places that cannot be right.
+
+What makes records of different sites comparable is the apparent shear modulus: peak force over depth, taken
+as that of a rigid flat punch on an incompressible layer bonded to bone (Hayes et al. 1972),
+``F / d = 8 a G k(a / h)`` with the punch's radius a and the tissue's thickness h. Over clean synthetic limbs
+its standard deviation is a factor of about 1.25, while the stiffness itself varies sevenfold. A wrong unit
+shifts it, the speed, the depth and the time step by known factors, so the hypothesis that explains all four
+names the unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Hayes, Keer, Herrmann and Mockros 1972, flat punch, Poisson's ratio 0.5: kappa against a / h.
+_HAYES = (
+    (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0),
+    (1.0, 1.281, 1.683, 2.211, 2.855, 3.609, 5.970, 9.069),
+)
+# Relaxed and tensed soft tissue of limbs in elastography and indentation: about 1.5 to 60 kPa.
+MODULUS_KPA = (1.0, 100.0)
+# Standard deviations (logarithmic) below which differences between sites of one study mean nothing:
+# modulus with and without a known thickness, speed, time step, depth.
+_FLOORS = {"modulus": 0.35, "stiffness": 0.75, "speed": 0.2, "step": 0.1, "depth": 0.4}
+_MIN_OTHERS = 3
+_LARGE = 4.0  # standard deviations of one quantity
+_DROP = 12.0  # by which a hypothesis must lower chi-square
+_EXPLAINED = 16.0  # the chi-square (of 4) up to which a hypothesis explains what it names
+AXIS_DEG, OFF_SKIN_MM, HINT_MM, DEPTH_SHARE = 25.0, 3.0, 12.0, 0.8
+
+# Recorded over true number: force, displacement, time.
+UNITS: dict[str, tuple[float, float, float]] = {
+    "force in kgf (or N x 0.102) instead of N": (1 / 9.80665, 1.0, 1.0),
+    "force multiplied by 9.81 (N taken for kgf)": (9.80665, 1.0, 1.0),
+    "force in gf instead of N": (101.97, 1.0, 1.0),
+    "force in lbf instead of N": (1 / 4.44822, 1.0, 1.0),
+    "force multiplied by 4.45 (N taken for lbf)": (4.44822, 1.0, 1.0),
+    "force in mN instead of N": (1000.0, 1.0, 1.0),
+    "force in kN instead of N": (1e-3, 1.0, 1.0),
+    "displacement in cm instead of mm": (1.0, 0.1, 1.0),
+    "displacement in m instead of mm": (1.0, 1e-3, 1.0),
+    "displacement in inches instead of mm": (1.0, 1 / 25.4, 1.0),
+    "displacement multiplied by 10": (1.0, 10.0, 1.0),
+    "time in ms instead of s": (1.0, 1.0, 1000.0),
+    "time in minutes instead of s": (1.0, 1.0, 1 / 60),
+    "time multiplied by 10 (wrong sampling rate)": (1.0, 1.0, 10.0),
+    "time divided by 10 (wrong sampling rate)": (1.0, 1.0, 0.1),
+}
+
+
+@dataclass(frozen=True)
+class Flag:
+    """Something that looks wrong: sites, what, the numbers that say so, the likely cause, the remedy."""
+
+    sites: tuple[str, ...]
+    kind: str
+    what: str
+    evidence: Mapping[str, float]
+    cause: str
+    remedy: str
+
+    @property
+    def text(self) -> str:
+        names = " and ".join(self.sites)
+        head = f"site{'s' if len(self.sites) > 1 else ''} {names}" if names else "all sites"
+        return f"{head}: {self.what}; likely {self.cause}; {self.remedy}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like values, the text among them."""
+        return {**asdict(self), "sites": list(self.sites), "evidence": dict(self.evidence), "text": self.text}
+
+
+@dataclass(frozen=True)
+class RecordFacts:
+    """A site and its record in numbers; what is not known (yet) is None.
+
+    ``step_s`` is the time between samples, ``radius_mm`` that of a circle of the punch's area,
+    ``thickness_mm`` the soft tissue under the indenter along its axis, ``axis_deg`` the angle between that
+    axis and the skin's inward normal, ``hint_mm`` how far its marker is from where the site was said to be.
+    """
+
+    site: str
+    peak_N: float
+    depth_mm: float
+    speed_mm_s: float
+    step_s: float
+    radius_mm: float
+    thickness_mm: float | None = None
+    axis_deg: float | None = None
+    off_skin_mm: float | None = None
+    hint_mm: float | None = None
+
+    @property
+    def modulus_kPa(self) -> float:
+        """The apparent shear modulus; that of a half-space where the thickness is not known."""
+        stiffness = self.peak_N / self.depth_mm / (8 * self.radius_mm) * 1e3
+        return stiffness / (layer_factor(self.radius_mm / self.thickness_mm) if self.thickness_mm else 1.0)
+
+
+def layer_factor(radius_over_thickness: float) -> float:
+    """How much stiffer a bonded incompressible layer is than a half-space, under a flat punch."""
+    ratios, factors = _HAYES
+    if radius_over_thickness > ratios[-1]:  # the limit of a thin layer: as the cube
+        return factors[-1] * (radius_over_thickness / ratios[-1]) ** 3
+    return float(np.interp(radius_over_thickness, ratios, factors))
+
+
+def implausible(facts: Sequence[RecordFacts]) -> tuple[Flag, ...]:
+    """Flags on the records of a study: each against the others, and against what limbs are like."""
+    return (*_places(facts), *_absolute(facts), *_against_others(facts))
+
+
+def _places(facts: Sequence[RecordFacts]) -> list[Flag]:
+    flags = []
+    for f in facts:
+        if f.axis_deg is not None and f.axis_deg > AXIS_DEG:
+            outward = f.axis_deg > 90
+            what = f"the axis is {f.axis_deg:.0f} degrees from the inward normal of the skin"
+            cause = "an axis that points out of the limb" if outward else "an axis of another site or frame"
+            remedy = "negate it" if outward else "check it, or leave axis out to take the skin's normal"
+            flags.append(Flag((f.site,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy))
+        if f.off_skin_mm is not None and f.off_skin_mm > OFF_SKIN_MM:
+            what = f"the stated position is {f.off_skin_mm:.1f} mm off the skin"
+            cause, remedy = "a wrong position or coordinate system", "give LPS millimetres on the skin"
+            flags.append(Flag((f.site,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy))
+        if f.hint_mm is not None and f.hint_mm > HINT_MM:
+            what = f"its marker lies {f.hint_mm:.1f} mm from where the study says the site is"
+            cause, remedy = "another site's marker", "check 'near' of this site and its neighbours"
+            flags.append(Flag((f.site,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy))
+        share = f.depth_mm / f.thickness_mm if f.thickness_mm else 0.0
+        if share > DEPTH_SHARE:
+            what = f"it goes {f.depth_mm:.1f} mm deep where the soft tissue is {f.thickness_mm:.1f} mm thick"
+            cause = "another place, another limb, or a wrong unit of displacement"
+            flags.append(Flag((f.site,), "depth", what, {"depth_share": share}, cause, "check the record"))
+    return flags
+
+
+def _absolute(facts: Sequence[RecordFacts]) -> list[Flag]:
+    """Where all records together cannot be a limb's."""
+    known = [f.modulus_kPa for f in facts if f.thickness_mm]
+    if len(known) < 2:
+        return []
+    middle = float(np.median(known))
+    low, high = MODULUS_KPA
+    if low <= middle <= high:
+        return []
+    what = f"an apparent shear modulus of {middle:.3g} kPa is not that of soft tissue ({low:g} to {high:g})"
+    wanted = float(np.log(middle / 8.0))
+    cause = min(UNITS, key=lambda name: abs(np.log(UNITS[name][0] / UNITS[name][1]) - wanted))
+    return [Flag((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")]
+
+
+def _features(f: RecordFacts) -> Array:
+    return np.log([f.modulus_kPa, f.speed_mm_s, f.step_s, f.depth_mm])
+
+
+def _spreads(rest: Array, known: bool) -> Array:
+    """Standard deviations (4,) of single sites about the others' median, robust, never below the floors."""
+    floors = [_FLOORS["modulus" if known else "stiffness"], *(_FLOORS[k] for k in ("speed", "step", "depth"))]
+    deviation = 1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0)
+    return np.maximum(floors, deviation) * np.sqrt(1 + 1 / len(rest))
+
+
+def _against_others(facts: Sequence[RecordFacts]) -> list[Flag]:
+    if len(facts) < _MIN_OTHERS + 1:
+        return []
+    known = all(f.thickness_mm for f in facts)
+    if not known:
+        facts = [replace(f, thickness_mm=None) for f in facts]
+    table = np.array([_features(f) for f in facts])
+    away, spread = np.zeros_like(table), np.zeros_like(table)
+    for i in range(len(facts)):
+        rest = np.delete(table, i, axis=0)
+        away[i], spread[i] = table[i] - np.median(rest, axis=0), _spreads(rest, known)
+    swapped = _swapped(facts, away[:, 0] / spread[:, 0]) if known else None
+    flags = [] if swapped is None else [swapped]
+    taken = set() if swapped is None else set(swapped.sites)
+    for f, shift, sd in zip(facts, away, spread):
+        flag = None if f.site in taken else _odd(f, shift, sd)
+        if flag is not None:
+            flags.append(flag)
+    return flags
+
+
+def _odd(f: RecordFacts, shift: Array, sd: Array) -> Flag | None:
+    """What is odd about one record: a unit that explains it all, or a stiffness that nothing explains."""
+    null = float(((shift / sd) ** 2).sum())
+    if np.abs(shift / sd).max() < _LARGE:
+        return None
+    name, best = "", null
+    for unit, (force, travel, time) in UNITS.items():
+        expected = np.log([force / travel, travel / time, time, travel])
+        chi2 = float((((shift - expected) / sd) ** 2).sum())
+        if chi2 < best:
+            name, best = unit, chi2
+    numbers = {
+        "modulus_kPa": f.modulus_kPa,
+        "modulus_ratio": float(np.exp(shift[0])),
+        "speed_ratio": float(np.exp(shift[1])),
+        "time_step_ratio": float(np.exp(shift[2])),
+        "depth_ratio": float(np.exp(shift[3])),
+        "chi2": null,
+        "chi2_explained": best,
+    }
+    what = (
+        f"against the other sites its apparent modulus is {np.exp(shift[0]):.2g} times, its speed "
+        f"{np.exp(shift[1]):.2g} times, its depth {np.exp(shift[3]):.2g} times"
+    )
+    if name and best < _EXPLAINED and null - best > _DROP:
+        return Flag((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
+    if abs(shift[0] / sd[0]) < _LARGE:
+        return None  # a protocol of its own is no fault
+    cause = "a swapped name, another place or another limb"
+    return Flag((f.site,), "stiffness", what, numbers, cause, "check which site this record belongs to")
+
+
+def _swapped(facts: Sequence[RecordFacts], z: Array) -> Flag | None:
+    """The exchange of two records that makes the moduli of all sites alike, where they are not.
+
+    Both sites must be odd, one too stiff and one too soft for its tissue's thickness: two errors that no
+    single unit makes.
+    """
+
+    def scatter(rows: Sequence[RecordFacts]) -> float:
+        moduli = np.log([f.modulus_kPa for f in rows])
+        return float(np.abs(moduli - np.median(moduli)).sum())
+
+    before = scatter(facts)
+    found: tuple[float, int, int] | None = None
+    for i, j in combinations(range(len(facts)), 2):
+        if z[i] * z[j] > 0 or max(abs(z[i]), abs(z[j])) < _LARGE or min(abs(z[i]), abs(z[j])) < 2.0:
+            continue
+        rows = list(facts)
+        rows[i] = replace(facts[i], thickness_mm=facts[j].thickness_mm)
+        rows[j] = replace(facts[j], thickness_mm=facts[i].thickness_mm)
+        after = scatter(rows)
+        if found is None or after < found[0]:
+            found = (after, i, j)
+    if found is None or found[0] > 0.5 * before:
+        return None
+    after, i, j = found
+    one, two = facts[i], facts[j]
+    what = (
+        f"for tissue of {one.thickness_mm:.0f} and {two.thickness_mm:.0f} mm their apparent moduli are "
+        f"{one.modulus_kPa:.3g} and {two.modulus_kPa:.3g} kPa; exchanged, the records of all sites agree"
+    )
+    numbers = {"scatter": before, "scatter_exchanged": after}
+    remedy = "exchange the traces of the two sites, or their names"
+    return Flag((one.site, two.site), "swap", what, numbers, "swapped site names", remedy)
