@@ -71,7 +71,7 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).increment(system, laws, 0.3, 0.3, 0.1, 100.0 * laws.modulus)
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
-    factor = Factor(system)
+    factor = Factor(system, laws.moduli)
     factor.factorise(data)
     data[system.indptr[:40]] *= -1.0
     b = np.random.default_rng(0).standard_normal((system.unknowns, 2))
@@ -96,7 +96,7 @@ def iterations(divisions: int) -> int:
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).increment(system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus)
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
-    factor = Factor(system, "multigrid")
+    factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
     b = system.at_springs(np.ones((system.surface.areas.size, 3, 1)))
     found = factor.solve(data, b, None, 1e-3)
@@ -133,7 +133,7 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     system, laws = System(problem), Laws.build([stiff[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).increment(system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus)
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
-    factor = Factor(system, "multigrid")
+    factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
     b = np.random.default_rng(0).standard_normal((system.unknowns, 1))
     short = factor.solve(data, b, None, 1e-6)

@@ -82,11 +82,20 @@ def _with_contact(
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
             found = factor.solve_anew(data, right, blocks, tolerance, found.x)
+        if not found.convex and factor.lasting:
+            found = _of_descent(factor, data, right, blocks, tolerance)
         foreseen = _closed(touch, system.springs_of(found.x[:, 0]))
         if (foreseen == closed).all() or (factor.lasting and springs is None) or not found.convex:
             break
         closed = foreseen
     return found
+
+
+def _of_descent(factor: Factor, data: Array, b: Array, blocks: Array, tolerance: float) -> Solution:
+    """Where an old factor met negative curvature: the solution of a new one, stiffened where need be."""
+    factor.factorise(data, blocks)
+    found = Solution(b, False, False) if factor.shifted else factor.solve(data, b, None, tolerance)
+    return found if found.convex else Solution(factor.apply(b), False, False)
 
 
 def _closed(touch: Touch, moved: Array) -> Bools:

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from .convexity import shear_stiffness
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
 from .multigrid import Multigrid
 from .springs import SpringChange, SpringColumns
@@ -27,9 +28,9 @@ MOST_REFINEMENTS = 12
 MOST_MINRES, MOST_RESTARTS = 100, 8
 # With fewer unknowns a factor costs no more than multigrid; with more cycles than this it is given up.
 FEWEST_MULTIGRID, MOST_CYCLES = 60_000, 150
-# Smallest shift of a tangent that is not positive definite, relative to each entry of its diagonal: tissues
-# differ in stiffness by up to a hundredfold, and a common shift would freeze the softest.
-FIRST_SHIFT, LARGEST_SHIFT = 1e-2, 1e6
+# Smallest and largest shear stiffness added to a tangent that is not positive definite, as a share of each
+# tissue's own: tissues differ by up to a hundredfold, and a common one would freeze the softest.
+FIRST_SHIFT, LARGEST_SHIFT = 0.1, 1e6
 
 
 @dataclass(frozen=True)
@@ -45,20 +46,22 @@ class Factor:
     """The linear algebra of one simulation: a factor of some earlier tangent and what to do with it.
 
     ``counts`` and ``seconds`` tell what was done.  ``name`` auto is `Multigrid` for quadratic tetrahedra,
-    unless they are few or the factor is to be ``lasting``.
+    unless they are few or the factor is to be ``lasting``.  ``moduli (r,)``: shear modulus of each
+    region, MPa.
     """
 
     def __init__(
-        self, system: System, name: str = "auto", threads: int = 1, lasting: bool = False
-    ) -> None:  # fmt: skip
-        self._system, self._choice, self._threads = system, name, threads
+        self, system: System, moduli: Array, name: str = "auto", threads: int = 1, lasting: bool = False
+    ) -> None:
+        self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
         suits = system.cells.shape[1] == 10 and system.unknowns >= FEWEST_MULTIGRID
         if name == "auto" and suits and not lasting:
             self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]
+        self._shear: Array | None = None
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self._shift = 0.0
+        self._shift = self._next_shift = 0.0
         self._costs = [0.0]
         self.columns = SpringColumns(system, self.apply)
         self.ready = False
@@ -85,6 +88,11 @@ class Factor:
     @property
     def name(self) -> str:
         return self._solver.name
+
+    @property
+    def shifted(self) -> bool:
+        """Whether what was factorised last had to be stiffened."""
+        return self._shift > 0.0
 
     @property
     def lasting(self) -> bool:
@@ -118,11 +126,14 @@ class Factor:
         """
         made = not self.ready and self.lasting and self._single_suffices(data)
         started = time.perf_counter()
-        shift = 0.1 * self._shift if self._shift > FIRST_SHIFT else 0.0
+        shift = self._next_shift
         while not made and not self._factorised(data, shift):
             shift = max(10.0 * shift, FIRST_SHIFT)
             if shift > LARGEST_SHIFT:
                 raise NotPositiveDefiniteError
+        # Less is tried next time, unless less was too little now.
+        enough = shift == self._next_shift
+        self._next_shift = (0.1 * shift if shift > FIRST_SHIFT else 0.0) if enough else shift
         self._shift = shift
         self.ready = True
         self.columns.clear(blocks)
@@ -132,8 +143,9 @@ class Factor:
     def _factorised(self, data: Array, shift: float) -> bool:
         self.counts["factorisations" if self.lasting else "multigrids"] += 1
         if shift:
-            data = data.copy()
-            data[self._diagonal] += shift * np.abs(data[self._diagonal])
+            if self._shear is None:
+                self._shear = shear_stiffness(self._system, self._moduli)
+            data = data + shift * self._shear
         try:
             self._solver.factorise(data)
         except NotPositiveDefiniteError:
@@ -224,7 +236,7 @@ class Factor:
             self._give_up_multigrid()
         self.factorise(data, blocks)
         found = self.solve(data, b, None, tolerance, x)
-        if self._single and self._shift == 0.0 and found.convex and not found.converged:
+        if self._single and not self.shifted and found.convex and not found.converged:
             self._use(single=False)
             self.factorise(data, blocks)
             found = self.solve(data, b, None, tolerance, x, limit=10 * self.limit)

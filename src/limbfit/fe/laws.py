@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Laws:
-    """Materials of all regions as padded arrays; see `MaterialTable`.
+    """Materials of all regions as padded arrays; see `MaterialTable`; ``moduli (r,)`` are instantaneous, MPa.
 
     ``parameter_index (r, p)`` says which global parameter each region's p-th one is (-1: none).
     """
@@ -28,12 +28,17 @@ class Laws:
     d_kappa: Array
     d_prony: Array
     parameter_index: NDArray[np.int64]
-    modulus: float
+    moduli: Array
     modulus_gradient: Array
 
     @property
     def tables(self) -> tuple[Array, Array, NDArray[np.int64]]:
         return self.terms, self.kappa, self.law
+
+    @property
+    def modulus(self) -> float:
+        """Mean of the regions' instantaneous shear moduli, MPa."""
+        return float(self.moduli.mean())
 
     @property
     def count(self) -> int:
@@ -57,8 +62,8 @@ class Laws:
                 d_kappa[r, p] = d.kappa
                 index[r, p] = at
                 at += 1
-        modulus = float(np.mean([m.instantaneous_modulus for m in materials]))
+        moduli = np.array([m.instantaneous_modulus for m in materials])
         gradient = np.concatenate([m.instantaneous_modulus_gradient for m in materials]) / R
         kappa = np.array([t.kappa for t in tables])
         law = np.array([t.volumetric for t in tables])
-        return cls(terms, kappa, law, prony, d_terms, d_kappa, d_prony, index, modulus, gradient)
+        return cls(terms, kappa, law, prony, d_terms, d_kappa, d_prony, index, moduli, gradient)

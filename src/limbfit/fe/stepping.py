@@ -109,10 +109,12 @@ class Simulation:
         self.system = _system(problem, warm_start, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self.factor = Factor(self.system, control.linear_solver, control.threads)
+        self.factor = Factor(self.system, self.laws.moduli, control.linear_solver, control.threads)
         # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
         apart = sensitivities and not self.factor.lasting
-        self.slopes = Factor(self.system, threads=control.threads, lasting=True) if apart else self.factor
+        self.slopes = self.factor
+        if apart:
+            self.slopes = Factor(self.system, self.laws.moduli, threads=control.threads, lasting=True)
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
