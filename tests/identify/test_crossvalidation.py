@@ -68,10 +68,9 @@ def test_perfect_records_are_predicted_from_any_choice():
     assert all(len(fold.heldout) == 2 and fold.converged for fold in folds)
 
 
-def test_the_site_that_differs_is_predicted_worst_and_spoils_fits_that_hold_it():
+def test_the_site_that_differs_is_predicted_badly_from_all_choices_without_it():
     folds = cross_validate(simulate, records([1, 1, 1.2]), near(), choices_of(5, 3))
     by_site = errors_by_site(folds, 5)
-    assert max(range(5), key=lambda i: by_site[i].mean_percent) == 2
     assert [summary.sites for summary in by_site] == [4] * 5
     # 20 % more force: a mean absolute error of 20 % of the mean over the peak.
     force = SITES[2].force(TRUTH)

@@ -100,7 +100,8 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
         return
     for line in findings["facts"]:
         STDOUT.print(line)
-    STDOUT.print("the study can be run")
+    show_flags(findings["flags"])
+    STDOUT.print("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
 
 
 def run(
@@ -213,6 +214,7 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
     show_parameters(summary)
     show_sites(summary)
     show_warnings(summary["sites"])
+    show_flags(summary.get("flags", ()))
     STDOUT.print(f"report: {summary['report']}")
 
 
@@ -221,6 +223,12 @@ def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     for site in sites:
         for text in site["warnings"]:
             STDERR.print(f"warning: site {site['site']}: {text}", soft_wrap=True)
+
+
+def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:
+    """What looks wrong about records, names and places."""
+    for flag in flags:
+        STDERR.print(f"warning: {flag['text']}", soft_wrap=True)
 
 
 def show_parameters(summary: dict[str, Any]) -> None:

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 
 from ..anatomy.imaging import Volume
+from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..indentation import read_indenter
 from ..study import Study
 from .context import Listener, Progress
 from .geometry_stages import given_anatomy, place_site
 from .inputs import marked_image, study_image, study_labels
+from .plausible import record_flags
+from .run import keys
+from .store import Store
 from .traces_stage import read_site_trace
 
 
@@ -21,7 +25,8 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down per recorded site).
+        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down per recorded site),
+        ``flags`` (what looks wrong about records and places, with the evidence).
 
     Raises
     ------
@@ -36,15 +41,41 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
         width = read_indenter(table, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
         facts.append(f"indenter: {study.indenter.file}, {width:.1f} mm wide")
     listener(Progress("check", 1, 2, "records"))
-    sites = {site.name: read_site_trace(study, site)[2] for site in study.sites if site.trace is not None}
+    read = {site.name: read_site_trace(study, site) for site in study.sites if site.trace is not None}
+    sites = {name: record for name, (_, _, record) in read.items()}
     for name, record in sites.items():
         facts.append(
             f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
             f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} mm"
         )
     facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
+    steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
+    placed, anatomy = _places(study)
+    if sites and not placed:
+        facts.append(
+            "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
+            "(limbfit run --until sites, then check again)"
+        )
+    flags = record_flags(study, sites, steps, placed, anatomy)
     listener(Progress("check", 2, 2))
-    return {"study": study.study.name, "facts": facts, "sites": sites}
+    return {
+        "study": study.study.name,
+        "facts": facts,
+        "sites": sites,
+        "flags": [flag.to_dict() for flag in flags],
+    }
+
+
+def _places(study: Study) -> tuple[dict[str, dict[str, Any]], Anatomy | None]:
+    """Sites on the skin and the anatomy, of given surfaces or of stages that are done; else none."""
+    if study.surfaces is not None:
+        anatomy = given_anatomy(study)
+        return {site.name: place_site(site, study, anatomy, None) for site in study.sites}, anatomy
+    store = Store(study.results)
+    if store.stamp("sites") is None or store.state("sites", keys(study)["sites"]).state != "done":
+        return {}, None
+    rows = store.read("sites", "sites.json")["sites"]
+    return {row["site"]: row for row in rows}, load_anatomy(store["surfaces"])
 
 
 def _image_facts(study: Study) -> list[str]:

@@ -1,0 +1,99 @@
+"""The records of a study judged before anything is simulated (see `identify.plausibility`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..anatomy.sites import indenter_axis
+from ..anatomy.surfaces import Anatomy, load_anatomy
+from ..anatomy.under import tissue_under
+from ..identify.plausibility import Flag, RecordFacts, implausible
+from ..indentation import read_indenter
+from ..study import Site, Study
+from .context import Context
+from .traces_stage import read_curves
+
+Placed = Mapping[str, Mapping[str, Any]]
+
+
+def stored_flags(context: Context) -> tuple[Flag, ...]:
+    """Flags on all recorded sites from the stages ``surfaces``, ``sites`` and ``traces``."""
+    study = context.study
+    traces = context.stored("traces", "traces.json")["sites"]
+    rows = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}
+    steps = {
+        name: _step(read_curves(context.store["traces"] / f"{name}-raw.csv")["time_s"]) for name in traces
+    }
+    return record_flags(study, traces, steps, rows, load_anatomy(context.store["surfaces"]))
+
+
+def record_flags(
+    study: Study,
+    records: Mapping[str, Mapping[str, Any]],
+    steps_s: Mapping[str, float],
+    placed: Placed,
+    anatomy: Anatomy | None,
+) -> tuple[Flag, ...]:
+    """Flags on the recorded sites.
+
+    Parameters
+    ----------
+    records : what ``traces.json`` says of each.
+    steps_s : time between samples of each.
+    placed : what ``sites.json`` says of those whose place is known (yet).
+    anatomy : None while the surfaces are not known.
+    """
+    recorded = [site for site in study.sites if site.name in records]
+    radius = _radius(study)
+    facts = [
+        _facts(study, site, records[site.name], steps_s[site.name], radius, placed.get(site.name), anatomy)
+        for site in recorded
+    ]
+    return implausible(facts)
+
+
+def _radius(study: Study) -> float:
+    """Of a circle with the indenter's section, mm; a sphere touches with less."""
+    table = study.indenter
+    file = None if table.file is None else study.path(table.file)
+    shape = table.model_copy(update={"file": file})
+    width = read_indenter(shape, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+    return float(width / np.sqrt(np.pi)) if table.shape in ("square", "stl") else width / 2
+
+
+def _facts(
+    study: Study,
+    site: Site,
+    record: Mapping[str, Any],
+    step_s: float,
+    radius: float,
+    row: Mapping[str, Any] | None,
+    anatomy: Anatomy | None,
+) -> RecordFacts:
+    facts: dict[str, Any] = {}
+    if row is not None and anatomy is not None:
+        width = radius * np.sqrt(np.pi)
+        axis = np.array(row["axis"])
+        normal = indenter_axis(anatomy.skin, row["position_mm"], width)
+        facts = {
+            "thickness_mm": tissue_under(anatomy, row["position_mm"], normal, width),
+            "axis_deg": float(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1)))),
+            "off_skin_mm": row["off_skin_mm"] if row["marker"] is None else None,
+            "hint_mm": None if row["marker"] is None else row["marker"]["distance_to_hint_mm"],
+        }
+    return RecordFacts(
+        site=site.name,
+        peak_N=record["peak_force_N"],
+        depth_mm=record["depth_mm"],
+        speed_mm_s=abs(record["speed_load_mm_s"]),
+        step_s=step_s,
+        radius_mm=radius,
+        **facts,
+    )
+
+
+def _step(times_s: Sequence[float] | np.ndarray) -> float:
+    return float(np.median(np.diff(times_s)))
