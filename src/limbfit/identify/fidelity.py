@@ -26,12 +26,13 @@ from .calibration import (
     iterate_at,
 )
 from .objective import Measured, Simulate, SiteResponse, check_responses
-from .parameters import Grouping, Unknowns, two_stages
+from .parameters import Grouping, Unknowns, search_space, two_stages
 from .trust_region import FIRST_RADIUS
 
 Array = NDArray[np.float64]
 
 Forces = Callable[[Array], Sequence[SiteResponse]]
+_LOOSE = 5.0  # times the tolerances where an answer is but the next start
 _TRIES = 3  # of the fine simulations of a correction
 
 
@@ -66,7 +67,7 @@ def corrected(response: SiteResponse, coarse_N: Array, fine_N: Array, scale: flo
 
 @dataclass(frozen=True)
 class Round:
-    """One correction: the stage, where it was anchored, how far fine forces were from what was expected.
+    """One correction: the stage (-1: before any), its anchor, how far fine forces were from the expected.
 
     ``expected_percent``: mean absolute difference of the fine forces from the corrected coarse ones, in
     percent of the largest, per site; nan where the fine simulation failed, and then ``reason`` says why.
@@ -82,8 +83,8 @@ class Round:
 
 @dataclass(frozen=True)
 class FidelitySettings:
-    """At most ``rounds`` corrections per stage; one is enough where the fine forces are within
-    ``tolerance_percent`` of what was expected, at every site."""
+    """At most ``rounds`` corrections per stage, fewer where the fine forces are as expected at every site:
+    within ``tolerance_percent``, or five times that in a stage that is but the start of another."""
 
     rounds: int = 3
     tolerance_percent: float = 0.1
@@ -163,6 +164,7 @@ def calibrate_corrected(
         tuple(stages) or two_stages(unknowns.names),
         on_iterate,
     )
+    run.begin()
     for _ in run.stages:
         run.next_stage()
     return run.result()
@@ -185,19 +187,27 @@ class _Outer:
     ended: tuple[StageResult, ...] = ()
     rounds: tuple[Round, ...] = ()
 
+    def begin(self) -> None:
+        """Correct at the start already, where it can be simulated: fine over coarse moves little."""
+        space = search_space(self.unknowns, self.stages[0])
+        start = space.expand(space.reduce(np.log(self.unknowns.start)))
+        if not check_responses(self.model.plain(start), self.measured, len(start)):
+            self._anchor(-1, start)
+
     def next_stage(self) -> None:
         """One stage to its end, corrected until coarse and fine agree on it."""
         stage, reason = len(self.ended), "the corrections have not settled"
         before = 0 if self.state is None else self.state.evaluations
         last = len(self.history)
-        settled = False
-        for _ in range(self.fidelity.rounds):
-            inner = self._inner(stage)
+        settled, is_last = False, stage == len(self.stages) - 1
+        allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSE)
+        for number in range(self.fidelity.rounds):
+            inner = self._inner(stage, _LOOSE if number == 0 or not is_last else 1.0)
             reached = self._correct(stage)
             if reached.reason:
                 reason = f"the fine simulation fails: {reached.reason}"
                 break
-            if max(reached.expected_percent) <= self.fidelity.tolerance_percent:
+            if max(reached.expected_percent) <= allowed:
                 settled = True
                 break
         assert self.state is not None
@@ -213,7 +223,7 @@ class _Outer:
         self.ended = (*self.ended, result)
         self.state = replace(self.state, history=(end,), stages=self.ended)
 
-    def _inner(self, stage: int) -> StageResult:
+    def _inner(self, stage: int, loose: float) -> StageResult:
         """The optimum of the model as it is corrected now, from where the round or stage before ended."""
         start = self.state
 
@@ -227,7 +237,7 @@ class _Outer:
             self.model,
             self.measured,
             self.unknowns,
-            self.settings,
+            replace(self.settings, relative_tolerance=loose * self.settings.relative_tolerance),
             stages=self.stages[: stage + 1],
             on_iterate=keep,
             state=start,
@@ -238,7 +248,17 @@ class _Outer:
     def _correct(self, stage: int) -> Round:
         """Anchor the model at the optimum, and take the iterate there as the fine forces see it."""
         assert self.state is not None
-        parameters = np.array(self.history[-1].parameters)
+        found = self._anchor(stage, np.array(self.history[-1].parameters))
+        if not found.reason:
+            standing = replace(self.state, radius=FIRST_RADIUS, stages=self.ended)
+            here = iterate_at(self.model, self.measured, self.unknowns, self.settings, self.stages, standing)
+            here = replace(here, evaluations=self.state.evaluations, failures=self.history[-1].failures)
+            self.history = (*self.history, here)
+            self.state = replace(standing, history=(here,))
+        return found
+
+    def _anchor(self, stage: int, parameters: Array) -> Round:
+        """Simulate the fine forces, and correct the model by them unless that fails."""
         expected = [response.force_N for response in self.model(parameters)]
         for _ in range(_TRIES):
             responses = self.fine(parameters)
@@ -262,11 +282,6 @@ class _Outer:
         self.rounds = (*self.rounds, found)
         if not reason:
             self.model.anchor = anchor
-            standing = replace(self.state, radius=FIRST_RADIUS, stages=self.ended)
-            here = iterate_at(self.model, self.measured, self.unknowns, self.settings, self.stages, standing)
-            here = replace(here, evaluations=self.state.evaluations, failures=self.history[-1].failures)
-            self.history = (*self.history, here)
-            self.state = replace(standing, history=(here,))
         return found
 
     def result(self) -> Corrected:

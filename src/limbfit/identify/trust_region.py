@@ -18,6 +18,7 @@ from scipy.optimize import lsq_linear
 Array = NDArray[np.float64]
 
 FIRST_RADIUS = 1.0
+NO_CHANGE = "the forces would hardly change"
 AT_THE_FLOOR = "the error falls by no more than the simulations can tell"
 _LARGEST_RADIUS = 2.0
 _MAX_REJECTED = 8
@@ -27,6 +28,7 @@ _DAMPING = 1e-2
 _FLOOR = 1e-2
 # The same of three ever shorter steps in a row, however much each promised: what is smooth is not refused so.
 _ROUGH, _MAX_REFUSED = 0.1, 3
+_LITTLE = 4.0  # times the change at which an iteration ends, where it creeps along a valley
 _EXACT = 1e-9  # a residual this small (relative force) is a perfect fit
 
 
@@ -65,6 +67,7 @@ def minimise(
     upper: Array,
     *,
     tolerance: float = 1e-3,
+    change: float = 0.0,
     radius: float = FIRST_RADIUS,
     max_iterations: int = 25,
     stop: Stop | None = None,
@@ -78,12 +81,14 @@ def minimise(
         lower the cost by less than this fraction. It also ends at the noise floor: where a step that promises
         less than a hundredth of the cost is refused, or lowers it by less than this fraction; and where
         three in a row are, each shorter than the one before, that promise less than a tenth.
+    change : ends too where a full step would change the residual vector by less than this, in its norm, or
+        where the last did, and a full step would by less than four times this.
     radius : half the width of the trust region, in z.
     stop : a further rule: from the last two points to a reason, empty to go on.
     """
     rejected = refused = accepted = 0
     while True:
-        reason = _converged(point, lower, upper, tolerance)
+        reason = _converged(point, lower, upper, tolerance, change)
         if reason:
             yield Step(point, radius, reason, converged=True)
             return
@@ -107,6 +112,8 @@ def minimise(
             continue
         previous, point, rejected, refused, accepted = point, trial, 0, 0, accepted + 1
         reason = stop(previous, point) if stop else ""
+        if _creeps(previous, point, lower, upper, change):
+            reason = reason or NO_CHANGE
         if hopeless and previous.cost - point.cost < tolerance * previous.cost:
             reason = reason or AT_THE_FLOOR
         if reason or accepted >= max_iterations:
@@ -145,12 +152,22 @@ def _next_radius(radius: float, length: float, gain: float) -> float:
     return radius
 
 
-def _converged(point: Point, lower: Array, upper: Array, tolerance: float) -> str:
+def _creeps(before: Point, after: Point, lower: Array, upper: Array, change: float) -> bool:
+    """Whether the step changed hardly anything, and the next full one promises little more."""
+    if float(np.linalg.norm(after.residual - before.residual)) >= change:
+        return False
+    step = _bounded_step(after, lower - after.z, upper - after.z)
+    return float(np.linalg.norm(after.jacobian @ step)) < _LITTLE * change
+
+
+def _converged(point: Point, lower: Array, upper: Array, tolerance: float, change: float) -> str:
     if float(np.linalg.norm(point.residual)) < _EXACT:
         return "the fit is exact"
     step = _bounded_step(point, lower - point.z, upper - point.z)
     if np.abs(step).max() < tolerance:
         return f"no parameter would change by more than {tolerance:g} of itself"
+    if float(np.linalg.norm(point.jacobian @ step)) < change:
+        return NO_CHANGE
     if _predicted(point, step) < tolerance * point.cost:
         return f"the squared error would fall by less than {tolerance:g} of itself"
     return ""

@@ -19,7 +19,9 @@ from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
 from ..indentation import Parameters, SiteModel, build_problem
+from ..study import IndenterTable
 from .record import Ramp
+from .sites import INDENTER_EDGE_MM, INDENTER_MM
 
 ELEMENT = "tet10p0"
 STEPS = StepControl(load_steps=10, unload_steps=8)
@@ -78,6 +80,7 @@ def site_force(job: ForceJob) -> TrueForce:
         axis=job.axis,
         knots_s=knots_s,
         knots_mm=knots_mm,
+        indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
     problem = build_problem(model, mesh, job.parameters)
     result = solve(replace(problem, element=ELEMENT), steps=STEPS)

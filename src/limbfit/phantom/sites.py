@@ -16,7 +16,7 @@ from ..errors import SiteError
 from .geometry import Limb
 from .mri import SkinMarker
 
-INDENTER_MM = 20.0
+INDENTER_MM, INDENTER_EDGE_MM = 20.0, 2.0
 SAFE_SHARE = 0.4  # of the thinnest soft tissue under the indenter
 HINT_ERROR_MM = (3.0, 5.0)  # how far off a place is when measured by hand
 SPEED_MM_S, SPEED_SPREAD = 0.96, 0.05

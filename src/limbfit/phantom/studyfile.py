@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..anatomy.layers import LayerSpec
-from .sites import INDENTER_MM, TrueSite
+from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 _HEAD = """\
 # A synthetic residuum with known truth: compare what limbfit finds with truth.json.
@@ -26,6 +26,7 @@ surface_edge_mm = {surface:.1f}
 [indenter]
 shape = "square"
 width_mm = {width:.1f}
+edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sharp edge they never do
 
 {mesh}
 # One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
@@ -72,6 +73,7 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         layers=_layers(layers),
         surface=_SURFACE_EDGE_MM[detail],
         width=INDENTER_MM,
+        edge=INDENTER_EDGE_MM,
         mesh=_MESH[detail],
     )
     parts = [head]

@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 
 from ..errors import StudyError
 from ..identify.calibration import Calibration, CalibrationSettings, State, calibrate
+from ..identify.fidelity import FidelitySettings, Round, calibrate_corrected
+from ..identify.multistart import Multistart, describe, multistart
 from ..identify.objective import Measured, SiteResponse
-from ..identify.parameters import Unknowns
+from ..identify.parameters import Grouping, Prior, Unknowns, constrained, two_stages
 from ..identify.uncertainty import Uncertainty, estimate_uncertainty
-from ..indentation import Simulation, flat_names, to_parameters, to_vector
-from ..study import Study
+from ..indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
+from ..study import Site, Study
 from .context import Context
+from .plausible import stored_flags
+from .record_noise import site_noise
 from .simulations import SimulationCache
-from .store import read_json, write_json
+from .store import write_json
 from .traces_stage import site_record
 
 Array = NDArray[np.float64]
@@ -31,55 +35,137 @@ def stage_titles(tissues: Sequence[str]) -> tuple[str, ...]:
     return ("one material", f"{COUNTS[n] if n < len(COUNTS) else n} materials")[: min(n, 2)]
 
 
+class Laboratory:
+    """Simulates some sites: with derivatives on one mesh, without on the other where there are two.
+
+    ``title`` is the stage or experiment that is told of progress.
+    """
+
+    def __init__(
+        self, context: Context, cache: SimulationCache, sites: Sequence[Site], title: str = "calibrate"
+    ) -> None:
+        study = context.study
+        self.context, self.cache, self.title = context, cache, title
+        self.records = [site_record(context, site) for site in sites]
+        self.searched = self.records
+        if study.mesh.coarse is not None:
+            self.searched = [site_record(context, site, coarse=True) for site in sites]
+        self.evaluations = self.corrections = 0
+        self.warnings: dict[str, list[str]] = {}
+
+    @property
+    def measured(self) -> list[Measured]:
+        return [Measured(record.site.name, record.force_N, record.site.weight) for record in self.records]
+
+    def search(self, parameters: Array) -> list[SiteResponse]:
+        """Force and derivatives where parameters are searched."""
+        self.evaluations += 1
+        jobs = [record.job(parameters) for record in self.searched]
+        return self._run(jobs, f"evaluation {self.evaluations}")
+
+    def check(self, parameters: Array) -> list[SiteResponse]:
+        """Force on the study's own meshes; what failed before is tried again."""
+        self.corrections += 1
+        jobs = [record.job(parameters, sensitivities=False) for record in self.records]
+        return self._run(jobs, f"correction {self.corrections}", again=True)
+
+    def _run(self, jobs: Sequence[SimulationJob], what: str, again: bool = False) -> list[SiteResponse]:
+        found = []
+        self.warnings = {}
+        for simulation in self.cache.run(jobs, self.context.executor, again):
+            found.append(_response(simulation))
+            if simulation.warnings:
+                self.warnings[simulation.site] = list(simulation.warnings)
+            self.context.tell(self.title, 0, 0, f"{what}, site {simulation.site}")
+        return found
+
+    def identify(self, start: Unknowns, stages: Sequence[Grouping]) -> tuple[Calibration, tuple[Round, ...]]:
+        """The parameters of the sites' records as the study wants them found, and the corrections made."""
+        study, table = self.context.study, self.context.study.calibration
+
+        titles = stage_titles(study.tissues)[-len(stages) :]
+
+        def tell(state: State) -> None:
+            name = titles[state.history[-1].stage]
+            self.context.tell(self.title, 0, 0, f"{name}: {_describe(state, study.tissues)}")
+
+        if study.mesh.coarse is None:
+            found = calibrate(
+                self.search, self.measured, start, settings(study), stages=stages, on_iterate=tell
+            )
+            return found, ()
+        corrected = calibrate_corrected(
+            self.search, self.check, self.measured, start, settings(study),
+            FidelitySettings(table.corrections, table.correction_tolerance_percent),
+            stages=stages, on_iterate=tell,
+        )  # fmt: skip
+        return corrected.calibration, corrected.rounds
+
+
 def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
-    """One material, then each tissue its own, on the fitted sites; simulations and iterates are kept."""
-    study = context.study
+    """One material, then each tissue its own, on the fitted sites; simulations are kept.
+
+    A run taken up again repeats the interrupted one from its kept simulations.
+    """
+    study, table = context.study, context.study.calibration
     if not study.fitted:
         raise StudyError("no site is fitted", file=study.file, place="sites", remedy="set fitted = true")
-    records = [site_record(context, site) for site in study.fitted]
-    measured = [Measured(record.site.name, record.force_N) for record in records]
+    for flag in stored_flags(context):
+        context.tell("calibrate", 0, 0, f"warning: {flag.text}")
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    state_file = folder / "state.json"
-    evaluations = 0
+    laboratory = Laboratory(context, cache, study.fitted)
+    stages = groupings(study)
+    rounds_of: dict[int, tuple[Round, ...]] = {}
 
-    def respond(parameters: Array) -> list[SiteResponse]:
-        nonlocal evaluations
-        evaluations += 1
-        jobs = [record.job(parameters) for record in records]
-        responses = []
-        for simulation in cache.run(jobs, context.executor):
-            responses.append(_response(simulation))
-            text = f"evaluation {evaluations}, site {simulation.site}"
-            context.tell("calibrate", 0, 0, text)
-        return responses
+    def run(number: int, start: Unknowns) -> Calibration:
+        if number:
+            context.tell("calibrate", 0, 0, f"start {number + 1} of {table.starts}")
+        found, rounds = laboratory.identify(start, stages)
+        rounds_of[id(found)] = rounds
+        return found
 
-    def keep(state: State) -> None:
-        write_json(state_file, state.to_dict())
-        context.tell("calibrate", 0, 0, _describe(state, study.tissues))
-
-    found = calibrate(
-        respond,
-        measured,
-        unknowns(study),
-        CalibrationSettings(
-            objective=study.calibration.objective,
-            relative_tolerance=study.calibration.relative_tolerance,
-            max_iterations=study.calibration.max_iterations,
-        ),
-        on_iterate=keep,
-        state=State.from_dict(read_json(state_file)) if state_file.is_file() else None,
+    tried = multistart(run, unknowns(study), table.starts, table.seed)
+    found = tried.best
+    noise = [site_noise(study, record) for record in laboratory.records]
+    known = estimate_uncertainty(
+        found.parameters, found.responses, laboratory.measured, unknowns(study), noise, stages[-1]
     )
-    known = estimate_uncertainty(found.parameters, found.responses, measured, unknowns(study))
-    ends = list(cache.run([record.job(found.parameters) for record in records], context.executor))
-    warnings = {end.site: list(end.warnings) for end in ends if end.warnings}
-    content = _calibration_record(context, found, known, folder) | {"warnings": warnings}
+    rounds = rounds_of[id(found)]
+    # The forces of the answer once more, from what is kept, for what is doubtful about them.
+    (laboratory.check if rounds else laboratory.search)(found.parameters)
+    content = _calibration_record(context, found, known, laboratory.cache)
+    content |= {
+        "corrections": [_round_record(one, found.sites, study.tissues) for one in rounds],
+        "multistart": _multistart_record(tried, study.tissues) if table.starts > 1 else None,
+        "warnings": laboratory.warnings,
+    }
     write_json(folder / "calibration.json", content)
     return {}
 
 
 def _response(simulation: Simulation) -> SiteResponse:
-    assert simulation.jacobian is not None
-    return SiteResponse(simulation.force_N, simulation.jacobian, simulation.completed, simulation.reason)
+    none = np.zeros((simulation.force_N.size, 0))
+    jacobian = none if simulation.jacobian is None else simulation.jacobian
+    return SiteResponse(simulation.force_N, jacobian, simulation.completed, simulation.reason)
+
+
+def settings(study: Study) -> CalibrationSettings:
+    """How the study wants its parameters found."""
+    table = study.calibration
+    return CalibrationSettings(
+        objective=table.objective,
+        relative_tolerance=table.relative_tolerance,
+        max_iterations=table.max_iterations,
+        stopping=table.stopping,
+        force_error_percent=table.force_error_percent,
+    )
+
+
+def groupings(study: Study) -> tuple[Grouping, ...]:
+    """Which parameters move together in each stage, as far as the study lets them move."""
+    names, table = unknowns(study).names, study.calibration
+    made = [constrained(one, names, table.fixed, table.tied) for one in two_stages(names)]
+    return tuple(dict.fromkeys(made))
 
 
 def unknowns(study: Study) -> Unknowns:
@@ -90,7 +176,8 @@ def unknowns(study: Study) -> Unknowns:
         return to_vector({tissue: material.of(tissue, which) for tissue in tissues}, tissues)
 
     names = tuple(f"{tissue}.{name}" for tissue, name in flat_names(tissues))
-    return Unknowns(names, flat("start"), flat("lower"), flat("upper"))
+    priors = tuple(Prior(name, p.median, p.factor) for name, p in study.calibration.prior.items())
+    return Unknowns(names, flat("start"), flat("lower"), flat("upper"), priors)
 
 
 def _describe(state: State, tissues: Sequence[str]) -> str:
@@ -100,16 +187,15 @@ def _describe(state: State, tissues: Sequence[str]) -> str:
         f"{tissue} c {v['c_kPa']:.3g} kPa, m {v['m']:.3g}, gamma {v['gamma']:.3g}, tau {v['tau_s']:.3g} s"
         for tissue, v in values.items()
     )
-    return f"{stage_titles(tissues)[last.stage]}: error {np.mean(last.errors_percent):.2f} % | {words}"
+    return f"error {np.mean(last.errors_percent):.2f} % | {words}"
 
 
 def _calibration_record(
-    context: Context, found: Calibration, known: Uncertainty, folder: Path
+    context: Context, found: Calibration, known: Uncertainty, cache: SimulationCache
 ) -> dict[str, Any]:
     """What ``calibration.json`` holds."""
     study, tissues = context.study, context.study.tissues
     bounds = unknowns(study)
-    cache = SimulationCache(folder / "runs")
     example = cache.example()
     return {
         "stages": [_stage_record(found, i, bounds.start, tissues) for i in range(len(found.stages))],
@@ -120,6 +206,7 @@ def _calibration_record(
         "objective": study.calibration.objective,
         "uncertainty": _uncertainty_record(known, tissues),
         "forward_runs": len(cache),
+        "forward_runs_with_sensitivities": cache.with_sensitivities(),
         "linear_solver": example.facts["linear_solver"] if example else None,
         "element": example.facts["element"] if example else None,
     }
@@ -151,6 +238,40 @@ def _stage_record(found: Calibration, number: int, start: Array, tissues: Sequen
     }
 
 
+def _round_record(one: Round, sites: Sequence[str], tissues: Sequence[str]) -> dict[str, Any]:
+    """One correction of the coarse meshes' forces; percentages are of each site's largest force."""
+    return {
+        "stage": stage_titles(tissues)[one.stage] if one.stage >= 0 else "start",
+        "parameters": to_parameters(np.array(one.parameters), tissues),
+        "scale_by_site": dict(zip(sites, one.scales, strict=True)),
+        "difference_percent_by_site": dict(zip(sites, one.difference_percent, strict=True)),
+        "change_percent_by_site": dict(zip(sites, one.expected_percent, strict=True)),
+        "reason": one.reason,
+    }
+
+
+def _multistart_record(tried: Multistart, tissues: Sequence[str]) -> dict[str, Any]:
+    """What came of every start."""
+    names = [f"{tissue}.{name}" for tissue, name in flat_names(tissues)]
+    return {
+        "summary": describe(tried, names),
+        "reached": tried.reached,
+        "starts": [
+            {
+                "start": to_parameters(np.array(one.start), tissues),
+                "parameters": None
+                if one.parameters is None
+                else to_parameters(np.array(one.parameters), tissues),
+                **{
+                    key: getattr(one, key)
+                    for key in ("cost", "evaluations", "converged", "reason", "same", "apart")
+                },
+            }
+            for one in tried.starts
+        ],
+    }
+
+
 def _uncertainty_record(known: Uncertainty, tissues: Sequence[str]) -> dict[str, Any]:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in tissues}
@@ -163,5 +284,6 @@ def _uncertainty_record(known: Uncertainty, tissues: Sequence[str]) -> dict[str,
         "verdict": dict(zip(known.names, known.verdicts, strict=True)),
         "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
         "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],
-        "residual_sd_N": {noise.name: noise.sd_N for noise in known.noise},
+        "most_probable": to_parameters(known.centre, tissues),
+        "residuals": known.residual_model.to_dict(),
     }

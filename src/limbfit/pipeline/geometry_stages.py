@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from .context import Context
 from .corrections import DIGEST, LABELS
 from .inputs import automatic_labels, labelled_file, naming, study_image, study_labels
 from .marked_images import MARKED_SKIN, second_skin, without_own_markers
+from .simulations import COARSE
 from .store import file_digest, read_json, write_json
 
 THICKNESS = "fat-depth.vtp"
@@ -217,6 +218,7 @@ def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, Ba
 
 
 def mesh_settings(study: Study) -> MeshSettings:
+    """How the site meshes of a study are made."""
     table, geometry = study.mesh, study.geometry
     return MeshSettings(
         element=table.element,
@@ -237,9 +239,31 @@ def mesh_settings(study: Study) -> MeshSettings:
     )
 
 
+def coarse_settings(study: Study) -> MeshSettings | None:
+    """How the second, coarse meshes are made; None where the study wants none."""
+    table = study.mesh.coarse
+    return None if table is None else replace(mesh_settings(study), **table.model_dump())
+
+
 def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
-    """One graded mesh per site, side by side; meshes of an interrupted run are kept."""
-    settings = mesh_settings(context.study)
+    """One graded mesh per site, and a coarse one where the study wants it; side by side.
+
+    Meshes of an interrupted run are kept.
+    """
+    study = context.study
+    content = _make_meshes(context, folder, mesh_settings(study), "")
+    coarse = coarse_settings(study)
+    if coarse is not None:
+        (folder / COARSE).mkdir(exist_ok=True)
+        content["coarse"] = _make_meshes(context, folder / COARSE, coarse, "coarse, ")
+    write_json(folder / "mesh.json", content)
+    for facts in (*folder.glob("*.vtu"), *folder.glob(f"{COARSE}/*.vtu")):
+        facts.with_suffix(".json").unlink()
+    return {}
+
+
+def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
+    """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
     sites = context.stored("sites", "sites.json")["sites"]
     stamp = context.store.stamp("surfaces") or {}
     jobs = [
@@ -256,17 +280,11 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     ]
     facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if _is_meshed(job)}
     missing = [job for job in jobs if job.site not in facts]
-    context.tell("mesh", len(facts), len(jobs))
+    context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
     for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         facts[job.site] = made
-        context.tell("mesh", len(facts), len(jobs), f"site {job.site}: {made['nodes']} nodes")
-    write_json(
-        folder / "mesh.json",
-        {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}},
-    )
-    for job in jobs:
-        job.file.with_suffix(".json").unlink()
-    return {}
+        context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {made['nodes']} nodes")
+    return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
 
 
 def _is_meshed(job: MeshJob) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..identify.prediction import error_percent, prediction_sd, summarise
-from ..indentation import Parameters, Simulation, SiteModel, simulate_fields, to_parameters, to_vector
+from ..identify.fidelity import Anchor, corrected
+from ..identify.objective import SiteResponse
+from ..identify.prediction import Known, error_percent, summarise
+from ..indentation import (
+    Parameters,
+    Simulation,
+    SimulationJob,
+    SiteModel,
+    simulate_fields,
+    to_parameters,
+    to_vector,
+)
 from .context import Context
+from .outliers import outlier_record
 from .simulations import SimulationCache
 from .store import write_json
 from .traces_stage import SiteRecord, site_record, write_curves
@@ -27,27 +38,68 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     calibration = context.stored("calibrate", "calibration.json")
     found = [to_vector(stage["parameters"], study.tissues) for stage in calibration["stages"]]
     one, best = found[0], found[-1]
-    covariance = np.array(calibration["uncertainty"]["covariance_log"])
+    known = Known.of(calibration["uncertainty"])
     records = [site_record(context, site) for site in study.sites if site.trace is not None]
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
-    jobs = [record.job(best) for record in records]
-    # At the fitted sites the calibration has simulated the one-material optimum already, with sensitivities.
-    if len(found) > 1:
-        jobs += [record.job(one, sensitivities=record.site.fitted) for record in records]
+    jobs = _jobs(context, records, best, one if len(found) > 1 else None)
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
         context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
-    ours, simple = simulations[: len(records)], simulations[len(records) :]
+    n = len(records)
+    ours, simple, coarse = simulations[:n], simulations[n : len(found) * n], simulations[len(found) * n :]
+    if coarse:
+        simple = [
+            s if record.site.fitted else _fine_force(s, fine, rough)
+            for record, s, fine, rough in zip(records, simple, ours, coarse)
+        ]
+        ours = [_with_derivatives(*parts) for parts in zip(ours, coarse)]
     _write_fields(context, folder, records, best, len(jobs))
     rows = []
     for record, with_all, with_one in zip_longest(records, ours, simple):
-        _write_prediction(folder, record, with_all, with_one, best, covariance)
+        _write_prediction(folder, record, with_all, with_one, best, known)
         rows.append(_row(record, with_all, with_one))
-    write_json(folder / "predict.json", {"sites": rows, **_means(rows)})
+    searched = records
+    if study.mesh.coarse is not None:
+        searched = [site_record(context, record.site, coarse=True) for record in records]
+    doubts = outlier_record(context, cache, records, ours, best, one, searched)
+    write_json(folder / "predict.json", {"sites": rows, **_means(rows), **doubts})
     return {}
+
+
+def _jobs(
+    context: Context, records: Sequence[SiteRecord], best: Array, one: Array | None
+) -> list[SimulationJob]:
+    """Every record with all materials, then with one (unless None), then on coarse meshes where there are.
+
+    With coarse meshes derivatives are theirs, and so is the one material's force at held-out sites; at the
+    fitted ones the calibration has simulated it already.
+    """
+    if context.study.mesh.coarse is None:
+        simple = [] if one is None else [r.job(one, sensitivities=r.site.fitted) for r in records]
+        return [record.job(best) for record in records] + simple
+    coarse = [site_record(context, record.site, coarse=True) for record in records]
+    jobs = [record.job(best, sensitivities=False) for record in records]
+    if one is not None:
+        pairs = zip(records, coarse, strict=True)
+        jobs += [(fine if fine.site.fitted else rough).job(one, sensitivities=False) for fine, rough in pairs]
+    return jobs + [record.job(best) for record in coarse]
+
+
+def _with_derivatives(fine: Simulation, coarse: Simulation) -> Simulation:
+    """The fine force with the coarse mesh's derivatives, scaled as the forces are."""
+    assert coarse.jacobian is not None
+    scale = Anchor(np.zeros(0), (coarse.force_N,), (fine.force_N,)).scales[0]
+    return replace(fine, jacobian=scale * coarse.jacobian)
+
+
+def _fine_force(simple: Simulation, fine: Simulation, coarse: Simulation) -> Simulation:
+    """The one material's force on a coarse mesh, corrected by what is known with all materials."""
+    anchor = Anchor(np.zeros(0), (coarse.force_N,), (fine.force_N,))
+    rough = SiteResponse(simple.force_N, np.zeros((simple.force_N.size, 0)))
+    return replace(simple, force_N=corrected(rough, coarse.force_N, fine.force_N, anchor.scales[0]).force_N)
 
 
 @dataclass(frozen=True)
@@ -77,10 +129,10 @@ def _write_fields(
 
 
 def _write_prediction(
-    folder: Path, record: SiteRecord, ours: Simulation, one: Simulation | None, best: Array, covariance: Array
+    folder: Path, record: SiteRecord, ours: Simulation, one: Simulation | None, best: Array, known: Known
 ) -> None:
     assert ours.jacobian is not None
-    sd = prediction_sd(ours.jacobian, best, covariance)
+    half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.site.name)
     write_curves(
         folder / f"{record.site.name}.csv",
         time_s=record.times_s,
@@ -88,8 +140,8 @@ def _write_prediction(
         force_measured_N=record.force_N,
         force_simulated_N=ours.force_N,
         **({} if one is None else {"force_one_material_N": one.force_N}),
-        force_low_N=np.maximum(ours.force_N - 1.96 * sd, 0.0),
-        force_high_N=ours.force_N + 1.96 * sd,
+        force_low_N=np.maximum(ours.force_N - half, 0.0),
+        force_high_N=ours.force_N + half,
     )
 
 

@@ -22,11 +22,15 @@ from .traces_stage import run_traces
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
 _UNSEEN: dict[str, Any] = {"region": "", "trace": None, "axis": None, "edge": None}
-_IDENTIFY = ("calibration", "objective", "parameters", "prediction", "trust_region", "uncertainty")
+_IDENTIFY = (
+    *("calibration", "fidelity", "multistart", "objective", "parameters", "prediction", "trust_region"),
+    *("uncertainty", "noise", "discrepancy"),
+)
 _MECHANICS = (
-    *("fe", "indentation", "mesh", "pipeline/simulations", "pipeline/traces_stage"),
+    *("fe", "indentation", "mesh", "pipeline/simulations", "pipeline/traces_stage", "pipeline/record_noise"),
     *(f"identify/{name}" for name in _IDENTIFY),
 )
+_DOUBTS = ("identify/outliers", "identify/plausibility", "pipeline/outliers", "pipeline/plausible")
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation"), rooms=("anatomy",)),
     Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=("anatomy",)),
@@ -38,7 +42,7 @@ STAGES = (
         run_calibrate,
         ("sites", "traces", "mesh"),
         ("material", "calibration", "solver", "indenter"),
-        ("name", "fitted", "edge"),
+        ("name", "fitted", "weight", "edge"),
         (*_MECHANICS, "pipeline/calibrate_stage"),
     ),
     Stage(
@@ -47,7 +51,7 @@ STAGES = (
         ("sites", "traces", "mesh", "calibrate"),
         (),
         ("name", "edge"),
-        (*_MECHANICS, "pipeline/predict_stage", "fields"),
+        (*_MECHANICS, *_DOUBTS, "pipeline/predict_stage", "fields"),
     ),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region"), ("report", "pipeline")),
 )
@@ -243,6 +247,7 @@ def summarise(study: Study) -> dict[str, Any]:
         ]
         for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
             summary[key] = predicted[key]
+        summary["flags"] = predicted.get("flags", [])
     report = store["report"] / "report.html"
     if report.is_file():
         summary["report"] = str(report)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from .provenance import code_digest
 from .store import atomic, digest, file_digest
 
 ROOMS = ("fe", "indentation", "mesh")  # whose code decides a simulation
+COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
 CURVE_POINTS = 81  # times, evenly over the indentation, at which measured and simulated force are compared
 
 
@@ -24,18 +25,31 @@ class SimulationCache:
     """Finished simulations in ``folder``, one file each.
 
     ``also`` are folders of earlier runs: what is found there is copied, since they may be replaced.
+    ``work`` does a job; what it tells beyond `simulate` is in the simulation's facts.
     """
 
-    def __init__(self, folder: Path, also: Sequence[Path] = ()) -> None:
-        self.folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        also: Sequence[Path] = (),
+        work: Callable[[SimulationJob], Simulation] = simulate,
+    ) -> None:
+        self.folder, self.work = folder, work
         self.places = (folder, *also)
         folder.mkdir(parents=True, exist_ok=True)
 
-    def run(self, jobs: Sequence[SimulationJob], executor: Executor) -> Iterator[Simulation]:
-        """The jobs' simulations, in order; those not found are done on the executor and kept."""
+    def run(
+        self, jobs: Sequence[SimulationJob], executor: Executor, again: bool = False
+    ) -> Iterator[Simulation]:
+        """The jobs' simulations, in order; those not found are done on the executor and kept.
+
+        ``again``: those that failed are tried once more.
+        """
         found = {i: kept for i, job in enumerate(jobs) if (kept := self._find(job)) is not None}
+        if again:
+            found = {i: kept for i, kept in found.items() if kept.completed}
         missing = [job for i, job in enumerate(jobs) if i not in found]
-        made = executor.map(simulate, missing, keys=[job.model.name for job in missing])
+        made = executor.map(self.work, missing, keys=[job.model.name for job in missing])
         for i, job in enumerate(jobs):
             if i in found:
                 yield found[i]
@@ -51,6 +65,10 @@ class SimulationCache:
 
     def __len__(self) -> int:
         return len(list(self.folder.glob("*.npz")))
+
+    def with_sensitivities(self) -> int:
+        """How many of the kept simulations have derivatives."""
+        return sum(_load(file).jacobian is not None for file in self.folder.glob("*.npz"))
 
     def _find(self, job: SimulationJob) -> Simulation | None:
         name = f"{job_digest(job)}.npz"
@@ -95,12 +113,12 @@ def job_digest(job: SimulationJob) -> str:
 
 
 def site_model(
-    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float]
+    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float], coarse: bool = False
 ) -> SiteModel:
-    """The stored mesh and place of a site with a displacement history."""
+    """The stored mesh (or the coarse one) and place of a site with a displacement history."""
     study: Study = context.study
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
-    mesh = context.store["mesh"] / f"{site.name}.vtu"
+    mesh = context.store["mesh"] / (COARSE if coarse else "") / f"{site.name}.vtu"
     file = None if study.indenter.file is None else study.path(study.indenter.file)
     return SiteModel(
         name=site.name,
@@ -118,10 +136,10 @@ def site_model(
     )
 
 
-def recorded_model(context: Context, site: Site) -> SiteModel:
-    """The site driven by its record, from touch-down."""
+def recorded_model(context: Context, site: Site, coarse: bool = False) -> SiteModel:
+    """The site driven by its record, from touch-down; ``coarse``: on its coarse mesh."""
     facts = context.stored("traces", "traces.json")["sites"][site.name]
-    return site_model(context, site, facts["knots_s"], facts["knots_mm"])
+    return site_model(context, site, facts["knots_s"], facts["knots_mm"], coarse)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:
@@ -129,3 +147,9 @@ def planned_model(context: Context, site: Site) -> SiteModel:
     assert site.depth_mm is not None
     ramp = site.depth_mm / site.speed_mm_s
     return site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+
+
+def experiment_cache(context: Context, folder: Path) -> SimulationCache:
+    """Simulations of the experiment in ``folder``; all others of the study count as done."""
+    others = sorted(place for place in context.store.folder.glob("*/runs") if place.parent != folder)
+    return SimulationCache(folder / "runs", also=others)

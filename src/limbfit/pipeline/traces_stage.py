@@ -98,12 +98,13 @@ class SiteRecord:
         return SimulationJob(self.model, self.tissues, values, times, sensitivities)
 
 
-def site_record(context: Context, site: Site) -> SiteRecord:
+def site_record(context: Context, site: Site, coarse: bool = False) -> SiteRecord:
+    """The stored record of a site and its model, on its coarse mesh where asked for."""
     curves = read_curves(context.store["traces"] / f"{site.name}.csv")
     return SiteRecord(
         site=site,
         tissues=context.study.tissues,
-        model=recorded_model(context, site),
+        model=recorded_model(context, site, coarse),
         times_s=curves["time_s"],
         displacement_mm=curves["displacement_mm"],
         force_N=curves["force_N"],

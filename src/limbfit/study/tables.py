@@ -169,8 +169,21 @@ class GeometryTable(Table):
         return self.layers or (Layer(name="skin", thickness_mm=self.skin_layer_mm),)
 
 
+class CoarseMeshTable(Table):
+    """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
+
+    edge_near_mm: Positive = 5.5
+    edge_far_mm: Positive = 30.0
+    near_radius_mm: Positive = 12.0
+    growth: Positive = 0.9
+    flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
+
+
 class MeshTable(Table):
-    """The mesh of each site: element and edge lengths near the indenter and far from it."""
+    """The mesh of each site: element and edge lengths near the indenter and far from it.
+
+    With ``coarse``, parameters are searched on coarse meshes, whose forces these meshes correct.
+    """
 
     element: Literal["tet4", "tet10"] = "tet10"
     edge_near_mm: Positive = 3.5
@@ -180,6 +193,7 @@ class MeshTable(Table):
     flatness: Annotated[float, Field(ge=1, le=2)] = 1.0
     engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
+    coarse: CoarseMeshTable | None = None
 
 
 class IndenterTable(Table):
@@ -214,12 +228,14 @@ class Site(Table):
 
     ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
     ``axis`` (into the limb) and ``edge`` (one edge direction of the square) are found when not given.
+    ``weight`` is how often the record of a fitted site counts.
     Where there is no ``trace``, ``depth_mm`` and ``speed_mm_s`` plan an indentation to be simulated.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$")
     region: str = ""
     fitted: bool = False
+    weight: Positive = 1.0
     trace: Path | None = None
     depth_mm: Positive | None = None
     speed_mm_s: Positive = 0.96
@@ -277,16 +293,74 @@ class MaterialTable(Table):
         return self
 
 
+class PriorTable(Table):
+    """What is known of a parameter beforehand: lognormal, ``factor`` is one standard deviation either way."""
+
+    median: Positive
+    factor: Annotated[float, Field(gt=1)]
+
+
 class CalibrationTable(Table):
-    """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals."""
+    """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals.
+
+    ``fixed``, ``tied`` and ``prior`` name parameters as ``skin.c_kPa``; ``starts`` after one are random.
+    ``corrections`` are those of the coarse meshes' forces (``mesh.coarse``), per stage.
+    """
 
     objective: Literal["pointwise", "paper"] = "pointwise"
+    stopping: Literal["relative", "paper"] = "relative"
     relative_tolerance: Positive = 1e-3
     max_iterations: Annotated[int, Field(ge=1, le=200)] = 25
+    fixed: tuple[str, ...] = ()
+    tied: tuple[tuple[str, ...], ...] = ()
+    prior: dict[str, PriorTable] = {}
+    force_error_percent: Positive = 1.0
+    starts: Annotated[int, Field(ge=1, le=1000)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+    corrections: Annotated[int, Field(ge=1, le=10)] = 3
+    correction_tolerance_percent: Positive = 0.1
+
+    @model_validator(mode="after")
+    def _constraints(self) -> CalibrationTable:
+        names = [name for group in self.tied for name in group]
+        doubled = [name for name in names if names.count(name) > 1 or name in self.fixed]
+        if doubled:
+            raise ValueError(f"{doubled[0]} is tied twice, or fixed too; name it once")
+        for group in self.tied:
+            if len(group) < 2 or len({name.rpartition(".")[2] for name in group}) > 1:
+                raise ValueError(f"tied = {list(group)}: tie two or more parameters of one kind")
+        if self.prior and self.objective == "paper":
+            raise ValueError('objective = "paper" has no place for priors; use "pointwise"')
+        return self
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Every parameter that is fixed, tied or has a prior."""
+        return (*self.fixed, *(name for group in self.tied for name in group), *self.prior)
+
+
+class UncertaintyTable(Table):
+    """What ``limbfit uncertainty`` may spend, and how well geometry and contact are known (one deviation).
+
+    ``runs`` are simulations of all fitted sites beyond those of the calibration; ``checked`` profiles have
+    their ends simulated. ``sources`` = false leaves geometry, contact and discretisation out.
+    """
+
+    runs: Annotated[int, Field(ge=4, le=1000)] = 24
+    checked: Annotated[int, Field(ge=0, le=100)] = 2
+    seed: Annotated[int, Field(ge=0)] = 0
+    sources: bool = True
+    layer_mm: Positive = 0.5
+    position_mm: Positive = 2.0
+    axis_degrees: Positive = 3.0
+    edge_radius_mm: Annotated[float, Field(ge=0)] = 1.0
 
 
 class SolverTable(Table):
-    """Steps over loading and unloading before the solver adapts them.
+    """Steps over loading and unloading before the solver adapts them, and how hard the contact is.
+
+    ``penalty_per_mm`` is the contact's stiffness over the mean instantaneous shear modulus of the tissues, as
+    it stays; without it the solver takes its own and raises it where the indenter sinks in by over 1 %.
 
     ``solver`` is what ``limbfit simulate`` runs; identification and prediction are always limbfit's own.
     """
@@ -294,6 +368,7 @@ class SolverTable(Table):
     solver: Literal["limbfit", "febio"] = Field(default="limbfit", exclude=True)  # of no stage, so of no key
     load_steps: Annotated[int, Field(ge=2, le=500)] = 10
     unload_steps: Annotated[int, Field(ge=2, le=500)] = 8
+    penalty_per_mm: Positive | None = None
 
 
 class FebioTable(Table):

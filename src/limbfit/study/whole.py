@@ -25,6 +25,7 @@ from .tables import (
     SurfacesTable,
     Table,
     TracesTable,
+    UncertaintyTable,
 )
 
 
@@ -43,6 +44,7 @@ class Study(Table):
     sites: tuple[Site, ...]
     material: MaterialTable = MaterialTable()
     calibration: CalibrationTable = CalibrationTable()
+    uncertainty: UncertaintyTable = UncertaintyTable()
     solver: SolverTable = SolverTable()
     febio: FebioTable = FebioTable()
     execution: ExecutionTable = ExecutionTable()
@@ -127,6 +129,14 @@ class Study(Table):
                     f"material: the tissues' bounds of {name} have no range in common, "
                     "and the stage of one material needs one; widen them"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _parameters_of_tissues(self) -> Study:
+        known = [f"{tissue}.{name}" for tissue in self.tissues for name in PARAMETERS]
+        for name in self.calibration.named:
+            if name not in known:
+                raise ValueError(f"calibration: no parameter is named {name!r}; they are {', '.join(known)}")
         return self
 
     @model_validator(mode="after")

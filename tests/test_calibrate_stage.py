@@ -1,0 +1,231 @@
+"""The identification of a study of blocks by the real solver: two meshes, failures, interruptions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from layered import block_model, layered_block
+from limbfit.errors import StudyError
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import SimulationJob, simulate, to_vector
+from limbfit.phantom.record import Ramp, record
+from limbfit.pipeline.calibrate_stage import groupings, run_calibrate
+from limbfit.pipeline.context import Context, Progress
+from limbfit.pipeline.predict_stage import run_predict
+from limbfit.pipeline.simulations import COARSE
+from limbfit.pipeline.store import Store, write_json
+from limbfit.pipeline.traces_stage import run_traces
+from limbfit.study import Study, load_study
+
+TISSUES = ("skin", "muscle")
+TRUTH = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
+# thickness of skin and muscle, depth, whether fitted
+BLOCKS = {
+    "a": ((3.0, 5.0), 2.2, True),
+    "b": ((3.0, 21.0), 6.0, True),
+    "c": ((3.0, 11.0), 4.0, False),
+}
+TEXT = """
+[study]
+name = "blocks"
+[surfaces]
+skin = "skin.stl"
+[indenter]
+edge_radius_mm = 2.0
+[solver]
+load_steps = 4
+unload_steps = 3
+"""
+COARSE_MESHES = "[mesh.coarse]\nedge_near_mm = 6.0\n"
+SITE = """
+[[sites]]
+name = "{name}"
+fitted = {fitted}
+trace = "{name}.csv"
+position = [0.0, 0.0, 0.0]
+"""
+
+
+def write_study(folder: Path, more: str = COARSE_MESHES) -> Study:
+    """Blocks as sites of a study, their records noisy, with stored places, curves and meshes."""
+    text = TEXT + more
+    for name, (_, _, fitted) in BLOCKS.items():
+        text += SITE.format(name=name, fitted=str(fitted).lower())
+        (folder / f"{name}.csv").touch()
+    (folder / "skin.stl").touch()
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return load_study(folder)
+
+
+def store_blocks(study: Study) -> Store:
+    store = Store(study.results)
+    for place in ("sites", "traces", "mesh", f"mesh/{COARSE}"):
+        store[place].mkdir(parents=True)
+    places = []
+    for i, (name, (thickness, depth, fitted)) in enumerate(BLOCKS.items()):
+        fine = layered_block(thickness, TISSUES, divisions=5)
+        rough = layered_block(thickness, TISSUES, divisions=3)
+        model = block_model(name, store["mesh"] / f"{name}.vtu", fine, depth, study.solver)
+        block_model(name, store["mesh"] / COARSE / f"{name}.vtu", rough, depth, study.solver)
+        model = replace(model, indenter=study.indenter)
+        times = np.linspace(0.0, model.knots_s[-1], 201)
+        truth = tuple(to_vector(TRUTH, TISSUES))
+        force = simulate(SimulationJob(model, TISSUES, truth, tuple(times), sensitivities=False)).force_N
+        ramp = Ramp(depth, 0.96)
+        made = record(ramp, lambda t, at=times, f=force: np.interp(t, at, f), np.random.default_rng(i))
+        made.write(study.path(Path(f"{name}.csv")))
+        places.append(
+            {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0, 0, -1]}
+        )
+    write_json(store["sites"] / "sites.json", {"sites": places})
+    run_traces(Context(study, store, SerialExecutor(), quiet), store["traces"])
+    return store
+
+
+def quiet(event: Progress) -> None:
+    """A listener that does nothing."""
+
+
+class Disturbed(SerialExecutor):
+    """Fails simulations at random, or is interrupted after some."""
+
+    def __init__(self, failing: float = 0.0, seed: int = 0, until: int = 10**6) -> None:
+        self.failing, self.random, self.left, self.done = failing, np.random.default_rng(seed), until, 0
+
+    def map(self, function, jobs, keys=None) -> Iterator:
+        for answer in super().map(function, jobs, keys):
+            if self.left == 0:
+                raise KeyboardInterrupt
+            self.left -= 1
+            self.done += 1
+            failed = isinstance(answer, object) and self.random.random() < self.failing
+            yield replace(answer, completed=False, reason="made to fail") if failed else answer
+
+
+def calibrated(study: Study, store: Store, executor=None) -> dict:
+    store["calibrate"].mkdir(exist_ok=True)
+    run_calibrate(Context(study, store, executor or SerialExecutor(), quiet), store["calibrate"])
+    return store.read("calibrate", "calibration.json")
+
+
+def vector(found: dict) -> np.ndarray:
+    return to_vector(found["stages"][-1]["parameters"], TISSUES)
+
+
+@pytest.fixture(scope="module")
+def blocks(tmp_path_factory):
+    """A study of blocks, calibrated and predicted on two meshes."""
+    study = write_study(tmp_path_factory.mktemp("blocks"))
+    store = store_blocks(study)
+    found = calibrated(study, store)
+    store["predict"].mkdir()
+    run_predict(Context(study, store, SerialExecutor(), quiet), store["predict"])
+    return study, store, found
+
+
+def moved(study: Study, store: Store, folder: Path) -> Store:
+    """The stored inputs of the calibration in another results folder, nothing simulated yet."""
+    other = Store(folder)
+    for stage in ("sites", "traces", "mesh"):
+        other[stage].symlink_to(store[stage], target_is_directory=True)
+    return other
+
+
+@pytest.mark.slow
+def test_two_meshes_give_the_fine_one_s_answer_with_the_coarse_one_s_derivatives(blocks):
+    _, store, found = blocks
+    assert all(stage["converged"] for stage in found["stages"]), found["stages"]
+    first, last = found["corrections"][0], found["corrections"][-1]
+    assert max(first["difference_percent_by_site"].values()) > 2.0
+    assert max(last["change_percent_by_site"].values()) <= 0.1
+    assert found["stages"][-1]["parameters"]["muscle"]["c_kPa"] == pytest.approx(4.5, rel=0.15)
+    predicted = store.read("predict", "predict.json")
+    assert predicted["mean_error_fitted_percent"] < 1.0
+    assert predicted["mean_error_heldout_percent"] < 1.5
+    plain = found["forward_runs"] - found["forward_runs_with_sensitivities"]
+    assert plain == 2 * len(found["corrections"])
+    assert found["forward_runs_with_sensitivities"] <= 40
+
+
+@pytest.mark.slow
+def test_one_simulation_in_ten_made_to_fail_ends_at_the_same_answer(blocks, tmp_path):
+    study, store, found = blocks
+    again = calibrated(study, moved(study, store, tmp_path / "r"), Disturbed(0.1, seed=1))
+    assert all(stage["converged"] for stage in again["stages"]), again["stages"]
+    for one, other in zip(found["stages"], again["stages"], strict=True):
+        assert other["cost"] == pytest.approx(one["cost"], rel=0.02)
+    assert vector(again)[[4, 6]] == pytest.approx(vector(found)[[4, 6]], rel=0.05)
+
+
+@pytest.mark.slow
+def test_an_interrupted_calibration_goes_on_where_it_was(blocks, tmp_path):
+    study, store, found = blocks
+    other = moved(study, store, tmp_path / "r")
+    done = []
+    for until in (3, 7, 10**6):
+        executor = Disturbed(until=until)
+        try:
+            again = calibrated(study, other, executor)
+        except KeyboardInterrupt:
+            assert until < 10**6
+        done.append(executor.done)
+    assert sum(done) == found["forward_runs"]
+    assert vector(again) == pytest.approx(vector(found), rel=1e-3)
+    assert again["corrections"][0]["scale_by_site"] == pytest.approx(
+        found["corrections"][0]["scale_by_site"], rel=1e-4
+    )
+
+
+@pytest.mark.slow
+def test_several_starts_constraints_and_weights_of_a_study(blocks, tmp_path):
+    _, store, _ = blocks
+    more = (
+        "[calibration]\nstarts = 3\nseed = 2\nfixed = ['skin.m']\ntied = [['skin.tau_s', 'muscle.tau_s']]\n"
+        "[calibration.prior.'skin.c_kPa']\nmedian = 9.0\nfactor = 1.3\n"
+    )
+    study = write_study(tmp_path, more)
+    for name in BLOCKS:
+        (tmp_path / f"{name}.csv").write_bytes((store.folder.parent / f"{name}.csv").read_bytes())
+    found = calibrated(study, moved(study, store, tmp_path / "r"))
+    assert found["corrections"] == []
+    told = found["multistart"]
+    assert told["reached"] >= 2, told
+    assert len(told["starts"]) == 3
+    values = found["stages"][-1]["parameters"]
+    assert values["skin"]["m"] == 3.0
+    assert values["skin"]["tau_s"] == values["muscle"]["tau_s"]
+    assert values["skin"]["c_kPa"] == pytest.approx(9.0, rel=0.4)
+
+
+def test_groups_of_a_study(tmp_path):
+    study = write_study(
+        tmp_path, "[calibration]\nfixed = ['skin.m']\ntied = [['skin.c_kPa', 'muscle.c_kPa']]\n"
+    )
+    assert groupings(study) == ((0, -1, 2, 3, 0, 1, 2, 3), (0, -1, 2, 3, 0, 5, 6, 7))
+    ties = ", ".join(f"['skin.{name}', 'muscle.{name}']" for name in ("c_kPa", "m", "gamma", "tau_s"))
+    study = write_study(tmp_path, f"[calibration]\ntied = [{ties}]\n")
+    assert groupings(study) == ((0, 1, 2, 3) * 2,)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("fixed = ['fat.m']", "no parameter is named 'fat.m'"),
+        ("tied = [['skin.m', 'muscle.gamma']]", "two or more parameters of one kind"),
+        ("tied = [['skin.m', 'muscle.m']]\nfixed = ['skin.m']", "skin.m is tied twice, or fixed too"),
+        ("objective = 'paper'\nprior = { 'skin.m' = { median = 3.0, factor = 2.0 } }", "no place for priors"),
+        ("prior = { 'skin.m' = { median = 3.0, factor = 1.0 } }", "factor"),
+        ("starts = 0", "starts"),
+    ],
+)
+def test_impossible_settings_are_bad_input(tmp_path, text, words):
+    with pytest.raises(StudyError, match=words):
+        write_study(tmp_path, f"[calibration]\n{text}\n")
