@@ -14,6 +14,7 @@ Everything the command line does is one call away:
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
+``limbfit design``        ``design_study(load_study(path), sites=4, depths_mm=(), listener=print)``
 ``limbfit cube``          ``compress_cube(folder)``, without a study
 ``limbfit EXPERIMENT``    ``run_experiment(load_study(path), "regions", listener=print)``, and others
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
@@ -43,6 +44,7 @@ _HOME = {
     "describe_series": "anatomy.imaging",
     "compare_site": "pipeline",
     "compress_cube": "pipeline",
+    "design_study": "pipeline",
     "export_study": "pipeline",
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",

@@ -10,7 +10,7 @@ import typer
 
 from .. import __version__
 from ..errors import InputError, LimbfitError
-from . import bench, commands, experiments, febio, geometry
+from . import bench, commands, experiments, febio, geometry, trust
 from .console import INTERRUPTED, STDOUT, fail
 
 app = typer.Typer(
@@ -32,7 +32,7 @@ def top(
         raise typer.Exit
 
 
-for verb in (*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *febio.VERBS):
+for verb in (*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS):
     app.command()(verb)
 app.add_typer(bench.app, name="bench")
 

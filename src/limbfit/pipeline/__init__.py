@@ -14,6 +14,7 @@ _HOME = {
     "check_study": "check",
     "compare_site": "compare",
     "compress_cube": "cube",
+    "design_study": "planning",
     "export_study": "export",
     "make_phantom_study": "demo",
     "report_study": "run",

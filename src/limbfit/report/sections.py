@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from . import figures, pictures, tables
 from .comparison import comparison
+from .doubts import doubts
 from .experiments import experiment_sections
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
 from .slices import slices_figure
@@ -28,6 +29,7 @@ def make_page(store: Store) -> Page:
         records,
         fit,
         prediction,
+        doubts,
         parameters,
         convergence,
     )
@@ -43,6 +45,7 @@ def make_page(store: Store) -> Page:
     absent: dict[Callable[[Store], Section], bool] = {
         simulated: not store.simulated,
         comparison: not store.compared,
+        doubts: "flags" not in store.predict,
     }
     version = store.run.get("limbfit", "unknown version")
     return Page(

@@ -1,0 +1,251 @@
+"""The experiment ``crossvalidate``: other choices of sites fitted, and whole regions left out.
+
+All fits share one emulator, made from simulations at all recorded sites around the answer; the solver then
+simulates at some of the fits' optima, which says how far the emulator is off there, and the emulator learns
+from those too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RunError, StudyError
+from ..identify.calibration import CalibrationSettings
+from ..identify.crossvalidation import (
+    Choice,
+    Fold,
+    choices_of,
+    cross_validate,
+    errors_by_site,
+    fit_sites,
+    standing,
+    without_regions,
+)
+from ..identify.emulator import Emulator
+from ..identify.fidelity import Anchor, corrected
+from ..identify.objective import SiteResponse
+from ..identify.parameters import Unknowns
+from ..identify.prediction import error_percent
+from ..identify.spread import spread_points
+from ..indentation import to_vector
+from .calibrate_stage import Laboratory, unknowns
+from .context import Context
+from .simulations import experiment_cache
+from .store import write_json
+from .tabular import write_table
+
+Array = NDArray[np.float64]
+Runs = list[list[SiteResponse]]
+
+_CHECKED = 3  # fits whose optima are simulated in each of two rounds
+_MARGIN = 0.02  # of the emulator's box, in the logarithm, that fits may go beyond
+
+
+def run_crossvalidate(
+    context: Context, folder: Path, *, fit: int, choices: int, seed: int, runs: int
+) -> dict[str, Any]:
+    """Held-out errors over choices of ``fit`` sites (0: as many as the study fits).
+
+    At most ``choices`` of them are drawn with ``seed``; ``runs`` more simulations of all sites make the
+    emulator.
+    """
+    study = context.study
+    recorded = [site for site in study.sites if site.trace is not None]
+    size = fit or len(study.fitted)
+    if not 0 < size < len(recorded):
+        raise StudyError(
+            f"{size} of {len(recorded)} recorded sites fitted leave none to be predicted",
+            file=study.file,
+            place="sites",
+            remedy="record more sites, or fit fewer (--fit)",
+        )
+    laboratory = Laboratory(context, experiment_cache(context, folder), recorded, "crossvalidate")
+    bench = _Bench(context, laboratory, seed, runs)
+    own_choice = tuple(i for i, site in enumerate(recorded) if site.fitted)
+    chosen = choices_of(len(recorded), size, choices, seed)
+    regions = without_regions([site.region for site in recorded])
+    first = bench.validate(own_choice, chosen, {})
+    checks = bench.check(first.spread(_CHECKED), 1)
+    found = bench.validate(own_choice, chosen, regions)
+    checks += bench.check(found.spread(_CHECKED), 2)
+    content = _content(context, bench, found, size, comb(len(recorded), size), checks)
+    write_json(folder / "crossvalidate.json", content)
+    _write_tables(folder, content)
+    return {}
+
+
+class _Found:
+    """The fits of one emulator: the study's own choice, others, and those without a region."""
+
+    def __init__(self, own: Fold, folds: tuple[Fold, ...], regions: tuple[Fold, ...]) -> None:
+        self.own, self.folds, self.regions = own, folds, regions
+
+    def spread(self, count: int) -> list[Fold]:
+        """Some fits from the best to the worst, the study's own first."""
+        ranked = sorted(self.folds, key=lambda fold: fold.mean_heldout)
+        places = np.linspace(0, len(ranked) - 1, min(count - 1, len(ranked))).astype(int)
+        return [self.own, *(ranked[i] for i in places)]
+
+
+class _Bench:
+    """Simulations of all recorded sites, the emulator made of them, and the fits on it."""
+
+    def __init__(self, context: Context, laboratory: Laboratory, seed: int, runs: int) -> None:
+        self.context, self.laboratory = context, laboratory
+        study = context.study
+        stored = context.stored("calibrate", "calibration.json")
+        self.best = to_vector(stored["stages"][-1]["parameters"], study.tissues)
+        self.bounds = unknowns(study).from_start(self.best)
+        self.measured = laboratory.measured
+        covariance = np.array(stored["uncertainty"]["covariance_log"])
+        # Where nothing is known, fits go anywhere; the emulator must not.
+        drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
+        self.points, self.runs = [self.best], [self._whole(laboratory.search(self.best))]
+        self.anchor: Anchor | None = None
+        if study.mesh.coarse is not None:
+            fine, coarse = self._whole(laboratory.check(self.best)), self.runs[0]
+            forces = [tuple(r.force_N for r in run) for run in (coarse, fine)]
+            self.anchor = Anchor(self.best, forces[0], forces[1])
+            self.runs[0] = self._as_fine(coarse)
+        self.learn(list(drawn))
+
+    def _whole(self, responses: list[SiteResponse]) -> list[SiteResponse]:
+        for response, site in zip(responses, self.measured):
+            if not response.completed:
+                raise RunError(f"site {site.name} cannot be simulated at the answer: {response.reason}")
+        return responses
+
+    def _as_fine(self, responses: list[SiteResponse]) -> list[SiteResponse]:
+        """Coarse meshes' responses corrected by what is known at the answer."""
+        if self.anchor is None:
+            return responses
+        parts = zip(responses, self.anchor.coarse, self.anchor.fine, self.anchor.scales)
+        return [corrected(response, coarse, fine, scale) for response, coarse, fine, scale in parts]
+
+    def learn(self, points: Sequence[Array]) -> Runs:
+        """Simulate at some points and make the emulator anew; the runs."""
+        runs = []
+        for i, point in enumerate(points):
+            self.context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
+            runs.append(self._as_fine(self.laboratory.search(point)))
+        self.points, self.runs = [*self.points, *points], [*self.runs, *runs]
+        self.emulator = Emulator.fit(self.bounds.names, np.array(self.points), self.runs)
+        return runs
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """The study's, within the emulator's region."""
+        low = np.maximum(self.emulator.lower * np.exp(-_MARGIN), self.bounds.lower)
+        high = np.minimum(self.emulator.upper * np.exp(_MARGIN), self.bounds.upper)
+        return Unknowns(self.bounds.names, self.best, low, high, self.bounds.priors)
+
+    def validate(self, own: Choice, chosen: Sequence[Choice], regions: dict[str, Choice]) -> _Found:
+        table = self.context.study.calibration
+        settings = CalibrationSettings(objective=table.objective, relative_tolerance=1e-3, max_iterations=40)
+        given = (self.emulator, self.measured, self.unknowns)
+
+        def tell(done: int, total: int) -> None:
+            self.context.tell("crossvalidate", done, total, f"{done} of {total} choices fitted")
+
+        return _Found(
+            fit_sites(*given, own, settings),
+            cross_validate(*given, chosen, settings, tell),
+            cross_validate(*given, regions, settings),
+        )
+
+    def check(self, folds: Sequence[Fold], number: int) -> list[dict[str, Any]]:
+        """The solver's errors at the optima of some fits beside the emulator's, which then learns them."""
+        names = [site.name for site in self.measured]
+        emulated = [self.emulator(fold.parameters) for fold in folds]
+        runs = self.learn([fold.parameters for fold in folds])
+        rows = []
+        for fold, cheap, run in zip(folds, emulated, runs):
+            if not all(response.completed for response in run):
+                continue
+            held = fold.heldout
+            solved = [error_percent(run[i].force_N, self.measured[i].force_N) for i in held]
+            away = [error_percent(cheap[i].force_N, run[i].force_N) for i in range(len(run))]
+            rows.append(
+                {
+                    "round": number,
+                    "fitted": [names[i] for i in fold.fitted],
+                    "heldout_emulated_percent": fold.mean_heldout,
+                    "heldout_solved_percent": float(np.mean(solved)),
+                    "emulator_error_percent": float(np.mean(away)),
+                    "emulator_error_largest_percent": float(np.max(away)),
+                }
+            )
+        return rows
+
+
+def _content(
+    context: Context, bench: _Bench, found: _Found, size: int, possible: int, checks: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """What ``crossvalidate.json`` holds."""
+    names, sites = bench.bounds.names, [site.name for site in bench.measured]
+    regions = {site.name: site.region for site in context.study.sites}
+    place = standing(found.own, found.folds)
+    by_site = errors_by_site(found.folds, len(sites))
+    return {
+        "fitted_sites": size,
+        "choices": len(found.folds),
+        "choices_possible": possible,
+        "own": found.own.to_dict(sites, names)
+        | {
+            "share_better": place.share_better,
+            "median_percent": place.median_percent,
+            "low_percent": place.low_percent,
+            "high_percent": place.high_percent,
+        },
+        "sites": [
+            {
+                "site": name,
+                "region": regions[name],
+                "fitted": i in found.own.fitted,
+                "left_out_of": summary.sites,
+                "mean_percent": _plain(summary.mean_percent),
+                "sd_percent": _plain(summary.sd_percent),
+                "own_percent": found.own.errors_percent[i],
+            }
+            for i, (name, summary) in enumerate(zip(sites, by_site))
+        ],
+        "regions": [fold.to_dict(sites, names) for fold in found.regions],
+        "folds": [fold.to_dict(sites, names) for fold in found.folds],
+        "at_limit_share": float(np.mean([bool(fold.at_limit) for fold in found.folds])),
+        "emulator": {
+            "runs": len(bench.points),
+            "loo_percent": float(np.median(bench.emulator.loo_percent)),
+            "checks": checks,
+        },
+    }
+
+
+def _plain(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+    """Every fit and its errors, and errors by site, as CSV."""
+    sites = [row["site"] for row in content["sites"]]
+    names = list(content["own"]["parameters"])
+    heads = ["fitted", "mean_error_fitted_percent", "mean_error_heldout_percent", *names]
+    heads += [f"error_{site}_percent" for site in sites]
+    rows = [
+        [
+            " ".join(fold["fitted"]),
+            fold["mean_error_fitted_percent"],
+            fold["mean_error_heldout_percent"],
+            *(fold["parameters"][name] for name in names),
+            *(fold["errors_percent"][site] for site in sites),
+        ]
+        for fold in (content["own"], *content["folds"], *content["regions"])
+    ]
+    write_table(folder / "fits.csv", heads, rows)
+    keys = ("site", "region", "fitted", "left_out_of", "mean_percent", "sd_percent", "own_percent")
+    write_table(folder / "sites.csv", keys, [[row[key] for key in keys] for row in content["sites"]])

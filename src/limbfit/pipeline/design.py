@@ -1,0 +1,205 @@
+"""The experiment ``design``: which sites to test, and how deep, to determine the parameters best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.surfaces import load_anatomy
+from ..anatomy.under import tissue_under
+from ..errors import InputError, RunError, StudyError
+from ..identify.design import Candidate, Design, NoiseModel, candidate, choose, efficiency, evaluate
+from ..identify.design import prior_information as bounds_information
+from ..identify.objective import SiteResponse
+from ..indentation import Parameters, SimulationJob, SiteModel, to_vector
+from ..study import Site, Study
+from .calibrate_stage import unknowns
+from .context import Context
+from .simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
+from .store import write_json
+from .tabular import write_table
+
+Array = NDArray[np.float64]
+
+DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go
+
+
+def run_design(
+    context: Context,
+    folder: Path,
+    *,
+    sites: int,
+    depths_mm: Sequence[float],
+    parameters: Parameters,
+    parameters_from: str,
+    noise: dict[str, float],
+) -> dict[str, Any]:
+    """Simulate every candidate once, with derivatives, and choose."""
+    study = context.study
+    if not 0 < sites <= len(study.sites):
+        raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
+    vector = to_vector(parameters, study.tissues)
+    models, left_out = _candidate_models(context, depths_mm)
+    cache = experiment_cache(context, folder)
+    jobs = [_job(model, study.tissues, vector) for model in models]
+    model_noise, found = NoiseModel(**noise), []
+    for i, (model, simulation) in enumerate(zip(models, cache.run(jobs, context.executor))):
+        depth = float(max(model.knots_mm))
+        context.tell("design", i + 1, len(models), f"site {model.name}, {depth:.1f} mm")
+        assert simulation.jacobian is not None
+        if not simulation.completed:
+            left_out.append(f"site {model.name} at {depth:.1f} mm: {simulation.reason}")
+            continue
+        response = SiteResponse(simulation.force_N, simulation.jacobian)
+        found.append((candidate(model.name, depth, response, vector, model_noise), simulation.force_N.max()))
+    content = _content(context, found, sites, vector, left_out)
+    content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
+    write_json(folder / "design.json", content)
+    _write_tables(folder, content)
+    return {}
+
+
+def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[list[SiteModel], list[str]]:
+    """Each site as recorded or planned, or at each depth that its tissue allows; and what was left out."""
+    study, models, left_out = context.study, [], []
+    anatomy = load_anatomy(context.store["surfaces"]) if depths_mm else None
+    for site in study.sites:
+        own = planned_model(context, site) if site.trace is None else recorded_model(context, site)
+        if anatomy is None:
+            models.append(own)
+            continue
+        thickness = tissue_under(anatomy, own.position, own.axis, study.indenter.width_mm)
+        for depth in depths_mm:
+            if depth > DEEPEST_SHARE * thickness:
+                left_out.append(f"site {site.name} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
+            else:
+                models.append(_at_depth(own, site, depth))
+    if not models:
+        raise StudyError("no depth fits any site", file=study.file, remedy="give smaller --depths")
+    return models, left_out
+
+
+def _at_depth(own: SiteModel, site: Site, depth: float) -> SiteModel:
+    """In and out at the speed of the record, or the planned one."""
+    top = int(np.argmax(own.knots_mm))
+    speed = own.knots_mm[top] / own.knots_s[top] if site.trace is not None else site.speed_mm_s
+    ramp = depth / speed
+    return replace(own, knots_s=(0.0, ramp, 2 * ramp), knots_mm=(0.0, depth, 0.0))
+
+
+def _job(model: SiteModel, tissues: tuple[str, ...], vector: Array) -> SimulationJob:
+    times = np.linspace(0.0, model.knots_s[-1], CURVE_POINTS)
+    return SimulationJob(model, tissues, tuple(map(float, vector)), tuple(map(float, times)))
+
+
+def _content(
+    context: Context,
+    found: Sequence[tuple[Candidate, float]],
+    sites: int,
+    vector: Array,
+    left_out: list[str],
+) -> dict[str, Any]:
+    """What ``design.json`` holds: the best choices, the study's own, all sites, and the candidates."""
+    study = context.study
+    every = [one for one, _ in found]
+    if len({one.site for one in every}) < sites:
+        raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
+    bounds = unknowns(study)
+    prior = bounds_information(bounds)
+    designs = {"D-optimal": choose(every, sites, prior, "D"), "A-optimal": choose(every, sites, prior, "A")}
+    own = _own_choice(study, every)
+    if own:
+        designs["the study's own"] = evaluate(every, own, prior)
+    designs["all sites"] = evaluate(every, _deepest(every), prior)
+    best_d, best_a = designs["D-optimal"], designs["A-optimal"]
+    rows = []
+    for name, design in designs.items():
+        chosen = [every[i] for i in design.chosen]
+        rows.append(
+            {
+                "design": name,
+                "sites": [{"site": one.site, "depth_mm": one.depth_mm} for one in chosen],
+                "d_efficiency": efficiency(design, best_d, "D"),
+                "a_efficiency": efficiency(design, best_a, "A"),
+                "factor_95": dict(zip(bounds.names, design.factors_95.tolist(), strict=True)),
+                "exhaustive": design.exhaustive,
+            }
+        )
+    return {
+        "wanted": sites,
+        "designs": rows,
+        "verdict": _verdict(designs, bounds.names),
+        "candidates": [_row(one, peak, prior) for one, peak in found],
+        "left_out": left_out,
+    }
+
+
+def _row(one: Candidate, peak: float, prior: Array) -> dict[str, Any]:
+    """A candidate, and what it tells alone: bits of information over the bounds."""
+    gain = np.linalg.slogdet(prior + one.information)[1] - np.linalg.slogdet(prior)[1]
+    return {
+        "site": one.site,
+        "depth_mm": one.depth_mm,
+        "peak_force_N": float(peak),
+        "bits": float(gain / (2 * np.log(2))),
+    }
+
+
+def _own_choice(study: Study, every: Sequence[Candidate]) -> tuple[int, ...]:
+    """The study's fitted sites at the depth nearest to the recorded one; its deepest candidate otherwise."""
+    fitted = {site.name for site in study.fitted}
+    return tuple(i for i in _deepest(every) if every[i].site in fitted)
+
+
+def _deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
+    """The deepest candidate of each site."""
+    best: dict[str, int] = {}
+    for i, one in enumerate(every):
+        if one.site not in best or one.depth_mm > every[best[one.site]].depth_mm:
+            best[one.site] = i
+    return tuple(best.values())
+
+
+def _verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
+    """In words: what the study's own choice gives away, and what no choice determines."""
+    best, every = designs["D-optimal"], designs["all sites"]
+    words = []
+    own = designs.get("the study's own")
+    if own is not None and len(own.chosen) == len(best.chosen):
+        share = efficiency(own, best, "D")
+        told = "the study's own choice is as good as the best" if share > 0.95 else (
+            f"the study's own choice tells as much as {100 * share:.0f} % of the data of the best"
+        )  # fmt: skip
+        words.append(told)
+    wide = [name for name, factor in zip(names, best.factors_95) if factor > 2]
+    open_too = [name for name, factor in zip(names, every.factors_95) if factor > 2]
+    if wide:
+        words.append(f"even the best choice leaves open (by more than twofold): {', '.join(wide)}")
+    if open_too:
+        words.append(f"and so do all sites together: {', '.join(open_too)}")
+    return "; ".join(words) or "the best choice determines every parameter within a factor of two"
+
+
+def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+    names = list(content["designs"][0]["factor_95"])
+    rows = [
+        [
+            row["design"],
+            " ".join(f"{one['site']}@{one['depth_mm']:.2f}mm" for one in row["sites"]),
+            row["d_efficiency"],
+            row["a_efficiency"],
+            *(row["factor_95"][name] for name in names),
+        ]
+        for row in content["designs"]
+    ]
+    heads = ["design", "sites", "d_efficiency", "a_efficiency", *(f"factor_95_{name}" for name in names)]
+    write_table(folder / "designs.csv", heads, rows)
+    keys = ("site", "depth_mm", "peak_force_N", "bits")
+    write_table(
+        folder / "candidates.csv", keys, [[row[key] for key in keys] for row in content["candidates"]]
+    )
