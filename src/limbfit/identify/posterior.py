@@ -108,7 +108,7 @@ def sample_posterior(
 def _told(sampler: emcee.EnsembleSampler, likelihood: Likelihood, k: int, steps: int) -> Posterior:
     dropped = steps // 4
     chain = sampler.get_chain(discard=dropped)
-    times = emcee.autocorr.integrated_time(chain, quiet=True)
+    times = emcee.autocorr.integrated_time(chain, tol=0)
     longest = float(np.nanmax(times))
     flat = chain.reshape(-1, chain.shape[2])
     kept = flat[np.linspace(0, len(flat) - 1, min(_KEPT, len(flat))).astype(int)]

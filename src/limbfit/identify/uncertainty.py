@@ -206,7 +206,7 @@ def _told(
     high = np.minimum(np.exp(centre + half), np.where(moved, unknowns.upper, np.inf))
     shares = [linear.sd(row) / max(float(row @ prior.sd), 1e-300) for row in space.tie]
     verdicts = [
-        _verdict(float(np.exp(h)), share) if free else GIVEN for h, share, free in zip(half, shares, moved)
+        verdict_of(float(np.exp(h)), share) if free else GIVEN for h, share, free in zip(half, shares, moved)
     ]
     covariance = space.tie @ linear.covariance @ space.tie.T
     sd = np.sqrt(np.where(moved, np.diag(covariance), 1.0))
@@ -233,7 +233,8 @@ def _at_bound(parameters: Array, unknowns: Unknowns) -> list[bool]:
     return [bool(edge) for edge in near_low | near_high]
 
 
-def _verdict(factor: float, share_of_prior: float) -> str:
+def verdict_of(factor: float, share_of_prior: float) -> str:
+    """In words: from half a 95 % interval as a factor, and its deviation over that of the bounds alone."""
     if factor <= _DETERMINED_FACTOR:
         return DETERMINED
     if factor <= _WEAK_FACTOR and share_of_prior < _PRIOR_SHARE:
@@ -252,7 +253,7 @@ def _combinations(
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         sd = float(np.sqrt(max(value, 0.0)))
         factor = float(np.exp(linear.half_width(axis)))
-        verdict = _verdict(factor, sd / float(np.linalg.norm(axis * prior.sd)))
+        verdict = verdict_of(factor, sd / float(np.linalg.norm(axis * prior.sd)))
         weights = space.tie @ (axis / members)
         found.append(Combination(weights, sd, factor, _product(weights, names), verdict))
     return tuple(found)

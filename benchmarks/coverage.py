@@ -1,0 +1,161 @@
+"""Do the 95 % intervals hold the truth in 95 % of cases?
+
+    limbfit uncertainty STUDY
+    python benchmarks/coverage.py STUDY --repeats 200 --json coverage.json
+
+The truth is the study's identified model, on the emulator that ``limbfit uncertainty`` made of its solver.
+Every repeat records the true forces as the robot does (500 Hz, noise of 0.05 N), regularises them as the
+stage ``traces`` does, calibrates on the emulator and estimates the uncertainty as the stage ``calibrate``
+does. A touch-down that is off by as much as the study states of its own moves each curve. The noise that is
+left after regularising is correlated from point to point. With ``--misfit`` the model is wrong as well: a
+smooth error of so many percent of the largest force, of another shape than the one that the method assumes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbfit import load_study
+from limbfit.execution import SerialExecutor
+from limbfit.identify import Measured, SiteNoise, record_noise
+from limbfit.identify.coverage import Coverage, coverage_study
+from limbfit.identify.noise import loading_slope
+from limbfit.phantom.record import RATE_HZ
+from limbfit.pipeline.calibrate_stage import unknowns
+from limbfit.pipeline.context import Context
+from limbfit.pipeline.emulator_file import EMULATOR, read_emulator
+from limbfit.pipeline.store import Store
+from limbfit.pipeline.traces_stage import SiteRecord, site_record
+from limbfit.traces import TouchDown, Trace, regularise
+
+Array = NDArray[np.float64]
+BEFORE_S = 0.3  # in the air
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Makes records of true forces at the sites of a study.
+
+    ``noise_N`` at 500 Hz with ``autocorrelation`` of neighbours; ``touch_down_mm`` (sites,) is the standard
+    deviation of a touch-down; ``misfit`` is the model's error over the largest force.
+    """
+
+    records: tuple[SiteRecord, ...]
+    touch_down_mm: tuple[float, ...]
+    noise_N: float
+    autocorrelation: float
+    misfit: float
+    seed: int
+
+    def __call__(self, repeat: int, forces: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
+        random = np.random.default_rng([self.seed, repeat])
+        measured, noise = [], []
+        for record, force, sd in zip(self.records, forces, self.touch_down_mm, strict=True):
+            true = force + self._wrong(random, record.times_s, force)
+            true = true + sd * random.standard_normal() * loading_slope(record.displacement_mm, force)
+            curve, residual = self._regularised(random, record, np.maximum(true, 0.0))
+            measured.append(Measured(record.site.name, curve))
+            noise.append(
+                record_noise(record.site.name, record.times_s, residual, curve, record.displacement_mm, sd)
+            )
+        return measured, noise
+
+    def _wrong(self, random: np.random.Generator, times: Array, force: Array) -> Array:
+        """A smooth error: a few waves of random phase, from half a wave to three over the record."""
+        share = times / times[-1]
+        waves = random.uniform(0.5, 3.0, 4)
+        sizes = random.standard_normal(4)
+        shape = sum(
+            size * np.sin(2 * np.pi * (wave * share + random.uniform())) for size, wave in zip(sizes, waves)
+        )
+        return self.misfit * force.max() * np.asarray(shape) / np.sqrt(2.0)
+
+    def _regularised(
+        self, random: np.random.Generator, record: SiteRecord, force: Array
+    ) -> tuple[Array, Array]:
+        """The curve at the record's times, and what was smoothed away."""
+        end = record.times_s[-1]
+        time = np.arange(0.0, BEFORE_S + end + 1e-9, 1 / RATE_HZ)
+        since = time - BEFORE_S
+        raw = np.where(since > 0, np.interp(since, record.times_s, force), 0.0) + self._noise(
+            random, time.size
+        )
+        depth = np.interp(since, record.times_s, record.displacement_mm)
+        touch = TouchDown(BEFORE_S, 0.0, 0.0, 1.0, 0.0, False)
+        smooth = regularise(Trace(time, depth, raw), touch)
+        curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
+        inside = since >= 0
+        return curve, raw[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+
+    def _noise(self, random: np.random.Generator, n: int) -> Array:
+        white = random.standard_normal(n)
+        lag, noise = self.autocorrelation, np.empty(n)
+        noise[0] = white[0]
+        for k in range(1, n):
+            noise[k] = lag * noise[k - 1] + np.sqrt(1 - lag**2) * white[k]
+        return self.noise_N * noise
+
+
+def study_robot(
+    study_file: Path, noise_N: float, autocorrelation: float, misfit: float, seed: int
+) -> tuple[Robot, Array, Any, Any]:
+    """The robot of a study, the truth (p,), the emulator and the unknowns."""
+    study = load_study(study_file)
+    store = Store(study.results)
+    context = Context(study, store, SerialExecutor(), lambda progress: None)
+    found = store.read("uncertainty", "uncertainty.json")
+    truth = np.array([row["calibrated"] for row in found["parameters"]])
+    traces = store.read("traces", "traces.json")["sites"]
+    records = tuple(site_record(context, site) for site in study.fitted)
+    touch = tuple(float(traces[site.name]["touch_down_uncertainty_mm"]) for site in study.fitted)
+    robot = Robot(records, touch, noise_N, autocorrelation, misfit, seed)
+    return robot, truth, read_emulator(store["uncertainty"] / EMULATOR), unknowns(study)
+
+
+def summary(found: Coverage, robot: Robot) -> dict[str, Any]:
+    low, high = found.limits()
+    return {
+        "repeats": len(found.deviations),
+        "noise_N": robot.noise_N,
+        "autocorrelation": robot.autocorrelation,
+        "misfit_percent": 100 * robot.misfit,
+        "coverage_determined_percent": 100 * found.share,
+        "determined_per_repeat": float(found.determined.sum(axis=1).mean()),
+        "coverage_by_combination_percent": (100 * found.by_combination).tolist(),
+        "binomial_limits_percent": [100 * low, 100 * high],
+        "coverage_by_parameter_percent": (100 * found.by_parameter).tolist(),
+        "estimated_misfit_percent": float(np.median(found.misfit_percent)),
+        "cpu_seconds": resource.getrusage(resource.RUSAGE_SELF).ru_utime,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("study", type=Path)
+    parser.add_argument("--repeats", type=int, default=200)
+    parser.add_argument("--noise", type=float, default=0.05, help="N, standard deviation at 500 Hz")
+    parser.add_argument("--autocorrelation", type=float, default=0.0, help="of neighbouring samples")
+    parser.add_argument("--misfit", type=float, default=0.0, help="percent of the largest force")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    robot, truth, emulator, free = study_robot(
+        given.study, given.noise, given.autocorrelation, given.misfit / 100, given.seed
+    )
+    told = summary(coverage_study(emulator, truth, free, robot, given.repeats), robot)
+    print(json.dumps(told, indent=1))
+    if given.json:
+        given.json.write_text(json.dumps(told, indent=1))
+
+
+if __name__ == "__main__":
+    main()

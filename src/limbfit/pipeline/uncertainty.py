@@ -1,0 +1,168 @@
+"""The experiment ``uncertainty``: what the records determine, and what else would change the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RunError
+from ..identify.discrepancy import ResidualModel
+from ..identify.evidence import Evidence, candidate, compare
+from ..identify.explore import Explored, ExploreSettings, explore
+from ..identify.fidelity import Anchor, corrected
+from ..identify.likelihood import Likelihood
+from ..identify.objective import Measured, SiteResponse
+from ..identify.parameters import search_space, shared
+from ..identify.sources import Gain
+from ..identify.uncertainty import Uncertainty, estimate_uncertainty
+from ..indentation import to_vector
+from .calibrate_stage import groupings, stage_titles, unknowns
+from .context import Context
+from .record_noise import site_noise
+from .simulations import experiment_cache
+from .traces_stage import site_record
+from .uncertainty_record import Found, Predicted, write_results
+from .uncertainty_sources import Change, changes, variants
+
+Array = NDArray[np.float64]
+
+_NEAR = 4.0  # runs of the calibration whose error is at most this many times the least, plus 3 %, are used
+NAME = "uncertainty"
+
+
+class FittedSites:
+    """The fitted sites, simulated with derivatives; brought to the fine meshes' forces where those exist."""
+
+    def __init__(self, context: Context, folder: Path, best: Array) -> None:
+        study = context.study
+        coarse = study.mesh.coarse is not None
+        self.context, self.cache = context, experiment_cache(context, folder)
+        self.records = [site_record(context, site) for site in study.fitted]
+        self.searched = [site_record(context, site, coarse) for site in study.fitted]
+        self.anchor = self._anchor(best) if coarse else None
+
+    @property
+    def measured(self) -> list[Measured]:
+        return [Measured(record.site.name, record.force_N, record.site.weight) for record in self.records]
+
+    def simulate(self, points: Sequence[Array]) -> list[list[SiteResponse]]:
+        """Responses of all sites at several parameters (p,)."""
+        jobs = [record.job(point) for point in points for record in self.searched]
+        found: list[SiteResponse] = []
+        for simulation in self.cache.run(jobs, self.context.executor):
+            jacobian = simulation.jacobian
+            assert jacobian is not None
+            found.append(SiteResponse(simulation.force_N, jacobian, simulation.completed, simulation.reason))
+            self.context.tell(NAME, len(found), len(jobs), f"site {simulation.site}")
+        n = len(self.searched)
+        return [self._corrected(found[i : i + n]) for i in range(0, len(found), n)]
+
+    def _anchor(self, best: Array) -> Anchor:
+        jobs = [record.job(best) for record in self.searched]
+        jobs += [record.job(best, sensitivities=False) for record in self.records]
+        ends = list(self.cache.run(jobs, self.context.executor))
+        failed = [end.site for end in ends if not end.completed]
+        if failed:
+            raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
+        n = len(self.records)
+        forces = [end.force_N for end in ends]
+        return Anchor(best, tuple(forces[:n]), tuple(forces[n:]))
+
+    def _corrected(self, responses: list[SiteResponse]) -> list[SiteResponse]:
+        if self.anchor is None:
+            return responses
+        parts = zip(responses, self.anchor.coarse, self.anchor.fine, self.anchor.scales, strict=True)
+        return [corrected(*part) for part in parts]
+
+
+def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
+    """Posterior, profiles, evidence, further sources and prediction intervals (see docs/uncertainty.md)."""
+    study = context.study
+    calibration = context.stored("calibrate", "calibration.json")
+    best = to_vector(calibration["stages"][-1]["parameters"], study.tissues)
+    sites = FittedSites(context, folder, best)
+    known = _linearised(context, sites, best)
+    table, grouping = study.uncertainty, groupings(study)[-1]
+    space = search_space(unknowns(study), grouping)
+    settings = ExploreSettings(table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed)
+    explored = explore(
+        sites.simulate,
+        sites.measured,
+        unknowns(study),
+        space,
+        known,
+        _earlier_points(context, calibration),
+        settings,
+        tell=lambda text: context.tell(NAME, 0, 0, text),
+    )
+    evidence = _evidence(context, explored, known.residual_model) if len(study.tissues) > 1 else None
+    responses = sites.simulate([best])[0]
+    gain = Gain.at(best, responses, known.residual_model, unknowns(study), space)
+    found: list[Change] = []
+    if table.sources:
+        wanted = variants(context, folder, sites.searched, best)
+        found = changes(context, sites.cache, wanted)
+    result = Found(known, explored, evidence, gain, tuple(found), unknowns(study))
+    write_results(folder, result, _predicted(context, sites, best))
+    return {"runs": explored.rounds[-1].runs}
+
+
+def _linearised(context: Context, sites: FittedSites, best: Array) -> Uncertainty:
+    study = context.study
+    responses = sites.simulate([best])[0]
+    failed = [record.site.name for record, r in zip(sites.records, responses) if not r.completed]
+    if failed:
+        raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
+    noise = [site_noise(study, record) for record in sites.records]
+    return estimate_uncertainty(best, responses, sites.measured, unknowns(study), noise, groupings(study)[-1])
+
+
+def _earlier_points(context: Context, calibration: dict[str, Any]) -> list[Array]:
+    """Parameters of the calibration's accepted iterates that came near the records."""
+    tissues = context.study.tissues
+    iterates = [iterate for stage in calibration["stages"] for iterate in stage["iterations"]]
+    least = min(iterate["error_percent"] for iterate in iterates)
+    near = [i for i in iterates if i["error_percent"] <= _NEAR * least + 3.0]
+    points = {tuple(to_vector(i["parameters"], tissues)) for i in near}
+    return [np.array(point) for point in sorted(points)]
+
+
+def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evidence:
+    """One material against the study's own, on one emulator and covariance, and where nothing was fitted."""
+    study, likelihood = context.study, explored.likelihood
+    space = search_space(unknowns(study), shared(unknowns(study).names))
+    single = Likelihood(explored.emulator, likelihood.measured, model, unknowns(study), space)
+    titles = stage_titles(study.tissues)
+    calibration = context.stored("calibrate", "calibration.json")
+    start = to_vector(calibration["stages"][0]["parameters"], study.tissues)
+    one, _ = candidate(titles[0], single, space.reduce(np.log(start)))
+    several, _ = candidate(titles[1], likelihood, explored.best.z)
+    rows = [row for row in context.stored("predict", "predict.json")["sites"] if not row["fitted"]]
+    columns = ("error_one_material_percent", "error_percent")
+    held = [row for row in rows if all(row[column] is not None for column in columns)]
+    return compare(one, several, *([row[column] for row in held] for column in columns))
+
+
+def _predicted(context: Context, sites: FittedSites, best: Array) -> list[Predicted]:
+    """Every recorded site at the identified parameters, from what the stage ``predict`` has simulated."""
+    study = context.study
+    coarse = study.mesh.coarse is not None
+    recorded = [site for site in study.sites if site.trace is not None]
+    searched = [site_record(context, site, coarse) for site in recorded]
+    jobs = [record.job(best) for record in searched]
+    if coarse:
+        jobs += [site_record(context, site).job(best, sensitivities=False) for site in recorded]
+    ends = list(sites.cache.run(jobs, context.executor))
+    found = []
+    for i, record in enumerate(searched):
+        derived, force = ends[i], ends[i + len(searched)] if coarse else ends[i]
+        if not (derived.completed and force.completed) or derived.jacobian is None:
+            continue
+        scale = float(force.force_N @ derived.force_N / (derived.force_N @ derived.force_N))
+        response = SiteResponse(force.force_N, scale * derived.jacobian)
+        found.append(Predicted(record, response, site_noise(study, record)))
+    return found

@@ -1,0 +1,320 @@
+"""What the experiment ``uncertainty`` stores: one JSON, and its tables and curves as CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from ..identify.evidence import Evidence
+from ..identify.explore import Explored
+from ..identify.noise import SiteNoise
+from ..identify.objective import SiteResponse
+from ..identify.parameters import Unknowns
+from ..identify.sources import Gain
+from ..identify.uncertainty import DETERMINED, GIVEN, UNDETERMINED, Uncertainty, verdict_of
+from .emulator_file import EMULATOR, write_runs
+from .store import write_json
+from .tabular import write_table
+from .traces_stage import SiteRecord, write_curves
+from .uncertainty_sources import Change
+
+Array = NDArray[np.float64]
+
+NORMAL_95 = 1.959964
+_DRAWS = 1500  # written
+
+
+@dataclass(frozen=True)
+class Found:
+    """All that the experiment found; see the parts for what they are."""
+
+    known: Uncertainty
+    explored: Explored
+    evidence: Evidence | None
+    gain: Gain
+    changes: tuple[Change, ...]
+    unknowns: Unknowns
+
+    @property
+    def source_covariance(self) -> Array:
+        """Of the logarithms (p, p), by all counted sources."""
+        counted = [change for change in self.changes if change.variant.counted]
+        parts = [self.gain.covariance(c.force_N, c.variant.shared) for c in counted]
+        return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A recorded site as predicted at the identified parameters, beside its record and the record's noise."""
+
+    record: SiteRecord
+    response: SiteResponse
+    noise: SiteNoise
+
+
+def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
+    """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions."""
+    (folder / "predictions").mkdir(exist_ok=True)
+    parameters, combinations = _parameters(found), _combinations(found)
+    rows = [_prediction(folder, found, one) for one in predicted]
+    explored, posterior = found.explored, found.explored.posterior
+    content = {
+        "parameters": parameters,
+        "combinations": combinations,
+        "correlation": {
+            "names": list(found.known.names),
+            "matrix": _correlation(posterior.covariance).tolist(),
+        },
+        "covariance_log": posterior.covariance.tolist(),
+        "covariance_sources_log": found.source_covariance.tolist(),
+        "residuals": found.known.residual_model.to_dict(),
+        "emulator": _emulator(found),
+        "posterior": posterior.to_dict(),
+        "profiles": {one.name: one.to_dict() for one in explored.profiles},
+        "checks": [asdict(check) for check in explored.checks],
+        "evidence": None if found.evidence is None else found.evidence.to_dict(),
+        "sources": [_source(found, change) for change in found.changes],
+        "predictions": {"sites": rows, **_coverage(rows)},
+        "verdict": _verdict(found, parameters, combinations, rows),
+    }
+    write_json(folder / "uncertainty.json", content)
+    _table(folder / "parameters.csv", [_flat(row) for row in parameters])
+    _table(folder / "sources.csv", [_flat(row) for row in content["sources"]])
+    _table(folder / "predictions.csv", rows)
+    write_runs(folder / EMULATOR, found.known.names, explored.emulator.points, explored.runs)
+    draws = posterior.draws[:: max(len(posterior.draws) // _DRAWS, 1)]
+    write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
+    _table(
+        folder / "profiles.csv",
+        [
+            {"parameter": one.name, "value": value, "rise": rise}
+            for one in explored.profiles
+            for value, rise in zip(one.values, one.rise)
+        ],
+    )
+
+
+def _parameters(found: Found) -> list[dict[str, Any]]:
+    """One row for every parameter: calibrated, and its interval by every method."""
+    known, explored = found.known, found.explored
+    posterior = explored.posterior
+    profiles = {one.name: one for one in explored.profiles}
+    more = np.sqrt(np.diag(posterior.covariance) + np.diag(found.source_covariance))
+    ours = np.sqrt(np.diag(posterior.covariance))
+    rows = []
+    for i, name in enumerate(known.names):
+        median, (low, high) = posterior.median[i], posterior.intervals_95[i]
+        wider = more[i] / max(ours[i], 1e-300)
+        bounds = found.unknowns.lower[i], found.unknowns.upper[i]
+        with_sources = (
+            max(median * (low / median) ** wider, bounds[0]),
+            min(median * (high / median) ** wider, bounds[1]),
+        )
+        profile = profiles.get(name)
+        prior_sd = np.log(bounds[1] / bounds[0]) / np.sqrt(12.0)
+        given = known.verdicts[i] == GIVEN
+        rows.append(
+            {
+                "name": name,
+                "calibrated": float(known.parameters[i]),
+                "median": float(median),
+                "linearised_95": known.intervals_95[i].tolist(),
+                "posterior_95": [float(low), float(high)],
+                "profile_95": None if profile is None else list(profile.interval_95),
+                "profile_verdict": None if profile is None else profile.verdict,
+                "with_sources_95": list(map(float, with_sources)),
+                "verdict": GIVEN if given else verdict_of(float(np.sqrt(high / low)), ours[i] / prior_sd),
+            }
+        )
+    return rows
+
+
+def _combinations(found: Found) -> list[dict[str, Any]]:
+    """The principal axes of the linearised covariance, as the posterior and the sources see them."""
+    logs = np.log(found.explored.posterior.draws)
+    prior_sd = np.log(found.unknowns.upper / found.unknowns.lower) / np.sqrt(12.0)
+    rows = []
+    for one in found.known.combinations:
+        drawn = logs @ one.weights
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        sd = float(drawn.std(ddof=1))
+        sources = float(np.sqrt(one.weights @ found.source_covariance @ one.weights))
+        factor = float(np.exp((high - low) / 2))
+        rows.append(
+            {
+                "text": one.text,
+                "weights": one.weights.tolist(),
+                "linearised_factor_95": one.factor_95,
+                "posterior_factor_95": factor,
+                "with_sources_factor_95": float(factor ** (np.hypot(sd, sources) / max(sd, 1e-300))),
+                "verdict": verdict_of(factor, sd / float(np.linalg.norm(one.weights * prior_sd))),
+            }
+        )
+    return rows
+
+
+def _emulator(found: Found) -> dict[str, Any]:
+    explored = found.explored
+    emulator = explored.emulator
+    return {
+        "runs": len(emulator.points),
+        "needed_percent": list(explored.needed_percent),
+        "good_enough": explored.good_enough,
+        "rounds": explored.rounds_record(),
+        "lower": emulator.lower.tolist(),
+        "upper": emulator.upper.tolist(),
+        "kernel_length": emulator.length,
+        "nugget": emulator.nugget,
+    }
+
+
+def _source(found: Found, change: Change) -> dict[str, Any]:
+    """One line of the table: change of force in percent of the largest, change of parameters in percent.
+
+    A source of each site's own changes parameters by the root of the sum of squares over sites.
+    """
+    variant, model = change.variant, found.known.residual_model
+    names = [noise.name for noise in model.noise]
+    forces = [100 * float(np.mean(np.abs(d))) / peak for d, peak in zip(change.force_N, model.peaks_N)]
+    if variant.shared:
+        shift = found.gain.shift(change.force_N)
+    else:
+        shift = np.sqrt(np.diag(found.gain.covariance(change.force_N, False)))
+    return {
+        "source": variant.source,
+        "change": variant.change,
+        "shared": variant.shared,
+        "counted": variant.counted,
+        "failed": list(change.failed),
+        "force_percent": dict(zip(names, forces)),
+        "parameters_percent": dict(zip(found.known.names, (100 * np.expm1(shift)).tolist())),
+    }
+
+
+def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
+    """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside."""
+    model, record = found.known.residual_model, one.record
+    parameters = found.known.parameters
+    force, measured = one.response.force_N, record.force_N
+    peak = float(force.max())
+    names = [noise.name for noise in model.noise]
+    share = (
+        model.misfit[names.index(record.site.name)] if record.site.name in names else model.misfit_elsewhere
+    )
+    scaled = one.response.jacobian * parameters
+    variances = {
+        "parameters": np.einsum("ni,ij,nj->n", scaled, found.explored.posterior.covariance, scaled),
+        "sources": np.einsum("ni,ij,nj->n", scaled, found.source_covariance, scaled),
+        "noise": np.diag(one.noise.covariance),
+        "misfit": np.full(len(force), (share * peak) ** 2),
+    }
+    total = np.sum(list(variances.values()), axis=0)
+    part = variances["misfit"] / np.maximum(total, 1e-300)
+    freedom = np.clip(model.known_scale / np.maximum(part, 1e-3) ** 2, 3.0, 1e6)
+    half = stdtrit(freedom, 0.975) * np.sqrt(total)
+    low, high = np.maximum(force - half, 0.0), force + half
+    write_curves(
+        folder / "predictions" / f"{record.site.name}.csv",
+        time_s=record.times_s,
+        force_measured_N=measured,
+        force_predicted_N=force,
+        force_low_N=low,
+        force_high_N=high,
+    )
+    inside = (measured >= low) & (measured <= high)
+    return {
+        "site": record.site.name,
+        "fitted": record.site.fitted,
+        "inside_percent": 100 * float(inside.mean()),
+        "half_width_percent": 100 * float(half.mean()) / peak,
+        **{f"{k}_sd_percent": 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()},
+    }
+
+
+def _coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Mean share of the records inside their intervals, in percent."""
+    found: dict[str, float | None] = {}
+    for kind, fitted in (("fitted", True), ("heldout", False)):
+        shares = [row["inside_percent"] for row in rows if row["fitted"] == fitted]
+        found[f"coverage_{kind}_percent"] = float(np.mean(shares)) if shares else None
+    return found
+
+
+def _verdict(
+    found: Found,
+    parameters: Sequence[dict[str, Any]],
+    combinations: Sequence[dict[str, Any]],
+    rows: Sequence[dict[str, Any]],
+) -> list[str]:
+    """The answer in sentences."""
+    words = []
+    for word in (DETERMINED, "weakly determined", UNDETERMINED):
+        names = [row["name"] for row in parameters if row["verdict"] == word]
+        if names:
+            words.append(f"{word.capitalize()}: {', '.join(names)}.")
+    told = [row for row in combinations if row["verdict"] == DETERMINED]
+    words.append(
+        f"The records determine {len(told)} of {len(combinations)} independent combinations to within "
+        "-20 to +25 %" + (f"; the best is {told[0]['text']}." if told else ".")
+    )
+    beyond = [
+        row["name"]
+        for row in parameters
+        if not row["posterior_95"][0] <= row["calibrated"] <= row["posterior_95"][1]
+    ]
+    if beyond:
+        words.append(
+            f"The calibrated value lies outside its own interval: {', '.join(beyond)}; the calibration "
+            "weighs all points of a record alike, the interval by noise and misfit."
+        )
+    if found.evidence is not None:
+        words.append(found.evidence.verdict[0].upper() + found.evidence.verdict[1:] + ".")
+    counted = [change for change in found.changes if change.variant.counted]
+    if counted:
+        largest = max(
+            counted, key=lambda c: float(np.trace(found.gain.covariance(c.force_N, c.variant.shared)))
+        )
+        words.append(
+            f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
+            "parameters most."
+        )
+    coverage = _coverage(rows)["coverage_heldout_percent"]
+    if coverage is not None:
+        words.append(f"{coverage:.0f} % of the held-out records lies inside the 95 % prediction intervals.")
+    if not found.explored.good_enough:
+        words.append("The emulator is not as good as the records: raise uncertainty.runs.")
+    if not found.explored.posterior.long_enough:
+        words.append("The sampler's chain is short for its autocorrelation: intervals are rough.")
+    return words
+
+
+def _correlation(covariance: Array) -> Array:
+    sd = np.sqrt(np.diag(covariance))
+    sd = np.where(sd > 0, sd, 1.0)
+    return covariance / np.outer(sd, sd)
+
+
+def _flat(row: dict[str, Any]) -> dict[str, Any]:
+    """Lists and dictionaries of a row as columns."""
+    flat: dict[str, Any] = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{name}": number for name, number in value.items()}
+        elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):
+            flat |= {f"{key}_low": value[0], f"{key}_high": value[1]}
+        elif isinstance(value, list):
+            flat[key] = " ".join(map(str, value))
+        else:
+            flat[key] = value
+    return flat
+
+
+def _table(file: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Rows with the same columns as CSV."""
+    write_table(file, list(rows[0]) if rows else [], [list(row.values()) for row in rows])

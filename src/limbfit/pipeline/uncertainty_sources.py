@@ -1,0 +1,235 @@
+"""What else would change the answer, by how much: geometry, contact and discretisation, as real simulations.
+
+Each source is the study's model with one thing changed by about one standard deviation of what is known of
+it. The change of force at the fitted sites becomes a change of the parameters by the generalised inverse of
+the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.meshing import MeshSettings
+from ..anatomy.sites import indenter_axis, project_to_skin
+from ..anatomy.surfaces import load_anatomy
+from ..indentation import SimulationJob, SiteModel
+from ..study import SolverTable, Study, Vector
+from .context import Context
+from .geometry_stages import MeshJob, coarse_settings, make_mesh, mesh_settings
+from .simulations import SimulationCache
+from .store import file_digest
+from .traces_stage import SiteRecord, site_record
+
+Array = NDArray[np.float64]
+
+FINER = 0.75  # edges of the finer mesh, where the study has no coarse one to compare with
+MORE_STEPS = 2
+Vary = Callable[..., "Variant"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A changed model of every fitted site: ``jobs``, beside the jobs of what they are compared with.
+
+    ``shared``: the change is the same at all sites, or each site has its own. ``counted``: it is a spread
+    that enters the covariance, or an alternative that is only told. ``scale``: of the difference of forces.
+    """
+
+    source: str
+    change: str
+    jobs: tuple[SimulationJob, ...]
+    compared_with: tuple[SimulationJob, ...]
+    shared: bool
+    counted: bool
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a variant does: change of force (n,) N at every fitted site; zero at those that ``failed``."""
+
+    variant: Variant
+    force_N: tuple[Array, ...]
+    failed: tuple[str, ...]
+
+
+def variants(
+    context: Context, folder: Path, records: Sequence[SiteRecord], parameters: Array
+) -> list[Variant]:
+    """All variants of the study, their meshes made; ``records`` are those whose meshes are searched on."""
+    table = context.study.uncertainty
+    plain = tuple(record.job(parameters, sensitivities=False) for record in records)
+
+    def vary(source: str, change: str, models: Sequence[SiteModel], shared: bool, counted: bool) -> Variant:
+        jobs = tuple(replace(job, model=model) for job, model in zip(plain, models, strict=True))
+        return Variant(source, change, jobs, plain, shared, counted)
+
+    models = [record.model for record in records]
+    found = [
+        vary(
+            "layer thickness", f"{table.layer_mm:g} mm thicker", _thicker(context, folder, models), True, True
+        )
+    ]
+    for number, word in enumerate(("along the limb", "around the limb")):
+        moved = [_moved(context, model, number, table.position_mm) for model in models]
+        found.append(vary("site position", f"{table.position_mm:g} mm {word}", moved, False, True))
+    for number, word in enumerate(("along the limb", "around the limb")):
+        tilted = [replace(m, axis=_tilted(m, number, table.axis_degrees)) for m in models]
+        found.append(vary("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True))
+    found += _of_contact(context.study, models, vary)
+    finer = [replace(m, steps=_more_steps(m)) for m in models]
+    found.append(vary("time steps", f"{MORE_STEPS} times as many", finer, True, True))
+    found.append(_of_mesh(context, folder, records, plain, parameters))
+    return found
+
+
+def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[Variant]:
+    """Edge radius, friction and bulk modulus; the last two are alternatives, no spreads."""
+    radius = study.uncertainty.edge_radius_mm
+    indenter, found = study.indenter, []
+    if indenter.shape == "square" and radius > 0:
+        rounded = [_with_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius) for m in models]
+        found.append(vary("indenter edge", f"radius {radius:g} mm larger", rounded, True, True))
+    other = "sticky" if indenter.friction == "frictionless" else "frictionless"
+    found.append(vary("friction", other, [_with_indenter(m, friction=other) for m in models], True, False))
+    softer = [replace(m, kappa_ratio=m.kappa_ratio / 2) for m in models]
+    found.append(vary("bulk modulus", "half", softer, True, False))
+    return found
+
+
+def _with_indenter(model: SiteModel, **changes: object) -> SiteModel:
+    return replace(model, indenter=model.indenter.model_copy(update=changes))
+
+
+def _more_steps(model: SiteModel) -> SolverTable:
+    steps = model.steps
+    update = {"load_steps": MORE_STEPS * steps.load_steps, "unload_steps": MORE_STEPS * steps.unload_steps}
+    return steps.model_copy(update=update)
+
+
+def _tangents(axis: Array) -> tuple[Array, Array]:
+    """Two unit vectors across an axis: along the limb (the image's z) and around it."""
+    up = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    along = up - (up @ axis) * axis
+    along /= np.linalg.norm(along)
+    return along, np.cross(axis, along)
+
+
+def _moved(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:
+    """The site elsewhere on the skin, its axis found anew; the mesh is refined widely enough around it."""
+    anatomy = load_anatomy(context.store["surfaces"])
+    axis = np.array(model.axis)
+    wanted = np.array(model.position) + distance_mm * _tangents(axis)[number]
+    point, _ = project_to_skin(anatomy, wanted)
+    width = context.study.indenter.width_mm
+    turned = indenter_axis(anatomy.skin, point, width) - indenter_axis(anatomy.skin, model.position, width)
+    axis = axis + turned
+    axis /= np.linalg.norm(axis)
+    return replace(model, position=_vector(point), axis=_vector(axis))
+
+
+def _tilted(model: SiteModel, number: int, degrees: float) -> Vector:
+    axis, angle = np.array(model.axis), np.radians(degrees)
+    turned = np.cos(angle) * axis + np.sin(angle) * _tangents(axis)[number]
+    return _vector(turned)
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def searched_settings(study: Study) -> MeshSettings:
+    """Of the meshes on which parameters are searched: the coarse ones where there are."""
+    return coarse_settings(study) or mesh_settings(study)
+
+
+def _thicker(context: Context, folder: Path, models: Sequence[SiteModel]) -> list[SiteModel]:
+    """The sites meshed anew with the outermost layer of given thickness made thicker."""
+    settings = searched_settings(context.study)
+    layers = list(settings.layers)
+    index = next((i for i, layer in enumerate(layers) if layer.thickness_mm is not None), 0)
+    layer, more = layers[index], context.study.uncertainty.layer_mm
+    if layer.thickness_mm is None:  # a mapped layer: its least thickness is all that can be stated
+        layers[index] = replace(layer, min_thickness_mm=(layer.min_thickness_mm or 0.0) + more)
+    else:
+        layers[index] = replace(layer, thickness_mm=layer.thickness_mm + more)
+    return _meshed(context, folder / "thicker", models, replace(settings, layers=tuple(layers)))
+
+
+def _meshed(
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
+) -> list[SiteModel]:
+    """The models on meshes of other settings; those of an interrupted run are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stamp = context.store.stamp("surfaces") or {}
+    jobs = [
+        MeshJob(
+            site=model.name,
+            surfaces=context.store["surfaces"],
+            surfaces_key=str(stamp["key"]),
+            position=model.position,
+            axis=model.axis,
+            settings=settings,
+            file=folder / f"{model.name}.vtu",
+        )
+        for model in models
+    ]
+    missing = [job for job in jobs if not job.file.with_suffix(".json").is_file()]
+    for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
+        context.tell("uncertainty", 0, 0, f"mesh of site {job.site}, {folder.name}")
+    return [
+        replace(model, mesh=job.file, mesh_digest=file_digest(job.file)) for model, job in zip(models, jobs)
+    ]
+
+
+def _of_mesh(
+    context: Context,
+    folder: Path,
+    records: Sequence[SiteRecord],
+    plain: tuple[SimulationJob, ...],
+    parameters: Array,
+) -> Variant:
+    """How far forces are from those of an infinitely fine mesh, extrapolated from two (order 2)."""
+    study = context.study
+    settings = searched_settings(study)
+    if study.mesh.coarse is not None:
+        fine = [site_record(context, record.site).job(parameters, sensitivities=False) for record in records]
+        ratio = (settings.edge_near_mm / study.mesh.edge_near_mm) ** 2
+        change = "what the fine mesh lacks, from coarse and fine"
+        return Variant("mesh", change, tuple(fine), plain, False, True, 1 / max(ratio - 1, 0.2))
+    finer = replace(
+        settings, edge_near_mm=FINER * settings.edge_near_mm, edge_far_mm=FINER * settings.edge_far_mm
+    )
+    models = _meshed(context, folder / "finer", [record.model for record in records], finer)
+    jobs = tuple(replace(job, model=model) for job, model in zip(plain, models, strict=True))
+    change = f"what the mesh lacks, from edges {FINER:g} times as long"
+    return Variant("mesh", change, jobs, plain, False, True, 1 / (1 - FINER**2))
+
+
+def changes(context: Context, cache: SimulationCache, wanted: Sequence[Variant]) -> list[Change]:
+    """Simulate the variants."""
+    jobs = [job for variant in wanted for job in (*variant.jobs, *variant.compared_with)]
+    forces: list[Array | None] = []
+    for simulation in cache.run(jobs, context.executor):
+        forces.append(simulation.force_N if simulation.completed else None)
+        context.tell("uncertainty", len(forces), len(jobs), f"sources, site {simulation.site}")
+    found, at = [], 0
+    for variant in wanted:
+        n = len(variant.jobs)
+        pairs = list(zip(forces[at : at + n], forces[at + n : at + 2 * n]))
+        at += 2 * n
+        failed = [
+            job.model.name for job, (new, old) in zip(variant.jobs, pairs) if new is None or old is None
+        ]
+        difference = [
+            np.zeros(len(job.times_s)) if new is None or old is None else variant.scale * (new - old)
+            for job, (new, old) in zip(variant.jobs, pairs)
+        ]
+        found.append(Change(variant, tuple(difference), tuple(failed)))
+    return found

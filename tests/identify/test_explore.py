@@ -1,0 +1,93 @@
+"""From a calibration to posterior and profiles with few runs; sources as shifts; coverage of it all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bars import NAMES, PAPER, SITES, TRUTH, records, simulate
+
+from limbfit.identify import SiteResponse, calibrate, estimate_uncertainty, separate
+from limbfit.identify.coverage import coverage_study
+from limbfit.identify.explore import ExploreSettings, explore
+from limbfit.identify.noise import curve_noise
+from limbfit.identify.parameters import search_space
+from limbfit.identify.sources import Gain
+
+SPACE = search_space(PAPER, separate(NAMES))
+
+
+def calibrated(noise=0.03, seed=4, **extra):
+    data = records(noise, seed=seed)
+    found = calibrate(simulate, data, PAPER.from_start(TRUTH), stages=(separate(NAMES),))
+    return data, found, estimate_uncertainty(found.parameters, found.responses, data, PAPER)
+
+
+def test_an_exploration_spends_its_runs_and_holds_the_truth():
+    data, found, known = calibrated()
+    asked = []
+
+    def many(points):
+        asked.extend(points)
+        return [simulate(p) for p in points]
+
+    earlier = [np.array(i.parameters) for i in found.history]
+    settings = ExploreSettings(runs=8, batch=4, steps=600, checked=1)
+    done = explore(many, data, PAPER, SPACE, known, earlier, settings)
+    # A check asks for the optimum and two ends of a profile.
+    assert len(asked) <= len(earlier) + 8 + 3
+    assert done.good_enough
+    assert max(done.rounds[-1].error_percent) < min(done.needed_percent)
+    inside = [low < true < high for true, (low, high) in zip(TRUTH, done.posterior.intervals_95)]
+    assert sum(inside) >= 6
+    assert {one.name for one in done.profiles} == set(NAMES)
+    assert done.checks[0].largest_difference < 0.5
+
+
+def test_failed_runs_do_not_stop_an_exploration():
+    data, found, known = calibrated()
+
+    def flaky(points):
+        runs = [list(simulate(p)) for p in points]
+        bad = runs[-1][0]
+        runs[-1][0] = SiteResponse(bad.force_N, bad.jacobian, False, "stopped")
+        return runs
+
+    settings = ExploreSettings(runs=8, batch=8, steps=200, checked=0)
+    earlier = [np.array(i.parameters) for i in found.history]
+    done = explore(flaky, data, PAPER, SPACE, known, earlier, settings)
+    assert len(done.runs) == len(earlier) + 8 - 2
+    assert done.emulator.check(TRUTH, simulate(TRUTH)).max() < 0.5
+
+
+def test_a_source_shifts_the_answer_as_a_new_calibration_would():
+    data, found, known = calibrated(0.001)
+    gain = Gain.at(found.parameters, found.responses, known.residual_model, PAPER, SPACE)
+    bump = [0.002 * d.force_N for d in data]
+
+    def changed(p):
+        return [SiteResponse(r.force_N + b, r.jacobian) for r, b in zip(simulate(p), bump)]
+
+    again = calibrate(changed, data, PAPER.from_start(found.parameters), stages=(separate(NAMES),))
+    # The two weigh the records differently, so the shift is the same in what all sites agree on.
+    moved = np.log(again.parameters / found.parameters)
+    assert gain.shift(bump)[[0, 4]] == pytest.approx(moved[[0, 4]], abs=5e-4)
+    assert gain.shift(bump)[[0, 4]] == pytest.approx([-0.002, -0.002], abs=5e-4)
+    alone = gain.covariance(bump, shared=False)
+    parts = [gain.matrices[k] @ bump[k] for k in range(len(SITES))]
+    assert alone == pytest.approx(sum(np.outer(part, part) for part in parts))
+    assert gain.covariance(bump, shared=True) == pytest.approx(np.outer(gain.shift(bump), gain.shift(bump)))
+
+
+def test_coverage_of_whole_calibrations():
+    def record(repeat, forces):
+        data = records(0.03, seed=repeat)
+        left = [d.force_N - f for d, f in zip(data, forces)]
+        return data, [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
+
+    found = coverage_study(simulate, TRUTH, PAPER, record, repeats=20)
+    assert found.determined.all()
+    assert 0.88 < found.share <= 1.0
+    low, high = found.limits()
+    assert low == pytest.approx(0.85)
+    assert high == pytest.approx(1.0)
+    assert found.by_parameter.mean() > 0.85
