@@ -29,9 +29,10 @@ _HAYES = (
 MODULUS_KPA = (1.0, 100.0)
 # Standard deviations (logarithmic) below which differences between sites of one study mean nothing:
 # modulus with and without a known thickness, speed, time step, depth.
-_FLOORS = {"modulus": 0.35, "stiffness": 0.75, "speed": 0.2, "step": 0.1, "depth": 0.4}
+_FLOORS = {"modulus": 0.3, "stiffness": 0.75, "speed": 0.2, "step": 0.1, "depth": 0.4}
 _MIN_OTHERS = 3
-_LARGE = 4.0  # standard deviations of one quantity
+_LARGE = 3.8  # standard deviations of one quantity
+_BOTH = 4.0  # of two sites together, exchanged
 _DROP = 12.0  # by which a hypothesis must lower chi-square
 _EXPLAINED = 16.0  # the chi-square (of 4) up to which a hypothesis explains what it names
 AXIS_DEG, OFF_SKIN_MM, HINT_MM, DEPTH_SHARE = 25.0, 3.0, 12.0, 0.8
@@ -236,7 +237,7 @@ def _swapped(facts: Sequence[RecordFacts], z: Array) -> Flag | None:
     before = scatter(facts)
     found: tuple[float, int, int] | None = None
     for i, j in combinations(range(len(facts)), 2):
-        if z[i] * z[j] > 0 or max(abs(z[i]), abs(z[j])) < _LARGE or min(abs(z[i]), abs(z[j])) < 2.0:
+        if z[i] * z[j] > 0 or np.hypot(z[i], z[j]) < _BOTH or min(abs(z[i]), abs(z[j])) < 2.0:
             continue
         rows = list(facts)
         rows[i] = replace(facts[i], thickness_mm=facts[j].thickness_mm)

@@ -1,0 +1,41 @@
+"""Tissue under an indenter, where it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from limbfit.anatomy.surfaces import Anatomy, Surface
+from limbfit.anatomy.under import DEEPEST_MM, tissue_under
+
+
+def cylinder(radius: float, offset: float = 0.0) -> Surface:
+    mesh = pv.Cylinder(center=(offset, 0, 0), direction=(0, 0, 1), radius=radius, height=200, resolution=200)
+    mesh = mesh.triangulate().clean()
+    return Surface(np.asarray(mesh.points, dtype=float), mesh.faces.reshape(-1, 4)[:, 1:].astype(np.int64))
+
+
+@pytest.fixture(scope="module")
+def limb() -> Anatomy:
+    """A leg of 50 mm radius with a bone of 10 mm radius, 25 mm off its axis."""
+    return Anatomy(
+        cylinder(50.0), {"tibia": cylinder(10.0, 25.0)}, np.array([0, 0, 100.0]), np.array([0, 0, 1.0])
+    )
+
+
+def test_it_is_the_distance_along_the_axis(limb):
+    assert tissue_under(limb, (50, 0, 0), (-1, 0, 0), 1.0) == pytest.approx(15.0, abs=0.1)
+
+
+def test_the_thinnest_place_under_the_footprint_counts(limb):
+    # Beside the bone's top the skin falls away slower than the bone: the middle is thinnest.
+    assert tissue_under(limb, (50, 0, 0), (-1, 0, 0), 20.0) == pytest.approx(15.0, abs=0.1)
+    # 8 mm to the side the centre sees 16.9 mm, the edge of the footprint the bone's top.
+    place = (np.sqrt(50**2 - 8**2), 8, 0)
+    assert tissue_under(limb, place, (-1, 0, 0), 20.0) < tissue_under(limb, place, (-1, 0, 0), 1.0)
+
+
+def test_without_bone_below_it_is_deep(limb):
+    assert tissue_under(limb, (0, 50, 0), (0, -1, 0), 20.0) == DEEPEST_MM
+    assert tissue_under(limb, (-50, 0, 0), (1, 0, 0), 20.0) == DEEPEST_MM
