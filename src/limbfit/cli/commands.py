@@ -215,7 +215,8 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
     show_sites(summary)
     show_warnings(summary["sites"])
     show_flags(summary.get("flags", ()))
-    STDOUT.print(f"report: {summary['report']}")
+    if "report" in summary:  # not before its stage
+        STDOUT.print(f"report: {summary['report']}")
 
 
 def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:

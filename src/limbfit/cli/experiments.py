@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,8 @@ from rich.table import Table
 import limbfit
 
 from ..errors import InputError
-from .console import STDOUT, AsJson, listening, print_json
+from .commands import StudyPath
+from .console import STDERR, STDOUT, AsJson, listening, print_json
 
 
 def run_verb(
@@ -61,4 +63,127 @@ def show_cube(found: dict[str, Any]) -> None:
     STDOUT.print(table)
 
 
-VERBS = (cube,)
+class Sites(StrEnum):
+    all = "all"
+    fitted = "fitted"
+
+
+def regions(
+    study: StudyPath,
+    sites: Annotated[
+        Sites,
+        typer.Option(help="fit all recorded sites of a region, as the paper, or the study's fitted ones"),
+    ] = Sites.all,
+    as_json: AsJson = False,
+) -> None:
+    """Identify each region of the limb by itself, beside the model of the whole limb: the paper's table 3."""
+    run_verb(study, "regions", show_regions, as_json=as_json, sites=sites.value)
+
+
+def show_regions(found: dict[str, Any]) -> None:
+    table = Table(
+        "region", "sites", "tissue", "c (kPa)", "m", "gamma", "tau (s)", "error (%)", "whole (%)", box=None
+    )
+    rows = [("whole limb", found["whole"]["fitted_sites"], found["whole"]["parameters"], None, None)]
+    errors = ("own_error_percent", "whole_error_percent")
+    rows += [
+        (row["region"], row["fitted_sites"], row["parameters"], *(row[key] for key in errors))
+        for row in found["regions"]
+    ]
+    for name, sites, parameters, *known in rows:
+        words = [name, ", ".join(sites)]
+        told = ["" if error is None else f"{error:.2f}" for error in known]
+        for tissue, values in parameters.items():
+            table.add_row(*words, tissue, *(f"{value:.3g}" for value in values.values()), *told)
+            words, told = ["", ""], ["", ""]
+    STDOUT.print(table)
+    for text in found["left_out"]:
+        STDOUT.print(f"left out: {text}", soft_wrap=True)
+
+
+def uncertainty(study: StudyPath, as_json: AsJson = False) -> None:
+    """Find what the records determine, what else would change it, and how far predictions can be trusted."""
+    run_verb(study, "uncertainty", show_uncertainty, as_json=as_json)
+
+
+def show_uncertainty(found: dict[str, Any]) -> None:
+    table = Table(
+        "parameter", "identified", "95 % by the records", "95 % with all sources", "verdict", box=None
+    )
+    for row in found["parameters"]:
+        ranges = [row[key] for key in ("posterior_95", "with_sources_95")]
+        words = [f"{low:.3g} to {high:.3g}" for low, high in ranges]
+        table.add_row(row["name"], f"{row['calibrated']:.3g}", *words, row["verdict"])
+    STDOUT.print(table)
+    for text in found["verdict"]:
+        STDOUT.print(text, soft_wrap=True)
+
+
+class Sensitivity(StrEnum):
+    c = "c"
+    kappa = "kappa"
+    contact = "contact"
+    indenter = "indenter"
+    mesh = "mesh"
+
+
+def sensitivity(
+    study: StudyPath,
+    only: Annotated[
+        str | None,
+        typer.Option(help="some of c, kappa, contact, indenter, mesh, separated by commas; default: all"),
+    ] = None,
+    site: Annotated[
+        list[str] | None,
+        typer.Option(help="where, repeatable; default: where tissue over bone is thinnest and thickest"),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate again with another c, bulk modulus, friction, indenter or mesh."""
+    checked, found = limbfit.load_study(study), {}
+    with listening() as listener:
+        for name in parse_sensitivities(only):
+            found[name] = limbfit.run_experiment(
+                checked, f"sensitivity-{name}", listener=listener, sites=site or []
+            )
+            if not as_json:
+                show_sensitivity(name, found[name])
+    if as_json:
+        print_json(found)
+
+
+def parse_sensitivities(only: str | None) -> list[str]:
+    """``--only``: names of what is changed."""
+    known = [kind.value for kind in Sensitivity]
+    names = known if only is None else [name.strip() for name in only.split(",")]
+    wrong = [name for name in names if name not in known]
+    if wrong:
+        raise InputError(f"{wrong[0]!r} cannot be changed", place="--only", remedy=f"use {', '.join(known)}")
+    return names
+
+
+def show_sensitivity(name: str, found: dict[str, Any]) -> None:
+    head = ["site", "peak (N)", "change (%)", "mean (%)"] + (
+        ["least J", "largest J"] if name == "kappa" else []
+    )
+    table = Table(f"sensitivity to {name}", *head, box=None)
+    for row in found["runs"]:
+        numbers = [row["peak_force_N"], row["peak_change_percent"], row["mean_change_percent"]]
+        words = ["-" if number is None else f"{number:.2f}" for number in numbers]
+        if name == "kappa":
+            words += ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("J_min", "J_max")]
+        table.add_row(row["label"], row["site"], *words)
+    STDOUT.print(table)
+    if name == "mesh":
+        for row in found["sites"]:
+            if row["limit_N"] is not None:
+                text = f"site {row['site']}: tends to {row['limit_N']:.3f} N, order {row['order']:.2g}"
+                STDOUT.print(f"{text}; the study's mesh is {row['error_percent']:+.2f} % off", soft_wrap=True)
+    for row in found["runs"]:
+        if not row["completed"]:
+            text = f"site {row['site']}, {row['label']}: {row['reason']}"
+            STDERR.print(f"warning: partial: {text}", soft_wrap=True)
+    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+
+
+VERBS = (cube, regions, sensitivity, uncertainty)

@@ -2,13 +2,13 @@
 
 An experiment is stored like a stage, in ``results/<name>`` under a key of all that decides it, and is stale
 when any of it has changed. It writes ``<name>.json``, which its command prints and its section of the report
-reads, and CSV tables beside it. ``experiment_cache`` keeps its simulations, and finds those of the stages and
-of other experiments, so that a killed one goes on and nothing is simulated twice.
+reads, and CSV tables beside it. `simulations.experiment_cache` keeps its simulations, and finds those of the
+stages and of other experiments, so that a killed one goes on and nothing is simulated twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,32 @@ from typing import Any
 from ..errors import InputError
 from ..study import Study
 from .context import Context
+from .crossvalidation import run_crossvalidate
 from .cube import COMPRESSION_PERCENT, run_cube
+from .design import run_design
 from .keys import Keys, Stage
-from .simulations import SimulationCache
+from .refinement import FACTORS, run_refinement
+from .regions import run_regions
+from .sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
 from .store import Store, read_json
+from .uncertainty import run_uncertainty
 
-MECHANICS = ("fe", "indentation", "mesh", "pipeline/simulations")  # rooms of every experiment that simulates
+# Rooms of experiments that simulate, and of those that identify parameters.
+IDENTIFY = tuple(
+    f"identify/{name}"
+    for name in ("calibration", "fidelity", "objective", "parameters", "trust_region", "uncertainty", "noise")
+)
+UNCERTAINTY = (
+    "discrepancy",
+    "emulator",
+    "evidence",
+    "explore",
+    "likelihood",
+    "posterior",
+    "profile",
+    "sources",
+)
+MECHANICS = ("fe", "indentation", "mesh", "pipeline/simulations")
 
 
 @dataclass(frozen=True)
@@ -35,6 +55,23 @@ class Experiment(Stage):
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
+_OF_SENSITIVITY = (*MECHANICS, "pipeline/sensitivity", "pipeline/variants")
+
+
+def _sensitivity(
+    name: str, run: Callable[..., dict[str, Any]], rooms: Sequence[str] = (), **options: Any
+) -> Experiment:
+    return Experiment(
+        f"sensitivity-{name}",
+        run,
+        needs=("sites", "traces", "mesh", "calibrate"),
+        tables=("material", "solver", "indenter"),
+        site_keys=("name", "region", "edge", "depth_mm", "speed_mm_s"),
+        rooms=(*_OF_SENSITIVITY, *rooms),
+        options={"sites": [], **options},
+    )
+
+
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "cube",
@@ -43,6 +80,53 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         tables=("material",),
         rooms=("fe", "pipeline/cube", "pipeline/published"),
         options={"compression_percent": COMPRESSION_PERCENT},
+    ),
+    Experiment(
+        "regions",
+        run_regions,
+        needs=("sites", "traces", "mesh", "calibrate"),
+        tables=("material", "calibration", "solver", "indenter"),
+        site_keys=("name", "region", "fitted", "weight", "edge"),
+        rooms=(*MECHANICS, *IDENTIFY, "identify/regions", "pipeline/calibrate_stage", "pipeline/regions"),
+        options={"sites": "all"},
+    ),
+    _sensitivity("c", run_stiffness),
+    _sensitivity("kappa", run_kappa, ["pipeline/volumes"], ratios=list(KAPPA_RATIOS)),
+    _sensitivity("contact", run_contact),
+    _sensitivity("indenter", run_indenter),
+    _sensitivity("mesh", run_refinement, ["pipeline/refinement", "anatomy"], factors=list(FACTORS)),
+    Experiment(
+        "uncertainty",
+        run_uncertainty,
+        needs=("sites", "traces", "mesh", "calibrate", "predict"),
+        tables=("material", "calibration", "solver", "indenter", "uncertainty"),
+        site_keys=("name", "fitted", "weight", "edge"),
+        rooms=(
+            *(*MECHANICS, *IDENTIFY, "pipeline/calibrate_stage", "pipeline/record_noise"),
+            *(f"identify/{name}" for name in UNCERTAINTY),
+            *(f"pipeline/{name}" for name in ("uncertainty", "uncertainty_record", "uncertainty_sources")),
+        ),
+    ),
+    Experiment(
+        "crossvalidate",
+        run_crossvalidate,
+        needs=("sites", "traces", "mesh", "calibrate"),
+        tables=("material", "calibration", "solver", "indenter"),
+        site_keys=("name", "region", "fitted", "weight", "edge"),
+        rooms=(
+            *(*MECHANICS, *IDENTIFY, "identify/crossvalidation", "identify/emulator", "identify/spread"),
+            *("pipeline/calibrate_stage", "pipeline/crossvalidation"),
+        ),
+        options={"fit": 0, "choices": 200, "seed": 0, "runs": 12},
+    ),
+    Experiment(
+        "design",
+        run_design,
+        needs=("sites", "traces", "mesh"),
+        tables=("material", "solver", "indenter"),
+        site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s"),
+        rooms=(*MECHANICS, "identify/design", "anatomy/under", "pipeline/design"),
+        options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
     ),
 )
 
@@ -111,9 +195,3 @@ def do_experiment(context: Context, experiment: Experiment, key: str, options: M
         stamp = store.make(name, key, produce)
         context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
     return read_json(store[name] / f"{name}.json")
-
-
-def experiment_cache(context: Context, folder: Path) -> SimulationCache:
-    """Simulations of the experiment in ``folder``; all others of the study count as done."""
-    others = sorted(place for place in context.store.folder.glob("*/runs") if place.parent != folder)
-    return SimulationCache(folder / "runs", also=others)

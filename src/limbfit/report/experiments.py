@@ -5,12 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from .cube import cube_section
+from .design import design_section
 from .page import Note, Section
+from .regions import regions_section
+from .sensitivity import SENSITIVITIES
 from .store import Json, Store
+from .uncertainty import uncertainty_section
+from .validation import validation_section
 
 Maker = Callable[[Store, Json], Section]
 # By the name of the experiment; a maker is given the store and what ``<name>.json`` holds.
-MAKERS: dict[str, Maker] = {"cube": cube_section}
+MAKERS: dict[str, Maker] = {
+    "uncertainty": uncertainty_section,
+    "regions": regions_section,
+    "cube": cube_section,
+    **SENSITIVITIES,
+    "crossvalidate": validation_section,
+    "design": design_section,
+}
 
 
 def experiment_sections(store: Store) -> tuple[Section, ...]:
@@ -23,7 +35,8 @@ def experiment_sections(store: Store) -> tuple[Section, ...]:
 
 
 def _outdated(name: str) -> Note:
+    verb = name.replace("sensitivity-", "sensitivity --only ")
     return Note(
-        f"The stored results of “limbfit {name}” are left out: they were made from other inputs, settings or "
+        f"The stored results of “limbfit {verb}” are left out: they were made from other inputs, settings or "
         "code. Run it again to see them here."
     )

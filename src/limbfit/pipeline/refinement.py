@@ -1,0 +1,176 @@
+"""The experiment ``sensitivity-mesh``: is the force independent of the mesh?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from ..errors import InputError
+from ..indentation import Simulation
+from .context import Context
+from .geometry_stages import MeshJob, make_mesh, mesh_settings
+from .sensitivity import identified_parameters, store_runs
+from .simulations import experiment_cache
+from .store import file_digest, read_json
+from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants
+
+Array = NDArray[np.float64]
+FACTORS = (1.4, 1.0, 0.7)  # of the edge lengths of the study's meshes
+ASSUMED_ORDER = 2.0
+ORDERS = (0.3, 6.0)  # in which a measured order of convergence is believed
+FARTHEST = 0.1  # of the force on the finest mesh: a limit farther away is no limit
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """What a quantity tends to as meshes get finer, and the order at which it does.
+
+    ``measured``: the order follows from three meshes; otherwise it is assumed and the limit rests on the two
+    finest ones.
+    """
+
+    limit: float
+    order: float
+    measured: bool
+
+    def error_percent(self, value: float) -> float:
+        """How far a value is from the limit, in percent of it."""
+        return 100.0 * (value / self.limit - 1.0)
+
+
+def richardson(edges: Sequence[float], values: Sequence[float]) -> Extrapolation:
+    """``value = limit + a edge^order`` through the three finest meshes (Richardson; Roache 1998).
+
+    Where the values do not change in one direction, or at no order of `ORDERS`, order two is assumed.
+
+    Parameters
+    ----------
+    edges : (k,) edge lengths of two or more meshes, in any order.
+    values : (k,) what was computed on them.
+    """
+    if len(edges) < 2:
+        raise ValueError("two meshes or more are needed")
+    order = np.argsort(edges)
+    h, f = np.asarray(edges, dtype=float)[order][:3], np.asarray(values, dtype=float)[order][:3]
+
+    def mismatch(p: float) -> float:
+        return float((f[2] - f[1]) * (h[1] ** p - h[0] ** p) - (f[1] - f[0]) * (h[2] ** p - h[1] ** p))
+
+    measured = len(h) == 3 and (f[2] - f[1]) * (f[1] - f[0]) > 0.0
+    if measured and mismatch(ORDERS[0]) * mismatch(ORDERS[1]) < 0.0:
+        p = float(brentq(mismatch, *ORDERS))
+    else:
+        p, measured = ASSUMED_ORDER, False
+    share = h[0] ** p / (h[1] ** p - h[0] ** p)
+    return Extrapolation(float(f[0] - share * (f[1] - f[0])), p, measured)
+
+
+def run_refinement(
+    context: Context, folder: Path, *, sites: Sequence[str], factors: Sequence[float]
+) -> dict[str, Any]:
+    """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
+    wanted = sorted({1.0, *map(float, factors)}, reverse=True)
+    if len(wanted) < 2 or wanted[-1] <= 0.0:
+        raise InputError("one mesh cannot be compared", place="factors", remedy="give another edge length")
+    parameters = identified_parameters(context)
+    chosen = choose_sites(context, sites)
+    facts = _meshes(context, folder, chosen, wanted)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, mesh=file, mesh_digest=file_digest(file)),
+            parameters,
+            f"edge x {factor:g}",
+            facts[one.site.name, factor],
+            base=factor == 1.0,
+        )
+        for one in chosen
+        for factor in wanted
+        for file in [_file(context, folder, one, factor)]
+    ]
+    simulations = run_variants(context, "sensitivity-mesh", experiment_cache(context, folder), variants)
+    write_variants(folder, variants, simulations)
+    content = {
+        "sites": [one.facts | _limit(one, variants, simulations) for one in chosen],
+        "runs": compared(variants, simulations),
+        "parameters": parameters,
+    }
+    store_runs(folder, "sensitivity-mesh", content)
+    return {}
+
+
+def _file(context: Context, folder: Path, one: ChosenSite, factor: float) -> Path:
+    return one.model.mesh if factor == 1.0 else folder / f"{one.site.name}-{factor:g}.vtu"
+
+
+def _meshes(
+    context: Context, folder: Path, chosen: Sequence[ChosenSite], factors: Sequence[float]
+) -> dict[tuple[str, float], dict[str, Any]]:
+    """Make the meshes that are not there yet; what is told of each, by site and factor."""
+    study, stored = context.study, context.stored("mesh", "mesh.json")["sites"]
+    settings = mesh_settings(study)
+    pairs = [(one, factor) for one in chosen for factor in factors]
+    jobs = {
+        (one.site.name, factor): MeshJob(
+            site=one.site.name,
+            surfaces=context.store["surfaces"],
+            surfaces_key=str((context.store.stamp("surfaces") or {})["key"]),
+            position=one.model.position,
+            axis=one.model.axis,
+            settings=replace(
+                settings,
+                edge_near_mm=factor * settings.edge_near_mm,
+                edge_far_mm=factor * settings.edge_far_mm,
+            ),
+            file=_file(context, folder, one, factor),
+        )
+        for one, factor in pairs
+        if factor != 1.0
+    }
+    missing = [job for job in jobs.values() if not job.file.with_suffix(".json").is_file()]
+    for i, made in enumerate(context.executor.map(make_mesh, missing)):
+        context.tell("sensitivity-mesh", i + 1, len(missing), f"mesh of {made['nodes']} nodes")
+    found = {}
+    for one, factor in pairs:
+        job = jobs.get((one.site.name, factor))
+        known = stored[one.site.name] if job is None else read_json(job.file.with_suffix(".json"))
+        found[one.site.name, factor] = {
+            "factor": factor,
+            "edge_near_mm": factor * settings.edge_near_mm,
+            "element": settings.element,
+            "nodes": known["nodes"],
+            "cells": known["cells"],
+        }
+    return found
+
+
+def _limit(one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> dict[str, Any]:
+    """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
+
+    Nothing where they do not tend to anything yet.
+    """
+    done = {
+        float(variant.facts["edge_near_mm"]): float(simulation.force_N.max())
+        for variant, simulation in zip(variants, simulations, strict=True)
+        if variant.chosen is one and simulation.completed
+    }
+    own = next(v.facts["edge_near_mm"] for v in variants if v.chosen is one and v.base)
+    nothing = dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))
+    if len(done) < 2 or own not in done:
+        return nothing
+    found = richardson(list(done), list(done.values()))
+    finest = done[min(done)]
+    if abs(found.limit - finest) > FARTHEST * finest:
+        return nothing
+    return {
+        "limit_N": found.limit,
+        "order": found.order,
+        "order_measured": found.measured,
+        "error_percent": found.error_percent(done[own]),
+    }

@@ -1,0 +1,184 @@
+"""The experiment ``regions``: parameters of each region of the limb beside those of the whole (table 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, StudyError
+from ..identify.calibration import Calibration
+from ..identify.objective import Measured, SiteResponse
+from ..identify.parameters import Unknowns
+from ..identify.regions import Region, RegionFit, fit_regions, mean_percent
+from ..identify.uncertainty import estimate_uncertainty
+from ..indentation import flat_names, to_parameters, to_vector
+from ..study import Site
+from .calibrate_stage import Laboratory, groupings, unknowns
+from .context import Context
+from .record_noise import site_noise
+from .simulations import SimulationCache, experiment_cache
+from .store import write_json
+from .tabular import write_table
+from .traces_stage import SiteRecord, site_record
+
+Array = NDArray[np.float64]
+CHOICES = ("all", "fitted")
+
+
+def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]:
+    """Each region's own parameters, started from the whole limb's, and the errors of both.
+
+    ``sites``: ``all`` fits every recorded site of a region, as table 3 lists them; ``fitted`` those that the
+    study fits, and the others of the region are predicted.
+    """
+    study = context.study
+    members = _members(context, sites)
+    stages = context.stored("calibrate", "calibration.json")["stages"]
+    whole = to_vector(stages[-1]["parameters"], study.tissues)
+    cache = experiment_cache(context, folder)
+    made = {name: _region(context, cache, *chosen) for name, chosen in members.items()}
+    found = fit_regions(made, unknowns(study), whole)
+    rows = [_row(context, name, members[name], fit) for name, fit in found.items()]
+    content = {
+        "sites_used": sites,
+        "left_out": _left_out(context, members),
+        "whole": {
+            "name": stages[-1]["name"],
+            "start": stages[0]["start"],
+            "parameters": stages[-1]["parameters"],
+            "fitted_sites": [site.name for site in study.fitted],
+        },
+        "regions": rows,
+        **_means(rows),
+    }
+    write_json(folder / "regions.json", content)
+    _write_tables(folder, content)
+    return {}
+
+
+def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
+    """By region: the sites that it is fitted on, and all that have a record."""
+    if sites not in CHOICES:
+        raise InputError(f"{sites!r} is no choice of sites", place="sites", remedy="use all or fitted")
+    study = context.study
+    recorded = [site for site in study.sites if site.trace is not None]
+    names = list(dict.fromkeys(site.region for site in recorded if site.region))
+    if not names:
+        raise StudyError(
+            "no site says in which region it lies",
+            file=study.file,
+            place="sites",
+            remedy='give each a region, such as region = "tibia"',
+        )
+    found = {}
+    for name in names:
+        mine = [site for site in recorded if site.region == name]
+        used = mine if sites == "all" else [site for site in mine if site.fitted]
+        if used:
+            found[name] = (used, mine)
+    return found
+
+
+def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
+    """What no region's model is judged on, in words."""
+    recorded = [site for site in context.study.sites if site.trace is not None]
+    without = [site.name for site in recorded if not site.region]
+    regions = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
+    words = [f"region {name}: none of its sites is fitted" for name in regions]
+    return words + ([f"sites without a region: {', '.join(without)}"] if without else [])
+
+
+def _region(context: Context, cache: SimulationCache, fitted: Sequence[Site], mine: Sequence[Site]) -> Region:
+    laboratory = Laboratory(context, cache, fitted, "regions")
+    records = [site_record(context, site) for site in mine]
+    stage = groupings(context.study)[-1:]
+
+    def identify(start: Unknowns) -> Calibration:
+        return laboratory.identify(start, stage)[0]
+
+    def simulate(parameters: Array) -> list[SiteResponse]:
+        return _forces(context, cache, records, parameters)
+
+    return Region(identify, simulate, tuple(map(_measured, records)))
+
+
+def _measured(record: SiteRecord) -> Measured:
+    return Measured(record.site.name, record.force_N, record.site.weight)
+
+
+def _forces(
+    context: Context, cache: SimulationCache, records: Sequence[SiteRecord], parameters: Array
+) -> list[SiteResponse]:
+    """Forces on the study's own meshes; with derivatives where a calibration on them has made them so."""
+    searched = context.study.mesh.coarse is None
+    jobs = [record.job(parameters, sensitivities=searched) for record in records]
+    none = np.zeros((0, 0))
+    return [
+        SiteResponse(one.force_N, none, one.completed, one.reason)
+        for one in cache.run(jobs, context.executor)
+    ]
+
+
+def _row(
+    context: Context, name: str, chosen: tuple[list[Site], list[Site]], fit: RegionFit
+) -> dict[str, Any]:
+    """What ``regions.json`` holds of a region."""
+    study, found = context.study, fit.calibration
+    fitted, mine = chosen
+    records = [site_record(context, site) for site in fitted]
+    measured = [_measured(record) for record in records]
+    noise = [site_noise(study, record) for record in records]
+    known = estimate_uncertainty(
+        found.parameters, found.responses, measured, unknowns(study), noise, groupings(study)[-1]
+    )
+    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
+    for (tissue, key), limits in zip(flat_names(study.tissues), known.intervals_95.tolist(), strict=True):
+        intervals[tissue][key] = limits
+    return {
+        "region": name,
+        "sites": [site.name for site in mine],
+        "fitted_sites": [site.name for site in fitted],
+        "parameters": to_parameters(found.parameters, study.tissues),
+        "intervals_95": intervals,
+        "verdict": dict(zip(known.names, known.verdicts, strict=True)),
+        "evaluations": found.evaluations,
+        "converged": found.converged,
+        "reason": found.reason,
+        "own_error_percent": mean_percent(fit.own_percent),
+        "whole_error_percent": mean_percent(fit.whole_percent),
+        "own_error_percent_by_site": fit.own_percent,
+        "whole_error_percent_by_site": fit.whole_percent,
+    }
+
+
+def _means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Mean error over all sites, each with its own region's model and with the whole limb's."""
+    return {
+        f"mean_{which}_error_percent": mean_percent(
+            {site: error for row in rows for site, error in row[f"{which}_error_percent_by_site"].items()}
+        )
+        for which in ("own", "whole")
+    }
+
+
+def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+    """Table 3 as CSV: parameters by region, and errors by site."""
+    whole, rows = content["whole"], content["regions"]
+    heads = ["tissue", "parameter", "start", "whole_limb"]
+    lines = []
+    for tissue, values in whole["parameters"].items():
+        for key, value in values.items():
+            cells = [tissue, key, whole["start"][tissue][key], value]
+            lines.append([*cells, *(row["parameters"][tissue][key] for row in rows)])
+    write_table(folder / "parameters.csv", [*heads, *(row["region"] for row in rows)], lines)
+    errors = [
+        [row["region"], site, site in row["fitted_sites"], own, row["whole_error_percent_by_site"][site]]
+        for row in rows
+        for site, own in row["own_error_percent_by_site"].items()
+    ]
+    heads = ["region", "site", "fitted", "own_error_percent", "whole_limb_error_percent"]
+    write_table(folder / "errors.csv", heads, errors)

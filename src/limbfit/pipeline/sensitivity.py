@@ -1,0 +1,228 @@
+"""Experiments of sensitivity: how force depends on what a study cannot measure or has to choose.
+
+Each takes the identified parameters, changes one thing, and simulates the chosen sites again: by default the
+one with the thinnest and the one with the thickest tissue over bone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..indentation import Parameters, flat_names, to_vector
+from ..study import IndenterTable
+from .context import Context
+from .simulations import experiment_cache
+from .store import write_json
+from .tabular import write_table
+from .traces_stage import site_record
+from .variants import (
+    ChosenSite,
+    Variant,
+    choose_sites,
+    compared,
+    run_variants,
+    tissue_over_bone,
+    write_variants,
+)
+from .volumes import volume_cache
+
+Array = NDArray[np.float64]
+FACTORS = (0.5, 2.0)
+KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
+
+
+def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+    """Force against ``c`` of each tissue, all tissues with the same ``m`` (the geometric mean of theirs).
+
+    Beside it the exact derivatives at all recorded sites, with the identified ``m``.
+    """
+    identified = identified_parameters(context)
+    m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
+    equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
+    chosen = choose_sites(context, sites)
+    variants = [variant for one in chosen for variant in _stiffer(one, equal)]
+    content = _run(context, folder, "sensitivity-c", chosen, variants)
+    content |= {"parameters": identified, "equal_m": m, "factors": list(FACTORS)}
+    content["local"] = _derivatives(context, folder, identified)
+    store_runs(folder, "sensitivity-c", content)
+    heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
+    rows = [
+        [row["site"], row["region"], row["tissue_mm"], *row["peak_percent_per_percent"].values()]
+        for row in content["local"]
+    ]
+    write_table(folder / "derivatives.csv", heads, rows)
+    return {}
+
+
+def _stiffer(chosen: ChosenSite, equal: Parameters) -> list[Variant]:
+    base = Variant(chosen, chosen.model, equal, "as identified", {"tissue": None, "factor": 1.0}, base=True)
+    changed = [
+        Variant(
+            chosen,
+            chosen.model,
+            equal | {tissue: values | {"c_kPa": factor * values["c_kPa"]}},
+            f"{tissue} c x {factor:g}",
+            {"tissue": tissue, "factor": factor},
+        )
+        for tissue, values in equal.items()
+        for factor in FACTORS
+    ]
+    return [base, *changed]
+
+
+def _derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
+    """At every recorded site: change of the largest force in percent for one percent more ``c`` of a tissue.
+
+    Where the study has coarse meshes, they are theirs, as those of the prediction.
+    """
+    study = context.study
+    coarse = study.mesh.coarse is not None
+    records = [site_record(context, site, coarse) for site in study.sites if site.trace is not None]
+    best = to_vector(identified, study.tissues)
+    cache = experiment_cache(context, folder)
+    rows: list[dict[str, Any]] = []
+    for record, found in zip(
+        records, cache.run([record.job(best) for record in records], context.executor), strict=True
+    ):
+        context.tell("sensitivity-c", len(rows), len(records), f"derivatives, site {found.site}")
+        assert found.jacobian is not None
+        peak = int(np.argmax(found.force_N))
+        relative = found.jacobian[peak] * best / found.force_N[peak]
+        rows.append(
+            {
+                "site": record.site.name,
+                "region": record.site.region,
+                "tissue_mm": tissue_over_bone(record.model),
+                "completed": found.completed,
+                "peak_percent_per_percent": {
+                    tissue: float(value) if found.completed else None
+                    for (tissue, name), value in zip(flat_names(study.tissues), relative, strict=True)
+                    if name == "c_kPa"
+                },
+            }
+        )
+    return rows
+
+
+def run_kappa(
+    context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]
+) -> dict[str, Any]:
+    """Force and change of volume against the ratio of bulk modulus and ``c``."""
+    identified, own = identified_parameters(context), context.study.material.kappa_ratio
+    chosen = choose_sites(context, sites)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, kappa_ratio=ratio),
+            identified,
+            f"kappa = {ratio:g} c",
+            {"kappa_ratio": ratio},
+            base=ratio == own,
+        )
+        for one in chosen
+        for ratio in sorted({own, *map(float, ratios)})
+    ]
+    content = _run(context, folder, "sensitivity-kappa", chosen, variants, volumes=True)
+    content |= {"parameters": identified, "kappa_ratio": own}
+    store_runs(folder, "sensitivity-kappa", content)
+    return {}
+
+
+def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+    """Force where the skin slips freely under the indenter, and where it sticks to it."""
+    identified, own = identified_parameters(context), context.study.indenter.friction
+    chosen = choose_sites(context, sites)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, indenter=one.model.indenter.model_copy(update={"friction": friction})),
+            identified,
+            friction,
+            {"friction": friction},
+            base=friction == own,
+        )
+        for one in chosen
+        for friction in ("frictionless", "sticky")
+    ]
+    content = _run(context, folder, "sensitivity-contact", chosen, variants)
+    store_runs(folder, "sensitivity-contact", content | {"parameters": identified, "friction": own})
+    return {}
+
+
+def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+    """Force and effort with the study's indenter, and with others of its width: a sphere before all."""
+    identified, own = identified_parameters(context), context.study.indenter
+    chosen = choose_sites(context, sites)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, indenter=table, indenter_digest=one.model.indenter_digest if base else ""),
+            identified,
+            label,
+            {"shape": table.shape, "width_mm": table.width_mm, "edge_radius_mm": table.edge_radius_mm},
+            base=base,
+        )
+        for one in chosen
+        for label, table, base in other_indenters(own, one.model.indenter)
+    ]
+    content = _run(context, folder, "sensitivity-indenter", chosen, variants)
+    store_runs(folder, "sensitivity-indenter", content | {"parameters": identified})
+    return {}
+
+
+def other_indenters(own: IndenterTable, placed: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
+    """(label, indenter, is the study's): its own, and those of its width that it is not.
+
+    ``placed`` is the study's with its file's whole path.
+    """
+    width = own.width_mm
+    rounded = {"shape": "square", "edge_radius_mm": 0.1 * width}
+    others = {
+        "square": {"shape": "square"},
+        "square, rounded edge": rounded,
+        "sphere": {"shape": "sphere"},
+        "cylinder": {"shape": "cylinder"},
+    }
+    found = [(f"{own.shape} of the study", placed, True)]
+    for label, change in others.items():
+        table = IndenterTable(width_mm=width, friction=own.friction, **change)  # type: ignore[arg-type]
+        if table != own:
+            found.append((label, table, False))
+    return found
+
+
+def identified_parameters(context: Context) -> Parameters:
+    """The last stage of the calibration."""
+    return context.stored("calibrate", "calibration.json")["stages"][-1]["parameters"]
+
+
+def _run(
+    context: Context,
+    folder: Path,
+    name: str,
+    chosen: Sequence[ChosenSite],
+    variants: Sequence[Variant],
+    volumes: bool = False,
+) -> dict[str, Any]:
+    """Simulate the variants, write their curves, and what all experiments of sensitivity store."""
+    cache = volume_cache(folder) if volumes else experiment_cache(context, folder)
+    simulations = run_variants(context, name, cache, variants)
+    write_variants(folder, variants, simulations)
+    rows = compared(variants, simulations)
+    if volumes:
+        for row, simulation in zip(rows, simulations, strict=True):
+            row |= simulation.facts["volume"]
+    return {"sites": [one.facts for one in chosen], "runs": rows}
+
+
+def store_runs(folder: Path, name: str, content: dict[str, Any]) -> None:
+    """``<name>.json``, and its runs as ``runs.csv``."""
+    write_json(folder / f"{name}.json", content)
+    keys = [key for key in content["runs"][0] if key not in ("warnings", "label", "base")]
+    write_table(folder / "runs.csv", keys, [[row[key] for key in keys] for row in content["runs"]])

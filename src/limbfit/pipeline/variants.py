@@ -1,0 +1,184 @@
+"""Simulations of the same indentation with one thing changed: what the experiments of sensitivity share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
+from ..mesh import read_vtu
+from ..study import Site
+from .context import Context
+from .simulations import CURVE_POINTS, SimulationCache, planned_model, recorded_model
+from .traces_stage import write_curves
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ChosenSite:
+    """A site that variants are simulated at; ``depth_mm`` is the tissue between it and the nearest bone."""
+
+    site: Site
+    model: SiteModel
+    tissue_mm: float
+    role: str
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stored of it."""
+        return {
+            "site": self.site.name,
+            "region": self.site.region,
+            "role": self.role,
+            "tissue_mm": self.tissue_mm,
+            "indentation_mm": max(self.model.knots_mm),
+        }
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One simulation; ``facts`` say what is changed, ``base`` that nothing is."""
+
+    chosen: ChosenSite
+    model: SiteModel
+    parameters: Parameters
+    label: str
+    facts: dict[str, Any]
+    base: bool = False
+
+    def job(self) -> SimulationJob:
+        tissues = tuple(self.parameters)
+        values = tuple(map(float, to_vector(self.parameters, tissues)))
+        return SimulationJob(self.model, tissues, values, tuple(map(float, self.times)), False)
+
+    @property
+    def times(self) -> Array:
+        """Times (k,) s of the compared forces."""
+        return np.linspace(0.0, self.model.knots_s[-1], CURVE_POINTS)
+
+
+def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
+    """The named sites; none named: where the tissue over the bone is thinnest and thickest.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have.
+    """
+    study = context.study
+    every = [_chosen(context, site) for site in study.sites]
+    if names:
+        wanted = [study.site(name).name for name in names]
+        return [one for name in wanted for one in every if one.site.name == name]
+    thin, thick = min(every, key=_tissue), max(every, key=_tissue)
+    if thin is thick:
+        return [thin]
+    return [_with_role(thin, "thin"), _with_role(thick, "thick")]
+
+
+def _tissue(chosen: ChosenSite) -> float:
+    return chosen.tissue_mm
+
+
+def _with_role(chosen: ChosenSite, role: str) -> ChosenSite:
+    return ChosenSite(chosen.site, chosen.model, chosen.tissue_mm, role)
+
+
+def _chosen(context: Context, site: Site) -> ChosenSite:
+    model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
+    return ChosenSite(site, model, tissue_over_bone(model), "")
+
+
+def tissue_over_bone(model: SiteModel) -> float:
+    """Distance in mm from a site to the nearest point of a bone in its mesh.
+
+    Raises
+    ------
+    InputError
+        Where the mesh has no bone.
+    """
+    mesh = read_vtu(model.mesh)
+    bone = mesh.node_sets.get("fixed_bone", np.zeros(0, dtype=int))
+    if not len(bone):
+        raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
+    return float(np.linalg.norm(mesh.points[bone] - np.array(model.position), axis=1).min())
+
+
+def run_variants(
+    context: Context, name: str, cache: SimulationCache, variants: Sequence[Variant]
+) -> list[Simulation]:
+    """Simulate them all, in order, those that are kept for nothing."""
+    done = []
+    for simulation in cache.run([variant.job() for variant in variants], context.executor):
+        done.append(simulation)
+        words = f"site {simulation.site}, {variants[len(done) - 1].label}"
+        context.tell(name, len(done), len(variants), words)
+    return done
+
+
+def compared(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[dict[str, Any]]:
+    """A row of each: what was changed, its largest force, and how it differs from its site's base.
+
+    Changes are in percent of the base's largest force: of the largest force, and the mean over the trace.
+    They are None where a simulation is partial.
+    """
+    base = {
+        variant.chosen.site.name: simulation
+        for variant, simulation in zip(variants, simulations, strict=True)
+        if variant.base
+    }
+    return [
+        {
+            "site": variant.chosen.site.name,
+            "label": variant.label,
+            "base": variant.base,
+            **variant.facts,
+            "peak_force_N": float(simulation.force_N.max()) if simulation.completed else None,
+            **_change(simulation, base[variant.chosen.site.name]),
+            "penetration_mm": simulation.penetration_mm,
+            "steps": simulation.facts["steps"],
+            "newton_iterations": simulation.facts["newton_iterations"],
+            "cuts": simulation.facts["cuts"],
+            "completed": simulation.completed,
+            "reason": simulation.reason,
+            "warnings": list(simulation.warnings),
+        }
+        for variant, simulation in zip(variants, simulations, strict=True)
+    ]
+
+
+def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]:
+    if not (simulation.completed and base.completed):
+        return {"peak_change_percent": None, "mean_change_percent": None}
+    peak = float(base.force_N.max())
+    return {
+        "peak_change_percent": 100.0 * (float(simulation.force_N.max()) / peak - 1.0),
+        "mean_change_percent": 100.0 * float(np.abs(simulation.force_N - base.force_N).mean()) / peak,
+    }
+
+
+def write_variants(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:
+    """``<site>.csv``: time, displacement and the force of every variant that was completed."""
+    for name in dict.fromkeys(variant.chosen.site.name for variant in variants):
+        mine = [i for i, variant in enumerate(variants) if variant.chosen.site.name == name]
+        first = variants[mine[0]]
+        forces = {column(variants[i].label): simulations[i].force_N for i in mine if simulations[i].completed}
+        write_curves(
+            folder / f"{name}.csv",
+            time_s=first.times,
+            displacement_mm=np.interp(first.times, first.model.knots_s, first.model.knots_mm),
+            **forces,
+        )
+
+
+def column(label: str) -> str:
+    """The head of a variant's column of forces."""
+    plain = "".join(c if (c.isalnum() and c.isascii()) or c == "." else " " for c in label)
+    return "_".join(plain.split()) + "_N"
