@@ -17,6 +17,8 @@ from .uncertainty import DETERMINED, estimate_uncertainty
 
 Array = NDArray[np.float64]
 
+_START_SD = 0.1  # of the logarithms
+
 # From the number of a repeat and the true forces per site to records, and the noise that is claimed of them.
 Recording = Callable[[int, Sequence[Array]], tuple[Sequence[Measured], Sequence[SiteNoise]]]
 
@@ -61,6 +63,7 @@ def coverage_study(
 ) -> Coverage:
     """Calibrate and judge ``repeats`` records of the forces at ``truth`` (p,), each with noise of its own.
 
+    Each calibration starts about a tenth off the truth.
     Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty``.
     """
     clean = [response.force_N for response in simulate(truth)]
@@ -68,9 +71,9 @@ def coverage_study(
     deviations, determined, held, misfit = [], [], [], []
     for repeat in range(repeats):
         measured, noise = record(repeat, clean)
-        found = calibrate(
-            simulate, measured, unknowns.from_start(truth), settings, stages=(separate(unknowns.names),)
-        )
+        off_truth = np.random.default_rng(repeat).normal(0.0, _START_SD, truth.size)
+        start = unknowns.from_start(truth * np.exp(off_truth))
+        found = calibrate(simulate, measured, start, settings, stages=(separate(unknowns.names),))
         u = estimate_uncertainty(found.parameters, found.responses, measured, unknowns, noise)
         off = np.log(u.centre / truth)
         deviations.append([c.weights @ off / np.log(c.factor_95) for c in u.combinations])

@@ -25,7 +25,8 @@ from .uncertainty import Uncertainty
 Array = NDArray[np.float64]
 SimulateMany = Callable[[Sequence[Array]], Sequence[Sequence[SiteResponse]]]
 
-_CANDIDATES, _SPREAD = 400, 1.5  # the first design is this much wider than the linearised posterior
+_CANDIDATES, _SPREAD = 400, 1.2  # the first design is this much wider than the linearised posterior
+_FARTHEST = 1.4  # distance of a candidate from their middle, over the root of their dimension
 _SHORT_CHAIN = 800
 _LOOKED_AT = 150  # draws at which the emulator's error is asked
 _QUANTILE = 0.9  # of those errors
@@ -169,8 +170,8 @@ class _Exploration:
         values, vectors = np.linalg.eigh(np.cov(candidates.T) + 1e-8 * np.eye(candidates.shape[1]))
         whiten = vectors / np.sqrt(values)
         at, known = candidates @ whiten, taken @ whiten
-        # Beyond three standard deviations a candidate tells of the tail alone.
-        far = np.linalg.norm(at - at.mean(axis=0), axis=1) > 3 * np.sqrt(at.shape[1])
+        # Out in the tail simulations are hard, and tell of the tail alone.
+        far = np.linalg.norm(at - at.mean(axis=0), axis=1) > _FARTHEST * np.sqrt(at.shape[1])
         distance = np.min(np.linalg.norm(at[:, None] - known[None], axis=2), axis=1)
         distance[far] = -1.0
         chosen = []

@@ -1,0 +1,79 @@
+"""`limbfit uncertainty` on a small stump: what it stores, what it says, and the section of the report."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from limbfit import run_experiment
+from limbfit.pipeline.emulator_file import EMULATOR, read_emulator
+from limbfit.report import build_report
+from limbfit.study import load_study
+
+QUICK = """
+[mesh]
+element = "tet4"
+edge_near_mm = 8.0
+edge_far_mm = 24.0
+near_radius_mm = 8.0
+growth = 1.0
+flatness = 2.0
+[solver]
+load_steps = 4
+unload_steps = 3
+[calibration]
+max_iterations = 4
+[execution]
+workers = 1
+[material]
+start = { c_kPa = 6.0, m = 4.0, gamma = 1.0, tau_s = 1.0 }
+[uncertainty]
+runs = 4
+checked = 1
+"""
+
+
+@pytest.fixture
+def done(study):
+    file = study / "study.toml"
+    file.write_text(file.read_text() + QUICK)
+    return study, run_experiment(load_study(study), "uncertainty", listener=lambda event: None)
+
+
+@pytest.mark.slow
+def test_the_experiment_on_a_stump(done, tmp_path):
+    study, content = done
+    folder = study / "results/uncertainty"
+    stored = json.loads((folder / "uncertainty.json").read_text())
+    assert stored["verdict"] == content["verdict"]
+    names = [row["name"] for row in stored["parameters"]]
+    assert len(names) == 8
+    for row in stored["parameters"]:
+        records, all_sources = row["posterior_95"], row["with_sources_95"]
+        assert all_sources[0] <= records[0] * 1.001
+        assert all_sources[1] >= records[1] * 0.999
+    # One site cannot determine two materials.
+    said = [row["verdict"] for row in stored["parameters"]]
+    assert "not determined by these data" in said
+    assert said.count("determined") < 4
+    sources = {row["source"] for row in stored["sources"]}
+    assert sources >= {"layer thickness", "site position", "site axis", "mesh", "friction", "bulk modulus"}
+    assert all(not row["failed"] for row in stored["sources"])
+    assert all(row["force_percent"]["1"] > 0 for row in stored["sources"])
+    assert {row["site"]: row["fitted"] for row in stored["predictions"]["sites"]} == {"1": True, "2": False}
+    for file in ("parameters.csv", "sources.csv", "predictions.csv", "profiles.csv", "draws.csv"):
+        assert len((folder / file).read_text().splitlines()) > 1
+    emulator = read_emulator(folder / EMULATOR)
+    assert len(emulator.points) == stored["emulator"]["runs"]
+    assert np.isfinite(
+        emulator(np.array([row["calibrated"] for row in stored["parameters"]]))[0].force_N
+    ).all()
+    page = build_report(study / "results", tmp_path).read_text()
+    assert "What the records determine" in page
+    assert "Profile likelihood" in page
+    # Done once: the second time nothing is simulated.
+    events = []
+    run_experiment(load_study(study), "uncertainty", listener=events.append)
+    assert not any("sources, site" in event.text for event in events)
