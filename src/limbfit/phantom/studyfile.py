@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..anatomy.layers import LayerSpec
+from .forces import PENALTY_PER_MM
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 _HEAD = """\
@@ -28,6 +29,8 @@ shape = "square"
 width_mm = {width:.1f}
 edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sharp edge they never do
 
+[solver]
+penalty_per_mm = {penalty:.1f}
 {mesh}
 # One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
 # The fitted sites identify the material; all others are predicted and compared.
@@ -37,21 +40,15 @@ edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sh
 _MESH = {
     "coarse": """
 [mesh]
-edge_near_mm = 5.0
+edge_near_mm = 3.5
 edge_far_mm = 30.0
 near_radius_mm = 12.0
 growth = 0.9
 flatness = 1.6
-
-[solver]
-load_steps = 7
-unload_steps = 5
-
-[calibration]
-relative_tolerance = 0.01
 """,
     "paper": "",
 }
+_STEPS = {"coarse": "load_steps = 7\nunload_steps = 5\n", "paper": ""}
 
 _SURFACE_EDGE_MM = {"coarse": 4.0, "paper": 3.0}
 
@@ -74,7 +71,8 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         surface=_SURFACE_EDGE_MM[detail],
         width=INDENTER_MM,
         edge=INDENTER_EDGE_MM,
-        mesh=_MESH[detail],
+        penalty=PENALTY_PER_MM,
+        mesh=_STEPS[detail] + _MESH[detail],
     )
     parts = [head]
     for site in sites:
