@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from limbfit.anatomy.surfaces import Anatomy, save_anatomy
+from limbfit.anatomy.triangles import Surface
 from limbfit.bench.blocks import SIX_TETS, boxes, upright
-from limbfit.indentation import SiteModel
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from limbfit.study import SolverTable
+from limbfit.phantom.record import Ramp, record
+from limbfit.pipeline.context import Context
+from limbfit.pipeline.simulations import COARSE
+from limbfit.pipeline.store import Store, write_json
+from limbfit.pipeline.traces_stage import run_traces
+from limbfit.study import SolverTable, Study
 
 TISSUES = ("skin", "fat", "muscle")
 TRUTH = {
@@ -59,3 +68,55 @@ def block_model(name: str, file: Path, mesh: Mesh, depth_mm: float, steps: Solve
         knots_mm=(0.0, depth_mm, 0.0),
         steps=steps,
     )
+
+
+def box(sides: tuple[float, float], height: tuple[float, float]) -> Surface:
+    """A closed box, outward."""
+    points = np.array([[x, y, z] for x in sides for y in sides for z in height])
+    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Surface(points, np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))]))
+
+
+def store_blocks(
+    study: Study,
+    blocks: Mapping[str, tuple[Sequence[float], float, bool]],
+    truth: Parameters,
+    divisions: int,
+    coarse: int | None = None,
+) -> Store:
+    """Surfaces, places, noisy records and meshes of blocks, as their stages store them.
+
+    ``blocks``: thickness of each tissue, depth, whether fitted.  ``coarse``: divisions of a second mesh.
+    """
+    store, tissues = Store(study.results), study.tissues
+    for stage in ("surfaces", "sites", "traces", "mesh"):
+        store[stage].mkdir(parents=True)
+    bone = {"bone": box((-20.0, 20.0), (-34.0, -32.0))}
+    plane = np.array([0.0, 0.0, -36.0]), np.array([0.0, 0.0, -1.0])
+    save_anatomy(store["surfaces"], Anatomy(box((-24.0, 24.0), (-36.0, 0.0)), bone, *plane))
+    places = []
+    for i, (name, (thickness, depth, fitted)) in enumerate(blocks.items()):
+        mesh = layered_block(thickness, tissues, divisions=divisions)
+        model = block_model(name, store["mesh"] / f"{name}.vtu", mesh, depth, study.solver)
+        if coarse is not None:
+            (store["mesh"] / COARSE).mkdir(exist_ok=True)
+            write_vtu(
+                layered_block(thickness, tissues, divisions=coarse), store["mesh"] / COARSE / f"{name}.vtu"
+            )
+        _write_record(study, replace(model, indenter=study.indenter), truth, np.random.default_rng(i))
+        places.append(
+            {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}
+            | {"off_skin_mm": 0.0, "marker": None}
+        )
+    write_json(store["sites"] / "sites.json", {"sites": places})
+    run_traces(Context(study, store, SerialExecutor(), lambda event: None), store["traces"])
+    return store
+
+
+def _write_record(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+    """What a robot writes down of the true forces."""
+    times = np.linspace(0.0, model.knots_s[-1], 201)
+    job = SimulationJob(model, study.tissues, tuple(to_vector(truth, study.tissues)), tuple(times), False)
+    force = simulate(job).force_N
+    made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, force), random)
+    made.write(study.path(Path(f"{model.name}.csv")))

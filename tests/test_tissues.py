@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import TISSUES, TRUTH, block_model, layered_block
+from layered import TISSUES, TRUTH, block_model, layered_block, store_blocks
 from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor
@@ -18,8 +18,6 @@ from limbfit.pipeline.calibrate_stage import run_calibrate, unknowns
 from limbfit.pipeline.context import Context, Progress
 from limbfit.pipeline.predict_stage import run_predict
 from limbfit.pipeline.run import keys
-from limbfit.pipeline.store import Store, write_json
-from limbfit.pipeline.traces_stage import write_curves
 from limbfit.report import build_report
 from limbfit.study import PARAMETERS, SolverTable, Study, load_study
 
@@ -214,33 +212,11 @@ BLOCKS = {
 }
 
 
-def store_blocks(study: Study) -> Store:
-    """Places, meshes and regularised records of `BLOCKS`, as their stages store them; no noise."""
-    store = Store(study.results)
-    for stage in ("sites", "traces", "mesh"):
-        store[stage].mkdir(parents=True)
-    places, facts = [], {}
-    for name, (thickness, depth, fitted) in BLOCKS.items():
-        file = store["mesh"] / f"{name}.vtu"
-        model = block_model(name, file, layered_block(thickness, divisions=4), depth, study.solver)
-        times = np.linspace(0.0, model.knots_s[-1], 81)
-        truth = tuple(to_vector(TRUTH, TISSUES))
-        force = simulate(SimulationJob(model, TISSUES, truth, tuple(times), sensitivities=False)).force_N
-        travel = np.interp(times, model.knots_s, model.knots_mm)
-        write_curves(store["traces"] / f"{name}.csv", time_s=times, displacement_mm=travel, force_N=force)
-        facts[name] = {"knots_s": model.knots_s, "knots_mm": model.knots_mm, "depth_mm": depth}
-        place = {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0, 0, -1]}
-        places.append(place)
-    write_json(store["sites"] / "sites.json", {"sites": places})
-    write_json(store["traces"] / "traces.json", {"sites": facts})
-    return store
-
-
 @pytest.mark.slow
 def test_three_tissues_are_identified_from_blocks_and_reported(tmp_path):
     sites = tuple((name, fitted) for name, (_, _, fitted) in BLOCKS.items())
     study = write_study(tmp_path, LAYERS + "[calibration]\nrelative_tolerance = 1e-4\n", sites)
-    store = store_blocks(study)
+    store = store_blocks(study, BLOCKS, TRUTH, 4)
     context = Context(study, store, SerialExecutor(), quiet)
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         store[stage].mkdir()
