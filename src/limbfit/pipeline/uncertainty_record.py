@@ -101,7 +101,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
 
 
 def _parameters(found: Found) -> list[dict[str, Any]]:
-    """One row for every parameter: calibrated, and its interval by every method."""
+    """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
     known, explored = found.known, found.explored
     posterior = explored.posterior
     profiles = {one.name: one for one in explored.profiles}
@@ -119,6 +119,7 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
         profile = profiles.get(name)
         prior_sd = np.log(bounds[1] / bounds[0]) / np.sqrt(12.0)
         given = known.verdicts[i] == GIVEN
+        factor = np.sqrt(with_sources[1] / with_sources[0])
         rows.append(
             {
                 "name": name,
@@ -129,7 +130,7 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
                 "profile_95": None if profile is None else list(profile.interval_95),
                 "profile_verdict": None if profile is None else profile.verdict,
                 "with_sources_95": list(map(float, with_sources)),
-                "verdict": GIVEN if given else verdict_of(float(np.sqrt(high / low)), ours[i] / prior_sd),
+                "verdict": GIVEN if given else verdict_of(float(factor), more[i] / prior_sd),
             }
         )
     return rows
@@ -146,14 +147,16 @@ def _combinations(found: Found) -> list[dict[str, Any]]:
         sd = float(drawn.std(ddof=1))
         sources = float(np.sqrt(one.weights @ found.source_covariance @ one.weights))
         factor = float(np.exp((high - low) / 2))
+        total = float(np.hypot(sd, sources))
+        wider = float(factor ** (total / max(sd, 1e-300)))
         rows.append(
             {
                 "text": one.text,
                 "weights": one.weights.tolist(),
                 "linearised_factor_95": one.factor_95,
                 "posterior_factor_95": factor,
-                "with_sources_factor_95": float(factor ** (np.hypot(sd, sources) / max(sd, 1e-300))),
-                "verdict": verdict_of(factor, sd / float(np.linalg.norm(one.weights * prior_sd))),
+                "with_sources_factor_95": wider,
+                "verdict": verdict_of(wider, total / float(np.linalg.norm(one.weights * prior_sd))),
             }
         )
     return rows
@@ -260,7 +263,7 @@ def _verdict(
             words.append(f"{word.capitalize()}: {', '.join(names)}.")
     told = [row for row in combinations if row["verdict"] == DETERMINED]
     words.append(
-        f"The records determine {len(told)} of {len(combinations)} independent combinations to within "
+        f"Determined are {len(told)} of {len(combinations)} independent combinations to within "
         "-20 to +25 %" + (f"; the best is {told[0]['text']}." if told else ".")
     )
     beyond = [
