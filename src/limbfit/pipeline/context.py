@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from ..execution import Executor
+from ..execution import Executor, Limits, make_executor
 from ..study import Study
 from .store import Store
 
@@ -39,3 +39,9 @@ class Context:
     def stored(self, stage: str, name: str) -> Any:
         """A JSON artefact of a finished stage."""
         return self.store.read(stage, name)
+
+
+def executor_of(study: Study) -> Executor:
+    """What a study's jobs run on, with its limits."""
+    table = study.execution
+    return make_executor(table.workers, Limits(table.time_limit_s, table.memory_limit_GB))

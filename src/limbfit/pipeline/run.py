@@ -6,10 +6,9 @@ from typing import Any
 
 from .. import __version__
 from ..errors import InputError
-from ..execution import make_executor
 from ..study import Study
 from .calibrate_stage import run_calibrate
-from .context import Context, Listener
+from .context import Context, Listener, executor_of
 from .corrections import keep_corrections
 from .experiments import do_experiment, experiment_key, experiment_rows, find_experiment, options_of
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
@@ -133,7 +132,7 @@ def run_study(study: Study, *, until: str | None = None, listener: Listener) -> 
     if until is not None and until not in STAGE_NAMES:
         raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
     store = Store(study.results)
-    with lock(study.results), make_executor(study.execution.workers) as executor:
+    with lock(study.results), executor_of(study) as executor:
         context = Context(study, store, executor, listener)
         kept = keep_corrections(study)
         if kept is not None:
@@ -181,7 +180,7 @@ def run_experiment(study: Study, name: str, *, listener: Listener, **options: An
     if last:
         run_study(study, until=last[0], listener=listener)
     store = Store(study.results)
-    with lock(study.results), make_executor(study.execution.workers) as executor:
+    with lock(study.results), executor_of(study) as executor:
         known = Keys(study)
         key = experiment_key(experiment, known, _chain(known), chosen)
         found = do_experiment(Context(study, store, executor, listener), experiment, key, chosen)
@@ -224,7 +223,7 @@ def run_record(study: Study) -> dict[str, Any]:
 def report_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     """Make the report anew from what is stored, stale or not; nothing is solved."""
     store = Store(study.results)
-    with lock(study.results), make_executor(study.execution.workers) as executor:
+    with lock(study.results), executor_of(study) as executor:
         context = Context(study, store, executor, listener)
         _do(context, "report", keys(study)["report"])
         return summarise(study)

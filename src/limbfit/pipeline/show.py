@@ -11,10 +11,9 @@ import numpy as np
 from ..anatomy.sites import thinnest_tissue
 from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..errors import InputError
-from ..execution import make_executor
 from ..report.stage_pictures import draw_stage
 from ..study import Study
-from .context import Listener, Progress
+from .context import Listener, Progress, executor_of
 from .run import run_study
 from .store import Store, lock
 
@@ -63,7 +62,7 @@ def show_stage(study: Study, stage: str, *, listener: Listener) -> dict[str, Any
 def _draw(study: Study, stage: str, file: Path, listener: Listener) -> None:
     """On the executor: graphics libraries can crash, and a worker that dies is an error in words."""
     listener(Progress(stage, 0, 1, "drawing"))
-    with lock(study.results), make_executor(study.execution.workers) as executor:
+    with lock(study.results), executor_of(study) as executor:
         list(executor.map(_draw_one, [(study.results, stage, file)]))
     listener(Progress(stage, 1, 1, "drawn"))
 

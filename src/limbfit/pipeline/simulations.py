@@ -49,13 +49,14 @@ class SimulationCache:
         if again:
             found = {i: kept for i, kept in found.items() if kept.completed}
         missing = [job for i, job in enumerate(jobs) if i not in found]
-        made = executor.map(self.work, missing, keys=[job.model.name for job in missing])
+        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], lost=_lost)
         for i, job in enumerate(jobs):
             if i in found:
                 yield found[i]
                 continue
             simulation = next(made)
-            self._keep(job, simulation)
+            if not simulation.facts.get("lost"):  # the machine's fault: another run tries it again
+                self._keep(job, simulation)
             yield simulation
 
     def example(self) -> Simulation | None:
@@ -94,6 +95,14 @@ class SimulationCache:
                 "warnings": list(simulation.warnings),
             }
             np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
+
+
+def _lost(job: SimulationJob, reason: str) -> Simulation:
+    """A failed simulation in place of one whose worker died or went over its limits."""
+    n, site = len(job.times_s), job.model.name
+    slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
+    facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts)
 
 
 def _load(file: Path) -> Simulation:

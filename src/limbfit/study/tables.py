@@ -381,6 +381,11 @@ class FebioTable(Table):
 
 
 class ExecutionTable(Table):
-    """Workers that simulate side by side, one thread each; 0 means one per core."""
+    """Workers that simulate side by side, one thread each; 0 means one per core.
+
+    What a simulation may take in a worker: wall time in s and memory in GB; 0 means no limit.
+    """
 
     workers: Annotated[int, Field(ge=0, le=1024)] = 0
+    time_limit_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3600.0
+    memory_limit_GB: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0

@@ -1,0 +1,204 @@
+"""Jobs on a Dask cluster: a scheduler that runs already, workers queued on a batch system, or local ones.
+
+The study's folder must be on a file system that the workers share, under the same path, and limbfit installed
+for them. Every Dask worker does its jobs in a process of its own (`processes`), which pins threads and can be
+ended, as a thread of Dask's cannot.
+"""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+from ..errors import InputError, RunError
+from .face import NO_LIMITS, Answer, Job, Limits, check_keys
+from .processes import ProcessExecutor
+
+QUEUES = {
+    "slurm": "SLURMCluster",
+    "pbs": "PBSCluster",
+    "sge": "SGECluster",
+    "lsf": "LSFCluster",
+    "oar": "OARCluster",
+    "htcondor": "HTCondorCluster",
+}
+LOCAL = "local"
+INSTALL = "pip install 'limbfit[dask]'"
+_CONNECT_S = 20.0
+_QUEUED_GB = 4.0  # asked of the batch system for a worker where the study sets no limit
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """Why a job had no answer."""
+
+    reason: str
+
+
+_own = threading.local()  # of a Dask worker: the process that does the jobs of each of its threads
+
+
+def _guarded(function: Callable, job: Any, limits: Limits, contained: bool) -> Any:
+    """A job in a process of its own on a Dask worker; ``contained``: the answer says why it was lost."""
+    executor: ProcessExecutor | None = getattr(_own, "executor", None)
+    if executor is None:
+        executor = _own.executor = ProcessExecutor(1, limits=limits)
+    lost = (lambda _, reason: _Lost(reason)) if contained else None
+    return next(executor.map(function, [job], lost=lost))
+
+
+class DaskExecutor:
+    """Runs jobs through a ``distributed.Client``, which it owns, with the cluster behind it if that is given.
+
+    A worker that dies costs its jobs another try elsewhere, as often as the scheduler allows
+    (``distributed.scheduler.allowed-failures``).
+    """
+
+    def __init__(
+        self, client: Any, limits: Limits = NO_LIMITS, cluster: Any = None, workers: int = 0
+    ) -> None:
+        self._client, self._cluster, self.limits = client, cluster, limits
+        self._asked = workers
+        self._home: dict[str, str] = {}
+
+    @classmethod
+    def at(cls, address: str, limits: Limits = NO_LIMITS) -> Self:
+        """On the workers of the scheduler at ``address`` (``tcp://host:8786``).
+
+        Raises
+        ------
+        InputError
+            Where Dask is not installed, or no scheduler answers.
+        """
+        try:
+            client = _dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {address!r}",
+                place="--scheduler",
+                remedy="start one with `dask scheduler`, and give the address that it prints",
+            ) from error
+        return cls(client, limits)
+
+    @classmethod
+    def queued(cls, queue: str, workers: int, limits: Limits = NO_LIMITS) -> Self:
+        """On ``workers`` jobs of a batch system (`QUEUES`), or on local processes (``local``).
+
+        What else the batch system wants (queue, account, walltime) stands in Dask's ``jobqueue.yaml``.
+
+        Raises
+        ------
+        InputError
+            For an unknown batch system, or one that cannot be used as configured.
+        """
+        if queue == LOCAL:
+            cluster = _dask("distributed").LocalCluster(
+                n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0
+            )
+        elif queue in QUEUES:
+            memory = f"{limits.memory_GB or _QUEUED_GB:g}GB"
+            try:
+                kind = getattr(_dask("dask_jobqueue"), QUEUES[queue])
+                cluster = kind(cores=1, processes=1, memory=memory)
+                cluster.scale(jobs=workers)
+            except (OSError, ValueError, TypeError, RuntimeError) as error:
+                raise InputError(
+                    f"{queue} cannot be used: {error}",
+                    place="--dask",
+                    remedy="configure it in ~/.config/dask/jobqueue.yaml",
+                ) from error
+        else:
+            raise InputError(
+                f"no batch system is named {queue!r}",
+                place="--dask",
+                remedy=f"use {', '.join((*QUEUES, LOCAL))}",
+            )
+        client = _dask("distributed").Client(cluster, set_as_default=False)
+        return cls(client, limits, cluster, workers)
+
+    @property
+    def workers(self) -> int:
+        """Workers that are there, or as many as were asked for while they wait in a queue."""
+        return max(len(self._addresses()), self._asked, 1)
+
+    def _addresses(self) -> list[str]:
+        return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
+
+    def map(
+        self,
+        function: Callable[[Job], Answer],
+        jobs: Iterable[Job],
+        keys: Sequence[str] | None = None,
+        lost: Callable[[Job, str], Answer] | None = None,
+    ) -> Iterator[Answer]:
+        listed = list(jobs)
+        check_keys(listed, keys)
+        return self._answers(function, listed, list(keys) if keys is not None else [None] * len(listed), lost)
+
+    def _answers(
+        self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None
+    ) -> Iterator[Any]:
+        name = f"{function.__name__}-{uuid.uuid4().hex}"
+        futures = []
+        try:
+            present = self._addresses()
+            for i, (job, key) in enumerate(zip(jobs, keys, strict=True)):
+                place = self._place(key, present)
+                futures.append(
+                    self._client.submit(
+                        _guarded, function, job, self.limits, lost is not None,
+                        key=f"{name}-{i}", pure=False,
+                        workers=place, allow_other_workers=place is not None,
+                    )
+                )  # fmt: skip
+            for i, job in enumerate(jobs):
+                answer = self._result(futures[i], lost is not None)
+                futures[i].release()
+                yield lost(job, answer.reason) if isinstance(answer, _Lost) and lost else answer
+        finally:
+            with suppress(Exception):  # the scheduler may be gone
+                self._client.cancel([future for future in futures if not future.done()])
+
+    def _place(self, key: str | None, present: list[str]) -> list[str] | None:
+        """Where jobs of a key went before, if that worker lives; else the next worker in turn."""
+        if key is None or not present:
+            return None
+        if self._home.get(key) not in present:
+            self._home[key] = present[len(self._home) % len(present)]
+        return [self._home[key]]
+
+    def _result(self, future: Any, contained: bool) -> Any:
+        distributed = _dask("distributed")
+        try:
+            return future.result()
+        except distributed.KilledWorker as error:
+            if contained:
+                return _Lost("every Dask worker that tried it died: out of memory, killed or crashed")
+            raise RunError(f"every Dask worker that tried a job died: {error}") from error
+        except (distributed.CancelledError, distributed.comm.CommClosedError) as error:
+            raise RunError("the Dask scheduler is gone; run again: finished work is kept") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(Exception):  # nothing more is wanted of either
+            self._client.close(timeout=2)
+        if self._cluster is not None:
+            with suppress(Exception):
+                self._cluster.close(timeout=2)
+
+
+def _dask(module: str) -> Any:
+    """A module of Dask's, an optional part of limbfit."""
+    try:
+        return __import__(module)
+    except ImportError as error:
+        raise InputError(f"{module} is not installed", remedy=INSTALL) from error

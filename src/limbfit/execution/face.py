@@ -1,0 +1,108 @@
+"""What every executor does, what a job may cost, and the executor that needs no workers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self, TypeVar
+
+Job = TypeVar("Job")
+Answer = TypeVar("Answer")
+
+# Read by the numerical libraries when they load: hence set before a worker starts, not in it.
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS",
+)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one job may take: wall time in s and resident memory in GB (10^9 bytes); 0 means no limit."""
+
+    time_s: float = 0.0
+    memory_GB: float = 0.0
+
+
+NO_LIMITS = Limits()
+
+
+class Executor(Protocol):
+    """Runs a function over jobs; use it as a context, which ends its workers."""
+
+    @property
+    def workers(self) -> int:
+        """How many jobs it does at a time."""
+        ...
+
+    def map(
+        self,
+        function: Callable[[Job], Answer],
+        jobs: Iterable[Job],
+        keys: Sequence[str] | None = None,
+        lost: Callable[[Job, str], Answer] | None = None,
+    ) -> Iterator[Answer]:
+        """Answers in the order of ``jobs``, as they are asked for.
+
+        Jobs of one key go to one worker, over all calls, so that what it keeps (meshes, states) serves again;
+        a new key goes to the first worker that is free. An exception of a job is raised where its answer
+        would come, and ends the call.
+
+        Parameters
+        ----------
+        lost : makes the answer of a job that was lost twice, from it and the reason in words: its worker
+            died, or it went over the executor's limits. Without it nothing limits the jobs.
+
+        Raises
+        ------
+        RunError
+            Where a worker died twice on the same job, and ``lost`` is not given.
+        """
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+def usable_cores() -> int:
+    """Cores that this process may use, which a batch system can make fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def check_keys(jobs: list, keys: Sequence[str] | None) -> None:
+    if keys is not None and len(keys) != len(jobs):
+        raise ValueError(f"{len(keys)} keys for {len(jobs)} jobs")
+
+
+class SerialExecutor:
+    """Runs jobs one after the other in this process, which no limit can end."""
+
+    workers = 1
+
+    def map(
+        self,
+        function: Callable[[Job], Answer],
+        jobs: Iterable[Job],
+        keys: Sequence[str] | None = None,
+        lost: Callable[[Job, str], Answer] | None = None,
+    ) -> Iterator[Answer]:
+        listed = list(jobs)
+        check_keys(listed, keys)
+        return map(function, listed)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None

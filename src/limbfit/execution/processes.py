@@ -1,0 +1,136 @@
+"""Jobs side by side in worker processes of this machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from multiprocessing.connection import wait
+from types import TracebackType
+from typing import Any, Self
+
+from ..errors import RunError
+from .face import NO_LIMITS, Answer, Job, Limits, check_keys
+from .worker import GRACE_S, Outcome, Worker
+
+TRIES = 2
+_LOOK_S = 0.25  # between two looks at what jobs take
+_DIED = "a worker process died: out of memory, killed or crashed"
+
+
+class ProcessExecutor:
+    """Worker processes that live as long as the executor, each with ``threads`` threads.
+
+    They start when first needed, and never run the caller's script again, guarded or not. A worker that dies
+    (killed, out of memory, crashed) or goes over ``limits`` is replaced, and its job is tried once more.
+    """
+
+    def __init__(self, workers: int, threads: int = 1, limits: Limits = NO_LIMITS) -> None:
+        if workers < 1 or threads < 1:
+            raise ValueError("workers and threads must be at least 1")
+        self.workers, self.threads, self.limits = workers, threads, limits
+        self._staff: list[Worker | None] = [None] * workers
+        self._home: dict[str, int] = {}
+        self._mapping = False
+
+    def map(
+        self,
+        function: Callable[[Job], Answer],
+        jobs: Iterable[Job],
+        keys: Sequence[str] | None = None,
+        lost: Callable[[Job, str], Answer] | None = None,
+    ) -> Iterator[Answer]:
+        listed = list(jobs)
+        check_keys(listed, keys)
+        return self._answers(function, listed, list(keys) if keys is not None else [None] * len(listed), lost)
+
+    def _answers(
+        self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None
+    ) -> Iterator[Any]:
+        if self._mapping:
+            raise RuntimeError("the executor is already mapping: take all answers of one map before the next")
+        self._mapping = True
+        waiting, busy, tries = list(range(len(jobs))), dict[int, int](), [0] * len(jobs)
+        limits = self.limits if lost is not None else NO_LIMITS
+        answers: dict[int, Outcome] = {}
+        try:
+            for index in range(len(jobs)):
+                while index not in answers:
+                    for seat, job in self._seat(waiting, busy, keys):
+                        tries[job] += 1
+                        busy[seat] = job
+                        self._worker(seat).send(function, jobs[job])
+                    for seat, outcome in self._collect(busy, limits):
+                        job = busy.pop(seat)
+                        if isinstance(outcome, Outcome):
+                            answers[job] = outcome
+                        elif tries[job] < TRIES:
+                            waiting.insert(0, job)
+                        elif lost is not None:
+                            answers[job] = Outcome(lost(jobs[job], f"{outcome}, twice"))
+                        else:
+                            raise RunError(_obituary(function, job, keys[job]))
+                yield answers.pop(index).result()
+        finally:
+            self._mapping = False
+            for seat in busy:  # left in the middle: their answers have no reader any more
+                self._replace(seat)
+
+    def _seat(
+        self, waiting: list[int], busy: dict[int, int], keys: Sequence[str | None]
+    ) -> Iterator[tuple[int, int]]:
+        """Take jobs that can start now from ``waiting``: (worker, job)."""
+        for job in tuple(waiting):
+            free = [seat for seat in range(self.workers) if seat not in busy]
+            if not free:
+                return
+            key = keys[job]
+            seat = free[0] if key is None else self._home.setdefault(key, free[0])
+            if seat in free:
+                waiting.remove(job)
+                yield seat, job
+
+    def _collect(self, busy: dict[int, int], limits: Limits) -> Iterator[tuple[int, Outcome | str]]:
+        """Wait for workers to answer: (worker, outcome), or why there will be none."""
+        lines = {self._worker(seat).connection: seat for seat in busy}
+        limited = limits.time_s or limits.memory_GB
+        ready = wait(list(lines), _LOOK_S if limited else None)
+        for line in ready:
+            seat = lines[line]  # type: ignore[index]
+            outcome = self._worker(seat).receive()
+            if outcome is None:
+                self._replace(seat)
+            yield seat, outcome or _DIED
+        for line, seat in lines.items():
+            if line not in ready and (excess := self._worker(seat).excess(limits)):
+                self._replace(seat)
+                yield seat, excess
+
+    def _worker(self, seat: int) -> Worker:
+        worker = self._staff[seat]
+        if worker is None:
+            worker = self._staff[seat] = Worker(self.threads)
+        return worker
+
+    def _replace(self, seat: int) -> None:
+        worker, self._staff[seat] = self._staff[seat], None
+        if worker is not None:
+            worker.dismiss(at_once=True)
+            worker.end(time.monotonic() + GRACE_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        staff, self._staff = [worker for worker in self._staff if worker], [None] * self.workers
+        for worker in staff:
+            worker.dismiss(at_once=error is not None)
+        until = time.monotonic() + GRACE_S  # for all of them together
+        for worker in staff:
+            worker.end(until)
+
+
+def _obituary(function: Callable, job: int, key: str | None) -> str:
+    name = f"{key!r}" if key is not None else f"number {job + 1}"
+    return f"a worker process died twice in {function.__name__} of {name}: out of memory, killed or crashed"
