@@ -10,13 +10,16 @@ import sys
 import time
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from stored_results import SITES, add_fat, write_results
 
+from limbfit import compress_cube
 from limbfit.errors import InputError
 from limbfit.report import build_report
 
+SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 VOID = {"meta", "link", "br", "img", "input", "hr", "path", "image", "use", "line", "circle"}
 
 
@@ -298,3 +301,50 @@ def test_the_report_never_loads_a_solver() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_every_table_and_drawing_is_a_file_too(results, report):
+    folder = results / "report"
+    shown = re.findall(r'<table id="table-([^"]+)"', report)
+    assert {file.stem for file in (folder / "tables").glob("*.csv")} == set(shown)
+    assert {file.stem for file in (folder / "tables").glob("*.json")} == set(shown)
+    drawn = (folder / "figures/errors.svg").read_text(encoding="utf-8")
+    assert drawn.startswith("<?xml")
+    assert "var(--" not in drawn
+    ElementTree.fromstring(drawn)
+
+
+def test_a_table_file_holds_the_numbers_of_the_page(results, report):
+    table = json.loads((results / "report/tables/sites.json").read_text(encoding="utf-8"))
+    stored = {row["site"]: row for row in json.loads((results / "predict/predict.json").read_text())["sites"]}
+    errors = [name for name in table["columns"] if name.startswith("Error,")][-1]
+    column = table["columns"].index(errors)
+    for row in table["rows"]:
+        site = stored[row["cells"][0]]
+        assert row["marked"] == site["fitted"]
+        assert row["cells"][column] == pytest.approx(site["error_percent"], abs=0.051)
+    lines = (results / "report/tables/sites.csv").read_text(encoding="utf-8").splitlines()
+    assert len(lines) == 1 + len(table["rows"]) + len(table["foot"])
+
+
+def test_methods_say_what_was_done_and_name_nobody(results, report):
+    text = (results / "report/methods.md").read_text(encoding="utf-8")
+    run = json.loads((results / "run.json").read_text())
+    for words in ("## Identification", "## Meshes", "## Software", f"limbfit {run['limbfit']}"):
+        assert words in text
+    for name, version in run["versions"].items():
+        assert f"{name} {version}" in text
+    assert str(results) not in text
+    assert "nan" not in text.lower().replace("nanometre", "")
+
+
+def test_experiments_are_shown_unless_stale(copy, tmp_path):
+    compress_cube(copy / "cube", parameters={"skin": SKIN, "muscle": SKIN})
+    run = json.loads((copy / "run.json").read_text())
+    states = {"cube": {"state": "done", "options": {}}, "regions": {"state": "stale"}}
+    (copy / "run.json").write_text(json.dumps(run | {"experiments": states}))
+    page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
+    assert '<section id="cube"' in page
+    assert "pig skin, along the spine" in page
+    assert '<section id="regions"' not in page
+    assert "limbfit regions” are left out" in page

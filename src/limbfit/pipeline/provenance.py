@@ -12,6 +12,7 @@ from typing import Any
 
 from .. import __version__
 from ..anatomy.labelfiles import sidecar
+from ..fe import StepControl
 from ..study import Study
 from .corrections import hand_labels
 from .store import digest, file_digest
@@ -93,7 +94,10 @@ def input_digests(study: Study) -> dict[str, str]:
 
 
 def settings_record(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Every setting of a study, with digests in place of paths and series, which may identify a person."""
+    """Every setting of a study, with digests in place of paths and series, which may identify a person.
+
+    Beside them: what the solver takes that no study sets.
+    """
     by_path = {path: f"sha256:{digests[key][:16]}" for key, path in study.inputs.items()}
 
     def plain(value: Any) -> Any:
@@ -107,4 +111,6 @@ def settings_record(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
     for key in ("series", "markers_series"):
         if record["image"] and record["image"][key]:
             record["image"][key] = f"sha256:{digest(record['image'][key])}"
+    control = StepControl()
+    record["solver"] |= {key: getattr(control, key) for key in ("tolerance", "max_cuts", "penetration")}
     return record

@@ -30,7 +30,7 @@ from .variants import (
     tissue_over_bone,
     write_variants,
 )
-from .volumes import volume_cache
+from .volumes import NO_VOLUME, volume_cache
 
 Array = NDArray[np.float64]
 FACTORS = (0.5, 2.0)
@@ -217,7 +217,7 @@ def _run(
     rows = compared(variants, simulations)
     if volumes:
         for row, simulation in zip(rows, simulations, strict=True):
-            row |= simulation.facts["volume"]
+            row |= simulation.facts.get("volume", NO_VOLUME)
     return {"sites": [one.facts for one in chosen], "runs": rows}
 
 

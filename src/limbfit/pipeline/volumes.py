@@ -16,6 +16,7 @@ from ..mesh import read_vtu
 from .simulations import SimulationCache
 
 Array = NDArray[np.float64]
+NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
 ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
 
 
@@ -49,7 +50,7 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
 
 def _volume(result: Result, model: SiteModel) -> dict[str, Any]:
     if not result.states:
-        return dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
+        return dict(NO_VOLUME)
     problem = result.problem
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     J = element_fields(result.system, laws, result.states[-1]).J

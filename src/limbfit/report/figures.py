@@ -53,7 +53,8 @@ def record_figure(store: Store, site: str) -> Figure | None:
     peak, depth = fixed(facts.get("peak_force_N"), 2), fixed(facts.get("depth_mm"), 2)
     alt = f"Record of site {site}: displacement and force against time, and force against displacement"
     caption = (
-        f"Record of site {site}, raw and regularised. The dashed line is the touch-down that was found; "
+        f"Figure 3 of the paper for this study: record of site {site}, raw and regularised. The dashed "
+        "line is the touch-down that was found; "
         f"loading and unloading are regularised apart and the peak is kept ({peak} N at {depth} mm)."
     )
     return Figure("record", svg(drawing, "record", alt), caption)
@@ -95,7 +96,10 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
     sites = ", ".join(f"{row['site']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words[against][1]}; site and error: {sites}"
     kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
-    caption = f"Measured and simulated force against {words[against][1]} at the {kind} sites, with the error."
+    paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
+    caption = (
+        f"{paper}easured and simulated force against {words[against][1]} at the {kind} sites, with the error."
+    )
     return Figure(name, svg(drawing, name, alt), caption)
 
 
@@ -182,7 +186,8 @@ def convergence_figure(store: Store) -> Figure | None:
     last = fixed(stages[-1]["iterations"][-1].get("error_percent"), 2)
     alt = f"Error and parameters against iteration; the error ends at {last} %"
     caption = (
-        "Convergence: the mean error at the fitted sites (thin lines: each site) and the parameters, "
+        "The paper's two steps (figure 5) as they went: the mean error at the fitted sites (thin lines: "
+        "each site) and the parameters, "
         "over the accepted iterates. The vertical line is where the second stage begins."
     )
     return Figure("convergence", svg(drawing, "convergence", alt), caption)

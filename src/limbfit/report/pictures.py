@@ -121,7 +121,8 @@ def marker_figure(store: Store) -> Figure | None:
     plotter.close()
     alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
     caption = (
-        "Skin of the image with markers, coloured by its distance from the skin without: each site of the "
+        "Figure 1 of the paper for this study: skin with markers, coloured by its distance from the skin "
+        "without: each site of the "
         "study was matched to one of the bumps."
     )
     bar = colour_bar(limits, "distance (mm)")
@@ -178,7 +179,8 @@ def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
     key = legend((*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE)))
     caption = (
-        "The mesh of each fitted site, cut along the limb through the site (above), and near the indenter "
+        "Figures 4 and 6 of the paper for this study: the mesh of each fitted site, cut along the limb "
+        "through the site (above), and near the indenter "
         "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
     )
     titles = [f"site {name}" for name in names]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from . import figures, pictures, tables
 from .comparison import comparison
 from .doubts import doubts
 from .experiments import experiment_sections
+from .methods import method_section
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
 from .slices import slices_figure
 from .store import PARAMETERS, Json, Store
@@ -37,7 +38,7 @@ def make_page(store: Store) -> Page:
         simulated,
         comparison,
         solver,
-        method,
+        method_section,
         timing,
         settings,
         provenance,
@@ -54,7 +55,7 @@ def make_page(store: Store) -> Page:
         key_numbers=key_numbers(store),
         summary=summary(store),
         sections=(
-            *(make(store) for make in makers),
+            *(make(store) for make in makers if not absent.get(make)),
             *experiment_sections(store),
             *(make(store) for make in closing if not absent.get(make)),
         ),
@@ -310,11 +311,22 @@ def simulated(store: Store) -> Section:
     return Section("simulated", "Simulated indentations", blocks)
 
 
+def _corrections(rounds: Sequence[Json]) -> str | None:
+    """How many, and what the last one changed."""
+    if not rounds:
+        return None
+    left = max(rounds[-1]["change_percent_by_site"].values())
+    return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
+
+
 def solver(store: Store) -> Section:
     """What the simulations say about themselves."""
     facts = {
         "Objective": store.calibration.get("objective"),
         "Forward simulations of the identification": store.calibration.get("forward_runs"),
+        "Of them with derivatives": store.calibration.get("forward_runs_with_sensitivities"),
+        "Corrections of coarse meshes": _corrections(store.calibration.get("corrections") or []),
+        "Starts": (store.calibration.get("multistart") or {}).get("summary"),
         "Linear solver": store.calibration.get("linear_solver"),
         "Element": store.calibration.get("element"),
     }
@@ -333,51 +345,6 @@ def solver(store: Store) -> Section:
         otherwise="No simulations are stored yet.",
     )
     return Section("solver", "Solver", blocks)
-
-
-def method(store: Store) -> Section:
-    """The method in words that a paper's supplement can take over."""
-    options = store.run.get("settings") or {}
-    geometry, indenter = options.get("geometry") or {}, options.get("indenter") or {}
-    kappa = (options.get("material") or {}).get("kappa_ratio", tables.NOTHING)
-    width = indenter.get("width_mm", tables.NOTHING)
-    return Section(
-        "method",
-        "Method",
-        (
-            Prose(
-                "The method follows Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater.): "
-                "all tissues obey the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with "
-                "quasi-linear viscoelasticity, G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress. "
-                f"The bulk modulus κ is c times {kappa}. {_layers(geometry)} Bones are voids whose "
-                "surfaces, like the proximal cut, do not move."
-            ),
-            Prose(
-                f"A rigid {indenter.get('shape') or 'square'} indenter of {width} mm follows the measured "
-                "displacement along the mean local normal, without friction. Parameters minimise the force "
-                "residuals at the fitted sites by bounded least squares with exact sensitivities. The force "
-                "error of a site is the mean absolute error over the trace divided by the largest measured "
-                "force."
-            ),
-        ),
-    )
-
-
-def _layers(geometry: Json) -> str:
-    """The layers of tissue in a sentence."""
-    layers = geometry.get("layers")
-    if not layers:
-        return f"The skin–adipose layer is {geometry.get('skin_layer_mm', tables.NOTHING)} mm thick."
-    words = [
-        f"{layer['name']} ("
-        + (
-            f"{layer['thickness_mm']} mm)"
-            if layer.get("thickness_mm")
-            else f"as thick as the segmented fat, at least {layer.get('min_thickness_mm')} mm)"
-        )
-        for layer in layers
-    ]
-    return f"Over the {geometry.get('core')} lie, outermost first: {_listed(words)}."
 
 
 def timing(store: Store) -> Section:
