@@ -33,8 +33,8 @@ def bench_calibrate(folder: Path | None = None, *, listener: Listener) -> dict[s
     dict
         ``seconds`` of calibration and prediction together, ``forward_runs`` of both (and how many of the
         calibration's have sensitivities), ``mean_error_fitted_percent``, ``mean_error_heldout_percent``;
-        ``febio_loop_seconds``, what FEBio would take for (parameters + 1) simulations per iteration and fitted
-        site, ten iterations, at its measured time on a site of 20,922 nodes; and ``ratio`` of the two.
+        ``febio_loop_seconds``, what FEBio would take for (parameters + 1) simulations per iteration and
+        fitted site, ten iterations, at its time on a site of 20,922 nodes; and ``ratio`` of the two.
 
     Raises
     ------
