@@ -97,12 +97,13 @@ def vector(found: dict) -> np.ndarray:
 def blocks(tmp_path_factory):
     """A study of blocks, calibrated on two meshes."""
     study = write_study(tmp_path_factory.mktemp("blocks"))
-    store = store_blocks(study, BLOCKS, TRUTH, 4, coarse=3)
+    store = store_blocks(study, BLOCKS, TRUTH, 5, coarse=4)
     return study, store, calibrated(study, store)
 
 
 def moved(study: Study, store: Store, folder: Path) -> Store:
     """The stored inputs of the calibration in another results folder, nothing simulated yet."""
+    folder.mkdir()
     other = Store(folder)
     for stage in ("surfaces", "sites", "traces", "mesh"):
         other[stage].symlink_to(store[stage], target_is_directory=True)
