@@ -34,7 +34,7 @@ LARGE, ERROR = 4.0, 0.12  # standardised error and prediction error over the pea
 _SHARE = 0.25  # of the logarithm of a unit's factor: how near the force ratio must come
 _MOST = 3  # corrections that are looked for
 _LOOKED_AT = 3  # exchanges that are simulated
-_PAIRS_OF = 8  # worst sites of which pairs are tried
+_WORST = 8  # sites of which pairs and units are tried
 MIN_SITES = 4
 GAIN = 4.0  # by which a correction must lower the squared misfit of all sites
 FORCE_UNITS = {name: force for name, (force, travel, time) in UNITS.items() if travel == time == 1.0}
@@ -223,10 +223,10 @@ def suspects(
 def _worst_pair(sites: Sites, singles: Sequence[LeftOut]) -> tuple[tuple[int, ...], float]:
     """The two sites that, both left out, are predicted worst by the rest; 0 where one of them is fine."""
     everyone = sites.errors(sites.without())
-    worst = np.maximum(everyone, [single.error for single in singles])
-    order = [int(i) for i in np.argsort(-worst)[:_PAIRS_OF]]
+    if max(everyone.max(), *(single.error for single in singles)) <= ERROR / 2:
+        return (), 0.0
     found: tuple[tuple[int, ...], float] = ((), 0.0)
-    for i, j in combinations(sorted(order), 2):
+    for i, j in combinations(sorted(_worst(sites, everyone)), 2):
         errors = sites.errors(sites.without(i, j))[[i, j]]
         if errors.min() < ERROR:
             continue
@@ -278,8 +278,11 @@ def best_correction(
     """
     as_is = Sites(simulate, measured, start)
     before = as_is.errors(as_is.without())
-    units = [converted(simulate, measured, start, i, unit, before) for i, unit in _units(len(measured))]
-    pairs = combinations(range(len(measured)), 2)
+    if before.max() <= ERROR / 2:
+        return None  # nothing to explain
+    worst = sorted(_worst(as_is, before))
+    units = [converted(simulate, measured, start, i, unit, before) for i in worst for unit in FORCE_UNITS]
+    pairs = combinations(worst, 2)
     swaps = [exchanged(simulate, measured, start, pair, exchange, before) for pair in pairs]
     if exactly is not None:
         likely = sorted((s for s in swaps if s.gain > GAIN / 2), key=lambda s: -s.gain)[:_LOOKED_AT]
@@ -293,8 +296,10 @@ def _pair(found: Correction) -> tuple[int, int]:
     return i, j
 
 
-def _units(sites: int) -> list[tuple[int, str]]:
-    return [(i, name) for i in range(sites) for name in FORCE_UNITS]
+def _worst(sites: Sites, before: Array) -> list[int]:
+    """The sites that are predicted worst, with or without themselves, at most eight."""
+    alone = [sites.errors(sites.without(i))[i] for i in range(len(before))]
+    return [int(i) for i in np.argsort(-np.maximum(before, alone))[:_WORST]]
 
 
 @dataclass(frozen=True)
