@@ -134,21 +134,24 @@ def _range(facts: Iterable[Json], key: str, digits: int) -> str:
 
 def _meshes(store: Store) -> str:
     table = _settings(store, "mesh")
-    if not store.mesh or not table:
+    if not store.mesh:
         return ""
     facts = tuple(store.mesh.values())
+    element = table.get("element") or facts[0].get("element")
+    edges = (
+        f" by {table.get('engine')}: edges of {table['edge_near_mm']} mm within "
+        f"{table.get('near_radius_mm')} mm of the site, growing at {table.get('growth')} per mm "
+        f"to {table.get('edge_far_mm')} mm"
+        if "edge_near_mm" in table
+        else ""
+    )
     coarse = table.get("coarse")
     return _said(
         (
-            f"Each site has a mesh of its own of {_element(table.get('element'))} by "
-            f"{table.get('engine')}: edges of "
-            f"{table.get('edge_near_mm')} mm within {table.get('near_radius_mm')} mm of the site, growing at "
-            f"{table.get('growth')} per mm to {table.get('edge_far_mm')} mm. They have "
-            f"{_range(facts, 'nodes', 0)} "
-            f"nodes and {_range(facts, 'cells', 0)} elements, with a smallest dihedral angle of "
-            f"{_range(facts, 'min_dihedral_deg', 1)} degrees.",
-            f"Parameters were searched on coarser meshes ({_pairs(coarse)}) whose forces the finer ones "
-            "correct."
+            f"Each site has a mesh of its own of {_element(element)}{edges}.",
+            f"They have {_range(facts, 'nodes', 0)} nodes and {_range(facts, 'cells', 0)} elements, with a "
+            f"smallest dihedral angle of {_range(facts, 'min_dihedral_deg', 1)} degrees.",
+            f"Parameters were searched on coarser meshes ({_pairs(coarse)}), corrected by the finer ones."
             if coarse
             else "",
         )
@@ -221,7 +224,7 @@ def _solution(store: Store) -> str:
 
 def _identification(store: Store) -> str:
     table, found = _settings(store, "calibration"), store.calibration
-    if not store.stages or not table:
+    if not store.stages:
         return ""
     first = store.stages[0]
     runs, exact = found.get("forward_runs"), found.get("forward_runs_with_sensitivities")
@@ -263,6 +266,8 @@ def _objective(name: str) -> str:
 
 
 def _stopping(table: Json) -> str:
+    if not table:
+        return ""
     if table.get("stopping") == "paper":
         return "A stage ends where no parameter or no entry of the objective changed by more than 0.01."
     return (
