@@ -25,7 +25,8 @@ def design_section(store: Store, content: Json) -> Section:
         "judged by the Fisher information of their forces, from exact derivatives at the parameters "
         f"({content['parameters_from']}); {searched}. The noise: a sensor of {number(noise['sensor_N'])} N, "
         f"and an error of the model of {fixed(100 * noise['misfit'])} % of the largest force that drifts "
-        f"along the trace. D-optimal is the smallest joint region of confidence, A-optimal the smallest sum of "
+        "along the trace. D-optimal is the smallest joint region of confidence, "
+        "A-optimal the smallest sum of "
         f"variances. In short: {content['verdict']}."
     )
     blocks: list[Block] = [words, _design_table(content), _figure(content), _candidate_table(content)]

@@ -70,7 +70,8 @@ def _figure(content: Json) -> Figure:
         legend_above(drawing, axes[0])
     caption = (
         "Left: mean error at the sites that a choice does not fit, over the choices. Right: the error of "
-        "each site over the choices that leave it out (dot: middle; bar: nine in ten), and by the study's own "
+        "each site over the choices that leave it out (dot: middle; bar: nine in ten), "
+        "and by the study's own "
         "choice (cross)."
     )
     alt = f"Mean held-out error over {len(means)} choices of sites, and errors of each site"
