@@ -13,8 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.errors import RunError, TraceError
-from limbfit.execution import THREAD_VARIABLES, ProcessExecutor, SerialExecutor, make_executor, usable_cores
+from limbfit.errors import InputError, RunError, TraceError
+from limbfit.execution import (
+    THREAD_VARIABLES,
+    Limits,
+    Placement,
+    ProcessExecutor,
+    SerialExecutor,
+    make_executor,
+    placed,
+    sharing,
+    usable_cores,
+)
 
 
 def square(x):
@@ -245,3 +255,61 @@ def test_workers_do_not_outlive_a_killed_parent():
     run.kill()
     run.wait()
     assert_group_ends(run.pid)
+
+
+def hang_once(marker):
+    path = Path(marker)
+    if not path.exists():
+        path.touch()
+        time.sleep(600)
+    return "alive"
+
+
+def swell(megabytes):
+    kept = np.ones(megabytes * 125_000)
+    time.sleep(600 if megabytes > 1000 else 0)
+    return float(kept[0])
+
+
+def told(job, reason):
+    return f"{Path(str(job)).name}: {reason}"
+
+
+def test_a_hung_worker_costs_one_retry_and_twice_is_lost_with_the_reason(tmp_path):
+    with ProcessExecutor(2, limits=Limits(time_s=20.0)) as executor:
+        answers = list(executor.map(hang_once, [str(tmp_path / "x")], lost=told))
+    assert answers == ["alive"]
+    with ProcessExecutor(1, limits=Limits(time_s=0.1)) as executor:
+        first, second = executor.map(nap, [600, 601], lost=told)
+    assert first == "600: it took longer than execution.time_limit_s = 0.1 s, twice"
+    assert second.startswith("601: ")
+
+
+def test_a_worker_over_its_memory_is_ended_and_the_others_go_on():
+    with ProcessExecutor(2, limits=Limits(memory_GB=1.2)) as executor:
+        answers = list(executor.map(swell, [1, 1800, 2], lost=told))
+    assert answers[::2] == [1.0, 1.0]
+    assert answers[1] == "1800: it needed more than execution.memory_limit_GB = 1.2 GB, twice"
+
+
+def test_a_job_that_kills_every_worker_can_be_a_failure_instead_of_an_end(pool):
+    assert list(pool.map(die, [0], lost=told)) == [
+        "0: a worker process died: out of memory, killed or crashed, twice"
+    ]
+
+
+def test_limits_are_for_jobs_that_can_be_lost():
+    with ProcessExecutor(1, limits=Limits(time_s=0.01)) as executor:
+        assert list(executor.map(square, [3])) == [9]
+
+
+def test_placement_and_sharing_decide_the_executor(pool):
+    with placed(Placement(workers=1)):
+        assert isinstance(make_executor(3), SerialExecutor)
+    with sharing(pool):
+        with make_executor(1) as lent:
+            assert lent.workers == 2
+        assert list(make_executor().map(square, [2])) == [4]  # still runs
+    assert make_executor(3).workers == 3
+    with pytest.raises(InputError, match="--scheduler"):
+        Placement(workers=2, scheduler="tcp://127.0.0.1:1")

@@ -9,6 +9,9 @@ Everything the command line does is one call away:
 ``limbfit check``         ``check_study(load_study(path), listener=print)``
 ``limbfit run``           ``run_study(load_study(path), until=None, listener=print)``
 ``limbfit status``        ``study_status(load_study(path))``
+``limbfit batch``         ``run_batch(paths, until=None, workers=0, listener=print)``
+``limbfit reproduce``     ``reproduce_study(run_json, folder, tolerance=1e-6, listener=print)``
+``limbfit doctor``        ``diagnose(folder)``
 ``limbfit surfaces``      ``show_stage(load_study(path), "surfaces", listener=print)``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
@@ -45,9 +48,12 @@ _HOME = {
     "compare_site": "pipeline",
     "compress_cube": "pipeline",
     "design_study": "pipeline",
+    "diagnose": "pipeline",
     "export_study": "pipeline",
     "make_phantom_study": "pipeline",
     "report_study": "pipeline",
+    "reproduce_study": "pipeline",
+    "run_batch": "pipeline",
     "run_demo": "pipeline",
     "run_experiment": "pipeline",
     "run_study": "pipeline",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
 from .. import __version__
 from ..errors import InputError, LimbfitError
-from . import bench, commands, experiments, febio, geometry, trust
+from . import bench, commands, experiments, febio, geometry, runs, trust
 from .console import INTERRUPTED, STDOUT, fail
 
 app = typer.Typer(
@@ -32,8 +33,13 @@ def top(
         raise typer.Exit
 
 
-for verb in (*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS):
-    app.command()(verb)
+_PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS}
+_VERBS: tuple[Callable[..., None], ...] = (
+    *(*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS),
+    *runs.VERBS,
+)
+for verb in _VERBS:
+    app.command()(runs.where(verb) if verb in _PLACED else verb)
 app.add_typer(bench.app, name="bench")
 
 

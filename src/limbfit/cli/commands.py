@@ -107,20 +107,30 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
 def run(
     study: StudyPath,
     until: Annotated[StageName | None, typer.Option(help="stop after this stage")] = None,
+    start: Annotated[
+        StageName | None, typer.Option("--from", help="do this stage and all after it anew")
+    ] = None,
+    force: Annotated[
+        list[StageName] | None, typer.Option(help="do this stage anew, repeatable; kept simulations count")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Do every stage that is missing or stale; a stopped run goes on where it stopped."""
-    start = perf_counter()
+    began = perf_counter()
     with listening() as listener:
         summary = limbfit.run_study(
-            limbfit.load_study(study), until=until.value if until else None, listener=listener
+            limbfit.load_study(study),
+            until=until.value if until else None,
+            start=start.value if start else None,
+            force=[stage.value for stage in force or ()],
+            listener=listener,
         )
-    summary["seconds"] = round(perf_counter() - start, 1)
+    summary["seconds"] = round(perf_counter() - began, 1)
     show_summary(summary, as_json)
 
 
 def status(study: StudyPath, as_json: AsJson = False) -> None:
-    """Say which stages are done, begun, stale or missing."""
+    """Say which stages are done, begun, stale (and why) or missing."""
     states = limbfit.study_status(limbfit.load_study(study))
     if as_json:
         print_json({"stages": states})
@@ -130,6 +140,9 @@ def status(study: StudyPath, as_json: AsJson = False) -> None:
         seconds = "" if row["seconds"] is None else f"{row['seconds']:.1f}"
         table.add_row(row["stage"], row["state"], seconds, row["finished"] or "")
     STDOUT.print(table)
+    for row in states:
+        if row["why"]:
+            STDOUT.print(f"{row['stage']} is stale: {'; '.join(row['why'])}", soft_wrap=True)
 
 
 def simulate(

@@ -87,7 +87,7 @@ class Laboratory:
 
         def tell(state: State) -> None:
             name = titles[state.history[-1].stage]
-            self.context.tell(self.title, 0, 0, f"{name}: {_describe(state, study.tissues)}")
+            self.context.tell(self.title, 0, 0, f"{name}: {_describe(state, study.tissues)}", fit=True)
 
         if study.mesh.coarse is None:
             found = calibrate(

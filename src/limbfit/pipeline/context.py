@@ -13,12 +13,16 @@ from .store import Store
 
 @dataclass(frozen=True)
 class Progress:
-    """One step of a stage: ``done`` of ``total`` (``total`` 0: not known), and what is going on in words."""
+    """One step of a stage: ``done`` of ``total`` (``total`` 0: not known), and what is going on in words.
+
+    ``fit``: the words are the identified parameters and their error so far.
+    """
 
     stage: str
     done: float = 0.0
     total: float = 0.0
     text: str = ""
+    fit: bool = False
 
 
 Listener = Callable[[Progress], None]
@@ -33,8 +37,8 @@ class Context:
     executor: Executor
     listener: Listener
 
-    def tell(self, stage: str, done: float, total: float, text: str = "") -> None:
-        self.listener(Progress(stage, done, total, text))
+    def tell(self, stage: str, done: float, total: float, text: str = "", fit: bool = False) -> None:
+        self.listener(Progress(stage, done, total, text, fit))
 
     def stored(self, stage: str, name: str) -> Any:
         """A JSON artefact of a finished stage."""

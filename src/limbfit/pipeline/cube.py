@@ -79,7 +79,7 @@ def compress_cube(
     times = _times()
     rows, stresses = [], {}
     for specimen in _specimens(parameters or {}, kappa_ratio):
-        stress, least, most = _compress(specimen.material, times, compression_percent)
+        stress, least, most = compress(specimen.material, times, compression_percent)
         stresses[specimen.name] = stress
         rows.append(specimen.row | _summary(times, stress) | {"J_min": least, "J_max": most})
     content = {
@@ -163,7 +163,7 @@ def cube_mesh(cells: int = 1) -> Mesh:
     return Mesh(points, corners[:, HEX], "hex8", np.zeros(len(corners), dtype=int), ("cube",), {}, {})
 
 
-def _compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:
+def compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:
     """Stress (k,) in kPa at ``times`` s, and the least and largest ratio of volumes."""
     depth = SIDE_MM * compression_percent / 100.0
     ramp = np.array([0.0, RAMP_S, 2 * RAMP_S, 2 * RAMP_S + HOLD_S])

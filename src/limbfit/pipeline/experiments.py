@@ -182,15 +182,24 @@ def experiment_rows(study: Study, keys: Keys, stages: Mapping[str, str]) -> list
     return rows
 
 
-def do_experiment(context: Context, experiment: Experiment, key: str, options: Mapping[str, Any]) -> Any:
-    """Run an experiment where its result is not there yet; what its ``<name>.json`` holds."""
+def do_experiment(
+    context: Context,
+    experiment: Experiment,
+    key: str,
+    options: Mapping[str, Any],
+    parts: Mapping[str, Any] | None = None,
+) -> Any:
+    """Run an experiment where its result is not there yet; what its ``<name>.json`` holds.
+
+    ``parts``: what the key is made of, for its stamp.
+    """
     store, name = context.store, experiment.name
     if store.state(name, key).state == "done":
         context.tell(name, 1, 1, "is up to date")
     else:
 
         def produce(folder: Path) -> dict[str, Any]:
-            return {**experiment.run(context, folder, **options), "options": dict(options)}
+            return {**experiment.run(context, folder, **options), "options": dict(options), "parts": parts}
 
         stamp = store.make(name, key, produce)
         context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")

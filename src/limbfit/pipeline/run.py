@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .. import __version__
 from ..errors import InputError
 from ..study import Study
 from .calibrate_stage import run_calibrate
+from .causes import causes, parts_of
 from .context import Context, Listener, executor_of
 from .corrections import keep_corrections
 from .experiments import do_experiment, experiment_key, experiment_rows, find_experiment, options_of
 from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
+from .journal import journal
 from .keys import Keys, Stage
 from .predict_stage import run_predict
 from .provenance import input_digests, machine, settings_record, versions
@@ -92,7 +95,8 @@ def _seen_by_calibration(study: Study) -> Study:
 def study_status(study: Study) -> list[dict[str, Any]]:
     """State of every stage: done, begun, stale (made from other inputs, settings or code) or missing.
 
-    Below the stages: the experiments that were begun or done.
+    ``why`` names what changed since a stale one was made. Below the stages: the experiments that were begun
+    or done.
     """
     store, known = Store(study.results), Keys(study)
     wanted, rows = _chain(known), []
@@ -104,23 +108,45 @@ def study_status(study: Study) -> list[dict[str, Any]]:
                 "state": state.state,
                 "seconds": state.seconds,
                 "finished": state.finished,
+                "why": _why(known, stage, wanted) if state.state == "stale" else [],
             }
         )
     columns = ("state", "seconds", "finished")
     for row in experiment_rows(study, known, wanted):
         if row["state"] != "missing":
-            rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}})
+            why = _why(known, find_experiment(row["experiment"]), wanted) if row["state"] == "stale" else []
+            rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}, "why": why})
     return rows
 
 
-def run_study(study: Study, *, until: str | None = None, listener: Listener) -> dict[str, Any]:
+def _parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """What the key of a stage is made of, for a later status to say what changed."""
+    seen = _seen_by_calibration(known.study) if stage.name == "calibrate" else known.study
+    return parts_of(stage, known, seen, chain)
+
+
+def _why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
+    stamp = Store(known.study.results).stamp(stage.name) or {}
+    return causes(stamp.get("parts"), _parts(known, stage, chain))
+
+
+def run_study(
+    study: Study,
+    *,
+    until: str | None = None,
+    start: str | None = None,
+    force: Sequence[str] = (),
+    listener: Listener,
+) -> dict[str, Any]:
     """Do every stage that is not done, in order; return the summary of the study.
 
     Parameters
     ----------
     study : a checked study.
     until : name of the last stage to do; default all.
-    listener : is told of progress.
+    start : name of a stage that is done anew, and all after it.
+    force : names of stages that are done anew. Kept simulations count: the same ones would come out.
+    listener : is told of progress; ``results/log`` too.
 
     Raises
     ------
@@ -129,17 +155,22 @@ def run_study(study: Study, *, until: str | None = None, listener: Listener) -> 
     RunError
         When another run holds the study, or the disk is full.
     """
-    if until is not None and until not in STAGE_NAMES:
-        raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
+    anew = _anew(study, until, start, force)
     store = Store(study.results)
-    with lock(study.results), executor_of(study) as executor:
+    with (
+        lock(study.results),
+        journal(study, "run", listener) as listener,
+        executor_of(study) as executor,
+    ):
         context = Context(study, store, executor, listener)
         kept = keep_corrections(study)
         if kept is not None:
             context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
-        for stage, key in keys(study).items():
-            if store.state(stage, key).state != "done":
-                _do(context, stage, key)
+        known = Keys(study)
+        chain = _chain(known)
+        for stage, key in chain.items():
+            if stage in anew or store.state(stage, key).state != "done":
+                _do(context, stage, known, chain)
             else:
                 context.tell(stage, 1, 1, "is up to date")
             if stage == until:
@@ -148,6 +179,17 @@ def run_study(study: Study, *, until: str | None = None, listener: Listener) -> 
     if until is not None:
         summary["until"] = until
     return summary
+
+
+def _anew(study: Study, until: str | None, start: str | None, force: Sequence[str]) -> set[str]:
+    """Stages that are done whether they are up to date or not."""
+    names = [stage.name for stage in stages_of(study)]
+    for name in (until, start, *force):
+        if name is not None and name not in names:
+            raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(names))
+    if until is not None and start is not None and names.index(start) > names.index(until):
+        raise InputError(f"{start} comes after {until}", remedy="leave out one of the two")
+    return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
 def run_experiment(study: Study, name: str, *, listener: Listener, **options: Any) -> dict[str, Any]:
@@ -180,18 +222,27 @@ def run_experiment(study: Study, name: str, *, listener: Listener, **options: An
     if last:
         run_study(study, until=last[0], listener=listener)
     store = Store(study.results)
-    with lock(study.results), executor_of(study) as executor:
+    with (
+        lock(study.results),
+        journal(study, name, listener) as listener,
+        executor_of(study) as executor,
+    ):
         known = Keys(study)
-        key = experiment_key(experiment, known, _chain(known), chosen)
-        found = do_experiment(Context(study, store, executor, listener), experiment, key, chosen)
+        chain = _chain(known)
+        key, parts = experiment_key(experiment, known, chain, chosen), _parts(known, experiment, chain)
+        context = Context(study, store, executor, listener)
+        found = do_experiment(context, experiment, key, chosen, parts)
     return found | {"folder": str(store[name])}
 
 
-def _do(context: Context, name: str, key: str) -> None:
+def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> None:
     stage = next(stage for stage in STAGES if stage.name == name)
     if name == "report":
         write_json(context.store.folder / "run.json", run_record(context.study))
-    stamp = context.store.make(name, key, lambda folder: stage.run(context, folder))
+    parts = _parts(known, stage, chain)
+    stamp = context.store.make(
+        name, chain[name], lambda folder: {**stage.run(context, folder), "parts": parts}
+    )
     context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
 
 
@@ -225,7 +276,8 @@ def report_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     store = Store(study.results)
     with lock(study.results), executor_of(study) as executor:
         context = Context(study, store, executor, listener)
-        _do(context, "report", keys(study)["report"])
+        known = Keys(study)
+        _do(context, "report", known, _chain(known))
         return summarise(study)
 
 

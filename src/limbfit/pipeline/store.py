@@ -183,6 +183,8 @@ def disk_errors(folder: Path) -> Iterator[None]:
         errno.EROFS: "the file system is read-only; copy the study to a folder that can be written",
         errno.EACCES: "no permission to write; check the folder's owner and mode",
         errno.EDQUOT: "the disk quota is used up; free some space and run again: finished work is kept",
+        errno.EFBIG: "a file is larger than may be written here (ulimit -f); raise the limit and run again",
+        errno.EPERM: "writing is not permitted; check the folder's owner and mode",
     }
     try:
         yield
@@ -208,9 +210,12 @@ def lock(folder: Path) -> Iterator[None]:
             except OSError:
                 stream.seek(0)
                 holder = stream.read().strip() or "another process"
-                raise RunError(f"{folder}: {holder} is running this study; wait for it or stop it") from None
+                raise RunError(
+                    f"{folder}: {holder} is running this study; wait for it or end it (kill PID): its lock "
+                    "goes with it, and another run goes on where it stopped"
+                ) from None
         stream.seek(0)
         stream.truncate()
-        stream.write(f"process {os.getpid()}")
+        stream.write(f"process {os.getpid()} (since {datetime.now(UTC):%Y-%m-%d %H:%M} UTC)")
         stream.flush()
         yield

@@ -1,0 +1,185 @@
+"""Runs: what is stale and why, stages anew, logs, batches, faults of the disk, the machine's fitness."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from limbfit.errors import InputError, RunError
+from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
+from limbfit.pipeline.doctor import squeeze_cube
+from limbfit.pipeline.journal import discreet
+from limbfit.study import load_study
+
+
+def quiet(event: Progress) -> None:
+    """A listener that does nothing."""
+
+
+@pytest.fixture
+def alone(study):
+    """The study on this process alone."""
+    file = study / "study.toml"
+    file.write_text(file.read_text() + "[execution]\nworkers = 1\n")
+    return study
+
+
+def rows_of(study) -> dict[str, dict]:
+    return {row["stage"]: row for row in study_status(load_study(study))}
+
+
+def test_status_names_the_setting_and_the_input_that_changed(alone):
+    run_study(load_study(alone), until="traces", listener=quiet)
+    assert rows_of(alone)["traces"]["state"] == "done"
+    file = alone / "study.toml"
+    file.write_text(file.read_text() + "[traces]\nsmoothing = 0.5\n")
+    rows = rows_of(alone)
+    assert rows["traces"]["why"] == ["setting traces.smoothing changed"]
+    assert rows["surfaces"]["why"] == []
+    (alone / "1.csv").write_text((alone / "1.csv").read_text() + "\n")
+    assert "input file sites.1.trace changed" in rows_of(alone)["traces"]["why"]
+
+
+def test_stages_are_done_anew_where_asked_for(alone):
+    def done(**how) -> list[str]:
+        told = []
+        run_study(load_study(alone), until="traces", listener=told.append, **how)
+        return [event.stage for event in told if event.text.startswith("done in")]
+
+    assert done() == ["surfaces", "sites", "traces"]
+    assert done() == []
+    assert done(force=["surfaces"]) == ["surfaces"]
+    assert done(start="sites") == ["sites", "traces"]
+    with pytest.raises(InputError, match="no stage is named 'meshing'"):
+        done(start="meshing")
+    with pytest.raises(InputError, match="comes after"):
+        done(start="report")
+
+
+def test_the_log_tells_what_happened_and_no_names_of_files(alone):
+    secret = alone / "Doe^Jane.csv"
+    (alone / "2.csv").rename(secret)
+    file = alone / "study.toml"
+    file.write_text(file.read_text().replace("2.csv", secret.name))
+    run_study(load_study(alone), until="sites", listener=quiet)
+    secret.write_text("time_s,displacement_mm,force_N\n0,0,zero\n")
+    with pytest.raises(InputError, match=r"Doe\^Jane"):
+        run_study(load_study(alone), until="traces", listener=quiet)
+    first, second = sorted((alone / "results/log").glob("*.jsonl"))
+    events = [json.loads(line) for line in first.read_text().splitlines()]
+    assert [events[0]["event"], events[-1]["event"]] == ["begin", "end"]
+    assert {"surfaces", "sites"} <= {row["stage"] for row in events if row["event"] == "progress"}
+    last = json.loads(second.read_text().splitlines()[-1])
+    assert (last["event"], last["error"]) == ("failed", "TraceError")
+    for text in (first.read_text(), second.read_text()):
+        assert "Doe" not in text
+        assert str(alone) not in text
+    assert discreet("see /home/jane/x/y.dcm", load_study(alone)) == "see <path>"
+
+
+def test_a_batch_lists_failures_and_does_the_rest(alone, tmp_path):
+    broken = shutil.copytree(alone, tmp_path / "broken")
+    (broken / "1.csv").write_text("nothing\n")
+    paths = [alone, broken, tmp_path / "missing"]
+    rows = list(run_batch(paths, until="traces", workers=1, listener=quiet))
+    assert [row["state"] for row in rows] == ["done", "failed", "failed"]
+    assert rows[0]["error"] is None
+    assert "no such study" in rows[2]["error"]
+    assert all("\n" not in row["error"] for row in rows[1:])
+
+
+@pytest.mark.slow
+def test_forty_studies_leave_no_growth_in_the_parent(alone, tmp_path):
+    paths = [shutil.copytree(alone, tmp_path / f"s{i}") for i in range(40)]
+    sizes = []
+    for row in run_batch(paths, until="traces", workers=2, listener=quiet):
+        assert row["state"] == "done", row
+        sizes.append(psutil.Process().memory_info().rss / 1e6)
+    assert sizes[-1] - sizes[9] < 20.0, sizes
+
+
+def run_cli(*words: str, limit_bytes: int | None = None, **more) -> subprocess.CompletedProcess:
+    def limit() -> None:
+        if limit_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
+
+    command = [sys.executable, "-m", "limbfit", *words]
+    return subprocess.run(
+        command, capture_output=True, text=True, preexec_fn=limit, timeout=600, check=False, **more
+    )
+
+
+def test_no_room_for_a_file_is_one_clear_line_and_the_run_goes_on_later(alone):
+    done = run_cli("run", str(alone), "--until", "traces", limit_bytes=1500)
+    assert done.returncode == 1
+    assert "may be written here" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    run_study(load_study(alone), until="traces", listener=quiet)
+    assert rows_of(alone)["traces"]["state"] == "done"
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_line(alone, monkeypatch):
+    if os.geteuid() != 0:
+        (alone / "results").mkdir(mode=0o500)
+    else:  # root may write anywhere, but not make a folder where a file stands
+        pytest.skip("the superuser may write to a read-only folder")
+    with pytest.raises(RunError, match="no permission to write"):
+        run_study(load_study(alone), until="traces", listener=quiet)
+
+
+def test_the_self_test_knows_its_answer():
+    found, wanted = squeeze_cube(1e-4)
+    assert found == pytest.approx(wanted, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_doctor_says_what_there_is_and_what_cannot_be_written(tmp_path):
+    found = diagnose(tmp_path)
+    assert found["healthy"], found
+    assert {"cores", "memory", "sparse solvers", "mesher MMG", "self-test"} <= {
+        row["check"] for row in found["checks"]
+    }
+    worse = diagnose(tmp_path / "missing")
+    assert not worse["healthy"]
+    (bad,) = [row for row in worse["checks"] if row["state"] == "failed"]
+    assert bad["check"] == "write access"
+    assert bad["remedy"]
+
+
+KILLS = [pytest.param(3, id="3"), pytest.param(30, id="30", marks=pytest.mark.slow)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", KILLS)
+def test_a_run_killed_at_random_moments_ends_the_same(alone, tmp_path, kills):
+    """Kill -9 until the stages before the meshes are done; stages that were finished are not done again."""
+    straight = shutil.copytree(alone, tmp_path / "straight")
+    start = time.monotonic()
+    assert run_cli("run", str(straight), "--until", "traces").returncode == 0
+    span = time.monotonic() - start
+    for i in range(kills):
+        begun = {stage: row["finished"] for stage, row in rows_of(alone).items()}
+        run = subprocess.Popen(
+            [sys.executable, "-m", "limbfit", "run", str(alone), "--until", "traces"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        time.sleep(span * (i + 1) / (kills + 1))
+        run.kill()
+        run.wait()
+        for stage, row in rows_of(alone).items():
+            assert begun[stage] is None or row["finished"] == begun[stage]
+    assert run_cli("run", str(alone), "--until", "traces").returncode == 0
+    for file in ("traces/1.csv", "traces/2.csv", "sites/sites.json"):
+        assert (alone / "results" / file).read_bytes() == (straight / "results" / file).read_bytes()
+    assert not list((alone / "results").glob(".work-*"))
