@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 DEFAULT, PAPER = "tet10", "tet4"
 LOAD_STEPS = 10
 WANTED_PERCENT = 2.0
+COLOURS = {DEFAULT: "tab:blue", PAPER: "tab:orange", f"{DEFAULT}, split": "tab:green"}
 LEAST_ORDER, THEORY_ORDER, MOST_ORDER = 0.8, 2.0, 6.0
 # FEBio 4.11 with two threads on two cores at 2.5 GHz: unknowns, seconds, steps.  The tet10 block took about
 # 80 s on one thread, beside another run.
@@ -168,14 +169,15 @@ def _draw_site(found: dict[str, Any], site: str, left: Any, right: Any) -> None:
         runs = series(rows, site, element, splits)
         label = element + (", split" if splits else "")
         sizes = [row["unknowns"] for row in runs]
-        (line,) = left.semilogx(sizes, [row["peak_force_N"] for row in runs], "o-", label=label)
+        colour = COLOURS.get(label, "tab:purple")
+        left.semilogx(sizes, [row["peak_force_N"] for row in runs], "o-", color=colour, label=label)
         runs = priced(runs)
         errors = [abs(row["error_percent"]) for row in runs]
-        right.loglog([row["cpu_seconds"] for row in runs], errors, "o-", color=line.get_color(), label=label)
+        right.loglog([row["cpu_seconds"] for row in runs], errors, "o-", color=colour, label=label)
         if element in (DEFAULT, PAPER) and not splits:
             factor, exponent = found["febio"]["residuum"]
             cost = factor * np.array([float(row["unknowns"]) for row in runs]) ** exponent
-            right.loglog(cost, errors, "s:", color=line.get_color(), label=f"FEBio {label}, cost estimated")
+            right.loglog(cost, errors, "s:", color=colour, label=f"FEBio {label}, cost estimated")
     left.axhline(limit, color="0.4", lw=0.8, label=f"Richardson limit {limit:.3f} N")
     left.set(xlabel="unknowns", ylabel="peak force, N", title=site)
     left.xaxis.set_minor_formatter(NullFormatter())
