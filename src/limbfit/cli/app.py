@@ -12,7 +12,7 @@ import typer
 from .. import __version__
 from ..errors import InputError, LimbfitError
 from . import bench, commands, experiments, febio, geometry, runs, trust
-from .console import INTERRUPTED, STDOUT, fail
+from .console import INTERRUPTED, STDOUT, fail, prompt_interrupt
 
 app = typer.Typer(
     name="limbfit",
@@ -46,7 +46,8 @@ app.add_typer(bench.app, name="bench")
 def main() -> None:
     """The entry point: errors become one line and an exit code."""
     try:
-        app()
+        with prompt_interrupt():
+            app()
     except LimbfitError as error:
         fail(str(error), 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from time import perf_counter
+from threading import Thread
+from time import perf_counter, sleep
 from typing import Annotated, Any
 
 import typer
@@ -23,6 +27,7 @@ from rich.progress import (
 import limbfit
 
 INTERRUPTED = "interrupted; run the same command again to go on"
+_PATIENCE_S = 4.0  # for an interrupt to be heard
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
@@ -57,11 +62,17 @@ def bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     )
     with Progress(*columns, console=STDERR) as shown:
         tasks: dict[str, Any] = {}
+        fits: dict[str, str] = {}
 
         def listen(event: limbfit.Progress) -> None:
             if event.stage not in tasks:
                 tasks[event.stage] = shown.add_task(event.stage, text="", total=None)
-            shown.update(tasks[event.stage], completed=event.done, total=event.total or None, text=event.text)
+            text = event.text
+            if event.fit:  # stays in sight while simulations come and go
+                fits[event.stage] = text
+            elif event.stage in fits:
+                text = f"{fits[event.stage]} ({text})" if event.done < 1 else text
+            shown.update(tasks[event.stage], completed=event.done, total=event.total or None, text=text)
 
         yield listen
 
@@ -75,6 +86,33 @@ def plain_listener() -> Callable[[limbfit.Progress], None]:
         STDERR.print(f"[{perf_counter() - start:7.1f} s] {event.stage}{share}{text}", soft_wrap=True)
 
     return listen
+
+
+@contextmanager
+def prompt_interrupt() -> Iterator[None]:
+    """A second way out for Ctrl-C: a solver's library does not come back to be interrupted while it works.
+
+    What is on disk is whole at every moment, so that ending at once loses no more than the work in progress.
+    """
+    near, far = socket.socketpair()
+    for end in (near, far):
+        end.setblocking(False)
+    before = signal.set_wakeup_fd(far.fileno(), warn_on_full_buffer=False)
+    near.setblocking(True)
+
+    def watch() -> None:
+        while numbers := near.recv(64):
+            if signal.SIGINT in numbers:
+                sleep(_PATIENCE_S)
+                os.write(2, f"error: {INTERRUPTED}\n".encode())
+                os._exit(130)
+
+    Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        far.close()  # which ends the watch
 
 
 def fail(text: str, code: int) -> None:

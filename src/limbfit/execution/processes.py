@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from ..errors import RunError
 from .face import NO_LIMITS, Answer, Job, Limits, check_keys
-from .worker import GRACE_S, Outcome, Worker
+from .worker import GRACE_S, READY, Outcome, Worker
 
 TRIES = 2
 _LOOK_S = 0.25  # between two looks at what jobs take
@@ -97,6 +97,8 @@ class ProcessExecutor:
         for line in ready:
             seat = lines[line]  # type: ignore[index]
             outcome = self._worker(seat).receive()
+            if outcome == READY:
+                continue
             if outcome is None:
                 self._replace(seat)
             yield seat, outcome or _DIED

@@ -21,6 +21,7 @@ from ..errors import RunError
 from .face import THREAD_VARIABLES, Limits
 
 GRACE_S = 2.0  # for workers to end when told so
+READY = "ready"  # a worker's first word: its start is not its first job's time
 
 
 class Outcome:
@@ -42,25 +43,31 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, far = context.Pipe()
         self.process = context.Process(target=serve, args=(far,), daemon=True)
-        self.began = 0.0
+        self.began: float | None = None  # its job; None before it is ready
         with _environment(dict.fromkeys(THREAD_VARIABLES, str(threads))), _no_main(), _may_have_children():
             self.process.start()
         far.close()
 
     def send(self, function: Callable, job: Any) -> None:
-        self.began = time.monotonic()
+        if self.began is not None:
+            self.began = time.monotonic()
         with suppress(OSError):  # it died while idle: reading its line tells so
             self.connection.send((function, job))
 
-    def receive(self) -> Outcome | None:
+    def receive(self) -> Outcome | str | None:
+        """The outcome of the job, `READY`, or None where the process is dead."""
         try:
-            return self.connection.recv()
+            message = self.connection.recv()
         except (EOFError, OSError):  # nothing more, or half a message
             return None
+        if message == READY:
+            self.began = time.monotonic()
+        return message
 
     def excess(self, limits: Limits) -> str:
         """Which limit the job at work is over, in words; empty where it is within them."""
-        if limits.time_s and time.monotonic() - self.began > limits.time_s:
+        began = self.began
+        if limits.time_s and began is not None and time.monotonic() - began > limits.time_s:
             return f"it took longer than execution.time_limit_s = {limits.time_s:g} s"
         if limits.memory_GB and self._memory_GB() > limits.memory_GB:
             return f"it needed more than execution.memory_limit_GB = {limits.memory_GB:g} GB"
@@ -132,6 +139,8 @@ def serve(connection: Connection) -> None:
     """A worker's life: do jobs until the line is closed. The terminal's Ctrl-C is the parent's affair."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
+    with suppress(ConnectionError):
+        connection.send(READY)
     while True:
         try:
             outcome = _do(*connection.recv())

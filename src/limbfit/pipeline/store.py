@@ -191,6 +191,11 @@ def disk_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in remedies:
             raise RunError(f"{folder}: {remedies[error.errno]}") from error
+        if error.errno is None and "failed to write" in str(error):  # VTK does not say why
+            raise RunError(
+                f"{folder}: a file could not be written; see whether the disk is full and run again: "
+                "finished work is kept"
+            ) from error
         raise
 
 
@@ -200,6 +205,8 @@ def lock(folder: Path) -> Iterator[None]:
 
     The lock is the operating system's, on ``results/.lock``, so it goes with the process however that ends.
     """
+    if folder.is_symlink():
+        raise RunError(f"{folder}: is a link, and nothing outside the study is written; make it a folder")
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = (folder / ".lock").open("a+")

@@ -1,0 +1,179 @@
+"""Inputs that are damaged or meant to harm: exit code 0 or 2 and one line, never a traceback."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import shutil
+import sys
+from contextlib import suppress
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from limbfit.cli import main
+from limbfit.errors import InputError, RunError
+from limbfit.pipeline import Progress, run_study
+from limbfit.study import load_study
+
+SETTINGS = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
+
+
+def check(folder, monkeypatch, capsys) -> str:
+    """``limbfit check``: the exit code must be 0 or 2; what stands on standard error."""
+    monkeypatch.setattr(sys, "argv", ["limbfit", "check", str(folder)])
+    try:
+        main()
+        code = 0
+    except SystemExit as end:
+        code = end.code or 0
+    err = capsys.readouterr().err
+    assert code in (0, 2), err
+    assert "Traceback" not in err
+    if code == 2:
+        assert err.strip().splitlines()[-1].startswith("error: ")
+    return err
+
+
+@st.composite
+def damage(draw):
+    """A few changes of bytes: (where, how much goes, what comes), where as a share of the file."""
+    one = st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=20) | st.sampled_from(WORDS))
+    return draw(st.lists(one, min_size=1, max_size=4))
+
+
+WORDS = [
+    *(b"nan", b"1e999", b"-inf", b"[[", b'"""', b"\x00", b"\x1b[2J", b"../../etc/passwd", b"\xff\xfe", b"{}"),
+    *(b"-1", b"[sites]", b"name = 1\n", b"9" * 400, "é‮".encode()),
+]
+
+
+def damaged(content: bytes, changes) -> bytes:
+    for share, gone, come in changes:
+        at = int(share * len(content))
+        content = content[:at] + come + content[at + gone :]
+    return content
+
+
+def fuzz(study, monkeypatch, capsys, examples: int) -> None:
+    """Each example damages one of the study's files; ``1.csv`` twice as often as the surface."""
+    names = ["study.toml", "study.toml", "1.csv", "1.csv", "tibia.stl"]
+    whole = {name: (study / name).read_bytes() for name in set(names)}
+
+    @settings(max_examples=examples, **SETTINGS)
+    @given(st.sampled_from(names), damage())
+    def run(name, changes):
+        (study / name).write_bytes(damaged(whole[name], changes))
+        try:
+            check(study, monkeypatch, capsys)
+        finally:
+            (study / name).write_bytes(whole[name])
+
+    run()
+
+
+@pytest.mark.slow
+def test_fifty_damaged_files(study, monkeypatch, capsys):
+    fuzz(study, monkeypatch, capsys, 50)
+
+
+@pytest.mark.slow
+def test_five_hundred_damaged_files(study, monkeypatch, capsys):
+    fuzz(study, monkeypatch, capsys, 500)
+
+
+@settings(max_examples=50, **SETTINGS)
+@given(damage())
+def test_damaged_study_files_are_read_or_refused(tmp_path_factory, changes):
+    folder = tmp_path_factory.mktemp("fuzz")
+    for name in ("skin.stl", "tibia.stl", "1.csv", "2.csv"):
+        (folder / name).touch()
+    text = (
+        '[study]\nname = "s"\n[surfaces]\nskin = "skin.stl"\n[[sites]]\nname = "1"\nfitted = true\n'
+        'trace = "1.csv"\nposition = [40.0, 0.0, 60.0]\n[solver]\nload_steps = 4\n'
+    )
+    (folder / "study.toml").write_bytes(damaged(text.encode(), changes))
+    with suppress(InputError):
+        load_study(folder)
+
+
+@pytest.mark.parametrize("name", ["study.toml", "1.csv", "skin.stl"])
+def test_fifty_megabytes_of_zeros(study, monkeypatch, capsys, name):
+    (study / name).write_bytes(bytes(50_000_000))
+    assert "error: " in check(study, monkeypatch, capsys)
+
+
+LAUGHS = (
+    b'<?xml version="1.0"?>\n<!DOCTYPE l [<!ENTITY a "ha">'
+    + b"".join(f'<!ENTITY {chr(98 + i)} "{f"&{chr(97 + i)};" * 10}">'.encode() for i in range(12))
+    + b']>\n<VTKFile type="PolyData"><PolyData>&m;</PolyData></VTKFile>'
+)
+
+
+def test_a_billion_laughs_in_a_surface(study, monkeypatch, capsys):
+    (study / "skin.vtp").write_bytes(LAUGHS)
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace("skin.stl", "skin.vtp"))
+    assert "error: " in check(study, monkeypatch, capsys)
+
+
+def test_deeply_nested_toml_is_refused(study, monkeypatch, capsys):
+    file = study / "study.toml"
+    file.write_text(file.read_text() + "\nx = " + "[" * 5000 + "]" * 5000)
+    assert "error: " in check(study, monkeypatch, capsys)
+
+
+def test_a_bomb_of_zeros_in_a_compressed_image(study, monkeypatch, capsys):
+    with gzip.open(study / "image.nii.gz", "wb", compresslevel=9) as stream:
+        for _ in range(100):
+            stream.write(bytes(1_000_000))
+    file = study / "study.toml"
+    text = file.read_text().replace('[surfaces]\nskin = "skin.stl"', '[image]\npath = "image.nii.gz"')
+    file.write_text(text.replace('bones = { tibia = "tibia.stl" }\n', ""))
+    assert "error: " in check(study, monkeypatch, capsys)
+
+
+def test_a_path_out_of_the_study_gives_away_nothing(study, monkeypatch, capsys):
+    secret = study.parent / "secret.txt"
+    secret.write_text("root:x:0:0:secret\n" * 20)
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace('"2.csv"', '"../secret.txt"'))
+    err = check(study, monkeypatch, capsys)
+    assert "error: " in err
+    assert "root:x" not in err
+
+
+@pytest.mark.parametrize("name", ["../../x", "a/b", "a\\u0000b", "\\u001b[2J", "", "x" * 300])
+def test_names_that_would_leave_the_folder_or_the_line_are_refused(study, monkeypatch, capsys, name):
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace('name = "1"', f'name = "{name}"'))
+    err = check(study, monkeypatch, capsys)
+    assert "sites.0.name" in err
+    assert "\x1b" not in err
+
+
+def quiet(event: Progress) -> None:
+    """A listener that does nothing."""
+
+
+def test_results_that_are_a_link_out_of_the_study_are_not_written(study, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (study / "results").symlink_to(elsewhere, target_is_directory=True)
+    with pytest.raises(RunError, match="is a link"):
+        run_study(load_study(study), until="surfaces", listener=quiet)
+    assert not os.listdir(elsewhere)
+
+
+def test_a_stage_that_is_a_link_is_replaced_and_its_target_left_alone(study, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "precious").write_text("kept")
+    (study / "results").mkdir()
+    (study / "results/traces").symlink_to(elsewhere, target_is_directory=True)
+    shutil.copyfile(study / "1.csv", study / "2.csv")
+    run_study(load_study(study), until="traces", listener=quiet)
+    assert (elsewhere / "precious").read_text() == "kept"
+    assert os.listdir(elsewhere) == ["precious"]
+    assert (study / "results/traces/traces.json").is_file()
