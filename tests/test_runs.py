@@ -15,6 +15,7 @@ import psutil
 import pytest
 
 from limbfit.errors import InputError, RunError
+from limbfit.execution import Limits, SerialExecutor, make_executor, sharing
 from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
 from limbfit.pipeline.doctor import squeeze_cube
 from limbfit.pipeline.journal import discreet
@@ -184,3 +185,36 @@ def test_a_run_killed_at_random_moments_ends_the_same(alone, tmp_path, kills):
     for file in ("traces/1.csv", "traces/2.csv", "sites/sites.json"):
         assert (alone / "results" / file).read_bytes() == (straight / "results" / file).read_bytes()
     assert not list((alone / "results").glob(".work-*"))
+
+
+SOLVER = """
+import sys, time
+from limbfit.cli.console import prompt_interrupt
+from limbfit.execution import ProcessExecutor
+with prompt_interrupt():
+    with ProcessExecutor(2) as executor:
+        list(executor.map(time.sleep, [0, 0], keys=["a", "b"]))
+        print("at work", flush=True)
+        if sys.argv[1] == "deaf":  # a library that does not come back
+            import signal
+            signal.signal(signal.SIGINT, lambda *_: None)
+        list(executor.map(time.sleep, [60, 60], keys=["a", "b"]))
+"""
+
+
+@pytest.mark.parametrize("how", ["hearing", "deaf"])
+def test_an_interrupt_ends_a_run_soon_even_where_nobody_listens(how):
+    run = subprocess.Popen(
+        [sys.executable, "-c", SOLVER, how], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert run.stdout.readline() == "at work\n"
+    run.send_signal(signal.SIGINT)
+    _, errors = run.communicate(timeout=30)
+    assert run.returncode != 0
+    assert "KeyboardInterrupt" in errors if how == "hearing" else "go on" in errors
+
+
+def test_a_lent_executor_takes_the_limits_of_whoever_uses_it():
+    with SerialExecutor() as executor, sharing(executor):
+        make_executor(limits=Limits(time_s=7.0))
+        assert executor.limits.time_s == 7.0

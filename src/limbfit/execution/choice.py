@@ -70,7 +70,7 @@ def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
     """
     shared, wanted = _shared.get(), _wanted.get() or Placement()
     if shared is not None:
-        return _Lent(shared)
+        return _Lent(shared, limits)
     if wanted.scheduler is not None:
         return DaskExecutor.at(wanted.scheduler, limits)
     count = (workers if wanted.workers is None else wanted.workers) or usable_cores()
@@ -80,10 +80,11 @@ def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
 
 
 class _Lent:
-    """Another's executor: leaving it does not end it."""
+    """Another's executor with limits of one's own: leaving it does not end it."""
 
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
+    def __init__(self, executor: Executor, limits: Limits) -> None:
+        self._executor, self.limits = executor, limits
+        executor.limits = limits
 
     @property
     def workers(self) -> int:

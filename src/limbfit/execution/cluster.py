@@ -47,7 +47,8 @@ def _guarded(function: Callable, job: Any, limits: Limits, contained: bool) -> A
     """A job in a process of its own on a Dask worker; ``contained``: the answer says why it was lost."""
     executor: ProcessExecutor | None = getattr(_own, "executor", None)
     if executor is None:
-        executor = _own.executor = ProcessExecutor(1, limits=limits)
+        executor = _own.executor = ProcessExecutor(1)
+    executor.limits = limits
     lost = (lambda _, reason: _Lost(reason)) if contained else None
     return next(executor.map(function, [job], lost=lost))
 

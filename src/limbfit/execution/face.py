@@ -36,6 +36,8 @@ NO_LIMITS = Limits()
 class Executor(Protocol):
     """Runs a function over jobs; use it as a context, which ends its workers."""
 
+    limits: Limits
+
     @property
     def workers(self) -> int:
         """How many jobs it does at a time."""
@@ -89,6 +91,7 @@ class SerialExecutor:
     """Runs jobs one after the other in this process, which no limit can end."""
 
     workers = 1
+    limits = NO_LIMITS
 
     def map(
         self,

@@ -28,7 +28,7 @@ def load_study(path: str | Path) -> Study:
         raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StudyError(f"not valid TOML: {error}", file=file) from None
     content = {key: value for key, value in content.items() if key not in ("file", "notes")}
     notes = _place_by_markups(content, file)
