@@ -36,11 +36,10 @@ def check(folder, monkeypatch, capsys) -> str:
     return err
 
 
-@st.composite
-def damage(draw):
+def damage():
     """A few changes of bytes: (where, how much goes, what comes), where as a share of the file."""
     one = st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=20) | st.sampled_from(WORDS))
-    return draw(st.lists(one, min_size=1, max_size=4))
+    return st.lists(one, min_size=1, max_size=4)
 
 
 WORDS = [

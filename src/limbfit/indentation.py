@@ -177,25 +177,57 @@ def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
     return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]
 
 
-_KEPT = 9  # problems and last results that a worker keeps: its share of the sites of one study
-_problems: OrderedDict[SiteModel, Problem] = OrderedDict()
-_last: OrderedDict[SiteModel, Result] = OrderedDict()
+_KEPT = 9  # sites that a worker keeps the discretisation of: its share of one study
+_REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}  # tissue that sets a site's contact penalty
+_REFERENCE_STEPS = 4  # to the deepest point
 
 
-def _keep(cache: OrderedDict, key: SiteModel, value: Any) -> Any:
-    cache[key] = value
-    cache.move_to_end(key)
-    while len(cache) > _KEPT:
-        cache.popitem(last=False)
-    return value
+@dataclass(frozen=True)
+class Prepared:
+    """What all simulations of a site share, and nothing that depends on which of them came first.
+
+    ``reference`` is a simulation with reference tissue, without its states: it holds the discretisation.
+    ``penalty`` is that of contact; None where the solver is to find it.
+    """
+
+    problem: Problem
+    reference: Result
+    penalty: float | None
 
 
-def _problem(model: SiteModel, parameters: Parameters) -> Problem:
-    """The site's problem; discretisation and warm start stay valid while only the materials change."""
-    known = _problems.get(model)
+_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...]], Prepared] = OrderedDict()
+
+
+def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
+    """The site's discretisation and contact penalty.
+
+    A penalty that each simulation found for itself would change in steps with the parameters, and the force
+    by a percent with it; one taken over from the simulation before makes the answer depend on what that was.
+    So it is the one that reference tissue needs at the deepest point; simulations that need more raise it.
+    """
+    known = _prepared.get((model, tissues))
     if known is None:
-        known = _keep(_problems, model, build_problem(model, read_vtu(model.mesh), parameters))
-    return known.with_materials(materials(parameters, model.kappa_ratio))
+        problem = build_problem(model, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
+        control, deepest = steps_of(model), problem.history.peak or float(problem.history.times[-1])
+        times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
+        found = solve(problem, steps=replace(control, times=times), store="peak")
+        penalty = found.states[0].penalty if found.completed and found.states else control.penalty
+        known = _prepared[model, tissues] = Prepared(problem, replace(found, states=()), penalty)
+    _prepared.move_to_end((model, tissues))
+    while len(_prepared) > _KEPT:
+        _prepared.popitem(last=False)
+    return known
+
+
+def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
+    """Simulate a site with what is prepared for it: the same answer, whatever was simulated before."""
+    known = _prepare(model, tuple(parameters))
+    return solve(
+        known.problem.with_materials(materials(parameters, model.kappa_ratio)),
+        steps=replace(steps_of(model), penalty=known.penalty),
+        warm_start=known.reference,
+        **how,
+    )
 
 
 def steps_of(model: SiteModel) -> StepControl:
@@ -210,18 +242,10 @@ def steps_of(model: SiteModel) -> StepControl:
 def simulate(job: SimulationJob) -> Simulation:
     """Simulate a job; a failure is a result with a reason, never an exception.
 
-    The last simulation of the same site in this process gives the first guesses.
+    The answer depends on the job alone: not on the process, nor on what it simulated before.
     """
-    model = job.model
-    result = solve(
-        _problem(model, to_parameters(np.array(job.parameters), job.tissues)),
-        steps=steps_of(model),
-        sensitivities=job.sensitivities,
-        warm_start=_last.get(model),
-        store="all",
-    )
-    if result.completed:
-        _keep(_last, model, result)
+    model, parameters = job.model, to_parameters(np.array(job.parameters), job.tissues)
+    result = _solve(model, parameters, sensitivities=job.sensitivities, store="peak")
     times = np.array(job.times_s)
     return Simulation(
         site=model.name,
@@ -243,17 +267,13 @@ def simulate_fields(
     With ``animation`` (a ``.pvd``) the fields of every step are stored too.  A simulation that fails in its
     first step has no fields at its deepest point, and ``file`` is not written.
     """
-    problem = _problem(model, parameters)
-    frames = None if animation is None else Animation(problem, animation)
-    result = solve(
-        problem,
-        steps=steps_of(model),
-        warm_start=_last.get(model),
-        on_step=None if frames is None else frames.add,
-        store="peak",
-    )
+    frames = None
+    if animation is not None:
+        prepared = _prepare(model, tuple(parameters)).problem
+        frames = Animation(prepared.with_materials(materials(parameters, model.kappa_ratio)), animation)
+    result = _solve(model, parameters, on_step=None if frames is None else frames.add, store="peak")
     if result.states:
-        write_fields(result.system, problem, result.states[0], file)
+        write_fields(result.system, result.problem, result.states[0], file)
     return result
 
 

@@ -1,0 +1,56 @@
+"""A simulation's answer depends on its job alone: not on the order, the executor or the number of workers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from layered import block_model, layered_block
+from limbfit.execution import ProcessExecutor, SerialExecutor
+from limbfit.indentation import SimulationJob, simulate
+from limbfit.study import SolverTable
+
+TISSUES = ("skin", "muscle")
+PARAMETERS = (
+    (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 1.0, 1.0),
+    (4.2, 6.0, 1.5, 0.8, 4.2, 6.0, 1.5, 0.8),
+    (8.8, 6.0, 2.0, 0.6, 4.45, 4.55, 2.95, 0.31),
+)
+
+
+@pytest.fixture(scope="module")
+def jobs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("blocks")
+    steps = SolverTable(load_steps=5, unload_steps=3)
+    mesh = layered_block((3.0, 12.0), TISSUES)
+    models = [
+        block_model(name, folder / f"{name}.vtu", mesh, depth, steps) for name, depth in (("a", 4), ("b", 5))
+    ]
+    times = tuple(np.linspace(0.0, models[0].knots_s[-1], 21))
+    return [SimulationJob(model, TISSUES, p, times) for p in PARAMETERS for model in models]
+
+
+def assert_equal(found, wanted):
+    for one, other in zip(found, wanted, strict=True):
+        assert one.completed
+        assert np.array_equal(one.force_N, other.force_N)
+        assert np.array_equal(one.jacobian, other.jacobian)
+
+
+def test_the_order_of_simulations_changes_nothing(jobs):
+    forwards = [simulate(job) for job in jobs]
+    backwards = [simulate(job) for job in jobs[::-1]]
+    assert_equal(forwards, backwards[::-1])
+
+
+@pytest.mark.slow
+def test_executors_and_numbers_of_workers_give_the_same_bits(jobs):
+    keys = [job.model.name for job in jobs]
+    found = []
+    for executor in (SerialExecutor(), ProcessExecutor(1), ProcessExecutor(2)):
+        with executor:
+            found.append(list(executor.map(simulate, jobs, keys=keys)))
+    with ProcessExecutor(2) as executor:
+        found.append(list(executor.map(simulate, jobs[::-1]))[::-1])
+    for other in found[1:]:
+        assert_equal(other, found[0])
