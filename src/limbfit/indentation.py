@@ -180,6 +180,7 @@ def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
 _KEPT = 9  # sites that a worker keeps the discretisation of: its share of one study
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}  # tissue that sets a site's contact penalty
 _REFERENCE_STEPS = 4  # to the deepest point
+_MARGIN = 0.3  # of the penetration that is allowed: few other tissues then need a larger penalty
 
 
 @dataclass(frozen=True)
@@ -210,8 +211,11 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         problem = build_problem(model, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
         control, deepest = steps_of(model), problem.history.peak or float(problem.history.times[-1])
         times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
-        found = solve(problem, steps=replace(control, times=times), store="peak")
-        penalty = found.states[0].penalty if found.completed and found.states else control.penalty
+        control = replace(control, times=times, penetration=_MARGIN * control.penetration)
+        found = solve(problem, steps=control, store="peak")
+        penalty = control.penalty
+        if penalty is None and found.completed and found.states:
+            penalty = found.states[0].penalty
         known = _prepared[model, tissues] = Prepared(problem, replace(found, states=()), penalty)
     _prepared.move_to_end((model, tissues))
     while len(_prepared) > _KEPT:
