@@ -81,7 +81,10 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path):
         text=True,
     )
     assert holder.stdout.readline().strip() == "held"
-    with pytest.raises(RunError, match=rf"process {holder.pid} \(since .* UTC\) is running.*kill"), lock(tmp_path):
+    with (
+        pytest.raises(RunError, match=rf"process {holder.pid} \(since .* UTC\).*kill"),
+        lock(tmp_path),
+    ):
         pass
     holder.kill()
     holder.wait()
