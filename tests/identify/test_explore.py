@@ -31,10 +31,10 @@ def test_an_exploration_spends_its_runs_and_holds_the_truth():
         return [simulate(p) for p in points]
 
     earlier = [np.array(i.parameters) for i in found.history]
-    settings = ExploreSettings(runs=8, batch=4, steps=600, checked=1)
+    settings = ExploreSettings(runs=24, batch=4, steps=600, checked=1)
     done = explore(many, data, PAPER, SPACE, known, earlier, settings)
     # A check asks for the optimum and two ends of a profile.
-    assert len(asked) <= len(earlier) + 8 + 3
+    assert len(asked) <= len(earlier) + 24 + 3
     assert done.good_enough
     assert max(done.rounds[-1].error_percent) < min(done.needed_percent)
     inside = [low < true < high for true, (low, high) in zip(TRUTH, done.posterior.intervals_95)]

@@ -30,17 +30,14 @@ def fitted(data, run=simulate):
 
 
 def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER):
-    """Uncertainty at the truth, without the nonlinear part: one Gauss-Newton step from there.
-
-    Also how far its most probable parameters are from the truth, in logarithms.
-    """
+    """How far one Gauss-Newton step from the truth goes, in logarithms, and the uncertainty there."""
     responses = [site.respond(truth) for site in sites]
     J = np.concatenate([r.jacobian * truth * d.scale for r, d in zip(responses, data)])
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
     found = estimate_uncertainty(truth, moved, data, unknowns)
-    return step + np.log(found.centre / truth), found
+    return step, found
 
 
 def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER):

@@ -75,7 +75,7 @@ def coverage_study(
         start = unknowns.from_start(truth * np.exp(off_truth))
         found = calibrate(simulate, measured, start, settings, stages=(separate(unknowns.names),))
         u = estimate_uncertainty(found.parameters, found.responses, measured, unknowns, noise)
-        off = np.log(u.centre / truth)
+        off = np.log(found.parameters / truth)
         deviations.append([c.weights @ off / np.log(c.factor_95) for c in u.combinations])
         determined.append([c.verdict == DETERMINED for c in u.combinations])
         low, high = u.intervals_95.T

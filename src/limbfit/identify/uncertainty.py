@@ -1,11 +1,12 @@
 """What the data tell about the parameters, and what they do not.
 
 Linearised at the answer, in logarithms of the parameters. The residuals have one covariance C, noise of the
-records plus misfit of the model (``noise``, ``discrepancy``); what is most probable under it lies one
-generalised least-squares step from the calibrated parameters, with covariance ``(J' C^-1 J + P)^-1``. P is
-what the bounds say, the spread of a uniform distribution between them, and what stated priors say: where the
-data are silent, that is all that is known, and the interval says so. The size of the misfit is itself
-estimated from few independent residuals, so intervals take Student's quantiles (Satterthwaite 1946).
+records plus misfit of the model (``noise``, ``discrepancy``), and the covariance is that of the calibration's
+own least squares under C. What is most probable under C lies one generalised least-squares step away; where
+that step is longer than C explains, the rest of it is one more deviation. P is what the bounds say, the
+spread of a uniform distribution between them, and what stated priors say: where the data are silent, that is
+all that is known, and the interval says so. The size of the misfit is itself estimated from few independent
+residuals, so intervals take Student's quantiles (Satterthwaite 1946).
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Uncertainty:
     """Linearised uncertainty at the answer.
 
     ``centre`` (p,) are the most probable parameters; ``covariance`` and ``correlation`` (p, p) are of the
-    logarithms; ``intervals_95`` (p, 2) are of the parameters, around the centre and kept between the bounds;
+    logarithms; ``intervals_95`` (p, 2) are of the parameters, around them and kept between the bounds;
     ``degrees_of_freedom`` (p,) belong to them. ``combinations`` are the principal axes of the covariance, the
     best known first.
     """
@@ -131,7 +132,8 @@ def estimate_uncertainty(
     prior = Beliefs.of(unknowns, space)
     peaks = np.array([site.force_N.max() for site in measured])
     model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision)
-    linear = _Linear.at(left, scaled, model, prior, z)
+    weights = [site.scale**2 for site in measured]
+    linear = _Linear.at(left, scaled, weights, model, prior, space, z)
     return _told(np.asarray(parameters), linear, model, unknowns, space, prior)
 
 
@@ -157,8 +159,14 @@ class Beliefs:
 
 @dataclass(frozen=True)
 class _Linear:
-    """Generalised least squares: ``centre`` (k,), ``covariance``, and the part of it that misfit causes."""
+    """Covariance about the calibrated ``z`` (k,), and the part of it that misfit causes.
 
+    The calibration weighs all points alike, generalised least squares by noise and misfit; ``centre`` (k,) is
+    where the latter would go. Where the two are farther apart than noise and misfit explain, the rest counts
+    as one more deviation: intervals must not say more than two readings of the same residuals agree on.
+    """
+
+    z: Array
     centre: Array
     covariance: Array
     by_misfit: Array
@@ -166,19 +174,34 @@ class _Linear:
 
     @classmethod
     def at(
-        cls, left: Sequence[Array], scaled: Sequence[Array], model: ResidualModel, prior: Beliefs, z: Array
+        cls,
+        left: Sequence[Array],
+        scaled: Sequence[Array],
+        weights: Sequence[float],
+        model: ResidualModel,
+        prior: Beliefs,
+        space: Space,
+        z: Array,
     ) -> _Linear:
+        """From residuals (n,), derivatives (n, k) and the calibration's weight of every site."""
         A, g = prior.precision.copy(), prior.rows.T @ (prior.rows @ z - prior.target)
-        by_misfit = np.zeros_like(A)
-        for i, (r, J) in enumerate(zip(left, scaled)):
+        H, M, by_misfit = np.zeros_like(A), np.zeros_like(A), np.zeros_like(A)
+        for i, (r, J, w) in enumerate(zip(left, scaled, weights)):
             weighted = np.linalg.solve(model.covariance(i), J)
             A += J.T @ weighted
             g += weighted.T @ r
-            by_misfit += weighted.T @ model.discrepancy(i) @ weighted
-        covariance = np.linalg.inv(A)
-        covariance = (covariance + covariance.T) / 2
-        caused = covariance @ by_misfit @ covariance
-        return cls(z - covariance @ g, covariance, caused, model.known_scale)
+            H += w * J.T @ J
+            M += w**2 * J.T @ model.covariance(i) @ J
+            by_misfit += w**2 * J.T @ model.discrepancy(i) @ J
+        best = np.linalg.inv(A)  # the least covariance that any weights reach
+        spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
+        inverse = np.linalg.inv(H / spread + prior.precision)
+        covariance = inverse @ (M / spread**2 + prior.precision) @ inverse
+        caused = inverse @ (by_misfit / spread**2) @ inverse
+        centre = np.clip(z - best @ g, space.lower, space.upper)
+        apart = _unexplained(centre - z, covariance - best)
+        total = covariance + apart
+        return cls(z, centre, (total + total.T) / 2, caused + apart, model.known_scale)
 
     def freedom(self, weights: Array) -> float:
         """Degrees of freedom of the variance of ``weights @ z`` (Satterthwaite 1946)."""
@@ -195,15 +218,23 @@ class _Linear:
         return float(min(stdtrit(self.freedom(weights), 0.975) * self.sd(weights), 50.0))
 
 
+def _unexplained(step: Array, expected: Array) -> Array:
+    """The part (k, k) of the square of a step (k,) beyond the covariance that is ``expected`` of it."""
+    values, vectors = np.linalg.eigh((expected + expected.T) / 2)
+    values = np.maximum(values, 1e-3 * max(float(values[-1]), 1e-30))
+    ratio = float(np.mean((vectors.T @ step) ** 2 / values))
+    return np.outer(step, step) * max(1.0 - 1.0 / max(ratio, 1e-30), 0.0)
+
+
 def _told(
     parameters: Array, linear: _Linear, model: ResidualModel, unknowns: Unknowns, space: Space, prior: Beliefs
 ) -> Uncertainty:
     """The answer in the search space as an answer about every parameter."""
     moved = np.asarray(space.tie.any(axis=1))
-    centre = space.logarithms(np.clip(linear.centre, space.lower, space.upper))
+    middle = space.logarithms(linear.z)
     half = np.array([linear.half_width(row) for row in space.tie])
-    low = np.maximum(np.exp(centre - half), np.where(moved, unknowns.lower, 0.0))
-    high = np.minimum(np.exp(centre + half), np.where(moved, unknowns.upper, np.inf))
+    low = np.maximum(np.exp(middle - half), np.where(moved, unknowns.lower, 0.0))
+    high = np.minimum(np.exp(middle + half), np.where(moved, unknowns.upper, np.inf))
     shares = [linear.sd(row) / max(float(row @ prior.sd), 1e-300) for row in space.tie]
     verdicts = [
         verdict_of(float(np.exp(h)), share) if free else GIVEN for h, share, free in zip(half, shares, moved)
@@ -213,7 +244,7 @@ def _told(
     return Uncertainty(
         names=unknowns.names,
         parameters=parameters,
-        centre=np.exp(centre),
+        centre=np.exp(space.logarithms(linear.centre)),
         covariance=covariance,
         correlation=covariance / np.outer(sd, sd),
         intervals_95=np.stack([low, high], axis=1),

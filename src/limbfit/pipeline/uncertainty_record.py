@@ -273,8 +273,8 @@ def _verdict(
     ]
     if beyond:
         words.append(
-            f"The calibrated value lies outside its own interval: {', '.join(beyond)}; the calibration "
-            "weighs all points of a record alike, the interval by noise and misfit."
+            f"The calibrated value lies outside its sampled interval: {', '.join(beyond)}; the calibration "
+            "weighs all points of a record alike, the sampled interval by noise and misfit."
         )
     if found.evidence is not None:
         words.append(found.evidence.verdict[0].upper() + found.evidence.verdict[1:] + ".")

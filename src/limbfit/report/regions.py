@@ -75,7 +75,7 @@ def _parameter_table(store: Store, content: Json) -> Table:
     caption = (
         "Table 3. Parameters of each region beside those of the whole limb, with 95 % intervals in brackets. "
         "In the heads: the region's sites, those that it was fitted on marked by *. Intervals surround what "
-        "is most probable under the model of the residuals; a fit that has not converged may lie outside."
+        "was found."
     )
     return Table("regions", caption, head, rows)
 
