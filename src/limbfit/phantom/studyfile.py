@@ -45,6 +45,9 @@ edge_far_mm = 30.0
 near_radius_mm = 12.0
 growth = 0.9
 flatness = 1.6
+
+[calibration]
+relative_tolerance = 0.01   # forces of meshes this coarse are off by more than a finer search could tell
 """,
     "paper": "",
 }
