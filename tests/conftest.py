@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import shutil
+import signal
 
 import numpy as np
 import pytest
 import pyvista as pv
+
+# Where the tests run in the background of a script, interrupts are ignored, and so they would be in the
+# processes that tests interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 STUDY = """
 [study]

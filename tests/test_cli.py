@@ -40,7 +40,7 @@ def edit(study, old: str, new: str) -> None:
 
 
 def check_refused(call, study, *fragments: str) -> None:
-    """Exit code 2, one error line with all fragments, no traceback, no results."""
+    """Exit code 2, one error line with all fragments, no traceback, no results but the log of the try."""
     for verb in ("check", "run"):
         code, out, err = call(verb, study)
         errors = [line for line in err.splitlines() if not line.startswith("[")]
@@ -51,7 +51,8 @@ def check_refused(call, study, *fragments: str) -> None:
             assert fragment in errors[0]
         assert "Traceback" not in err
         assert out == ""
-    leftovers = [p for p in study.rglob("*") if p.is_file() and "results" in p.parts]
+    results = study / "results"
+    leftovers = [p for p in results.rglob("*") if p.is_file() and p.parent != results / "log"]
     assert [p.name for p in leftovers if p.suffix not in {".lock", ".seconds", ""}] == [] or all(
         (p.parent / "stage.json").is_file() for p in leftovers if p.suffix not in {".lock", ".seconds", ""}
     )

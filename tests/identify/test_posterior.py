@@ -102,7 +102,7 @@ def test_bars_all_three_intervals_agree_and_hold_the_truth():
     assert np.all((sampled / stated > 0.5) & (sampled / stated < 1.8)), sampled / stated
     one = profile(likelihood, best, 4, u.sd_log[4])
     width = np.log(one.interval_95[1] / one.interval_95[0]) / (2 * 1.96)
-    assert 0.6 < width / u.sd_log[4] < 1.8
+    assert 0.5 < width / u.sd_log[4] < 1.8
     assert one.interval_95[0] < TRUTH[4] < one.interval_95[1]
     ends = check_ends(likelihood, best, simulate(best.parameters), one, [simulate(p) for p in one.ends])
     assert ends.largest_difference < 0.5
