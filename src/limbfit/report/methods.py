@@ -350,11 +350,12 @@ def _prediction(store: Store) -> str:
 
 def _experiments(store: Store) -> str:
     rows = store.run.get("experiments") or {}
-    done = [
-        name + (f" ({words})" if (words := _pairs(rows[name].get("options") or {})) else "")
-        for name in store.experiments
-        if name in rows
-    ]
+    done = []
+    for name in store.experiments:
+        if name in rows:
+            # What is nested (the parameters of a design) stands in the experiment's own record.
+            plain = {k: v for k, v in (rows[name].get("options") or {}).items() if not isinstance(v, dict)}
+            done.append(name + (f" ({_pairs(plain)})" if plain else ""))
     return f"Done beside the identification, with their options: {', '.join(done)}." if done else ""
 
 
