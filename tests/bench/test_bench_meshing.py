@@ -32,6 +32,7 @@ def test_sites_lie_on_the_skin_and_look_in(anatomy: Anatomy) -> None:
         assert anatomy.skin.vertex_normals[nearest] @ axis < -0.5
 
 
+@pytest.mark.slow
 def test_meshes_are_measured(anatomy: Anatomy) -> None:
     found = bench_meshing(sites=1, settings=COARSE, tell=silent, makers={"one": lambda: anatomy})
     assert (found["sites"], found["failures"], found["failed"]) == (1, 0, [])

@@ -75,6 +75,7 @@ def test_intervals_of_three_tissues_cover_the_truth_with_four_sites():
     assert shares.mean() < 0.995
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth_where_the_model_is_wrong():
     shares = coverage(smooth_misfit, repeats=100)
     assert np.all(shares > 0.86), shares
@@ -115,6 +116,7 @@ def test_uninformative_data_flip_the_verdict():
     assert said[2].count(UNDETERMINED) >= 6
 
 
+@pytest.mark.slow
 def test_intervals_still_cover_where_the_noise_drifts():
     def drifting(rng, n):
         noise = np.zeros(n)
