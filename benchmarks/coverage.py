@@ -31,11 +31,11 @@ from limbfit.identify import Measured, SiteNoise, record_noise
 from limbfit.identify.coverage import Coverage, coverage_study
 from limbfit.identify.noise import loading_slope
 from limbfit.phantom.record import RATE_HZ
-from limbfit.pipeline.calibrate_stage import unknowns
 from limbfit.pipeline.context import Context
-from limbfit.pipeline.emulator_file import EMULATOR, read_emulator
+from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
+from limbfit.pipeline.stages.calibrate import unknowns
+from limbfit.pipeline.stages.traces import SiteRecord, site_record
 from limbfit.pipeline.store import Store
-from limbfit.pipeline.traces_stage import SiteRecord, site_record
 from limbfit.traces import TouchDown, Trace, regularise
 
 Array = NDArray[np.float64]

@@ -18,8 +18,8 @@ from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.context import Context
 from limbfit.pipeline.simulations import COARSE
+from limbfit.pipeline.stages.traces import run_traces
 from limbfit.pipeline.store import Store, write_json
-from limbfit.pipeline.traces_stage import run_traces
 from limbfit.study import SolverTable, Study
 
 TISSUES = ("skin", "fat", "muscle")

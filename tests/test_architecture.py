@@ -17,11 +17,14 @@ FLOORS = [
     {"report", "phantom"},
     {"indentation"},
     {"study", "febio", "fields"},
-    {"identify", "execution", "traces", "anatomy", "fe"},
+    {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh"},
     {"errors", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
+# The pipeline's own floors: its verbs stand in the folder itself above its rooms, what all share below them.
+INNER_FLOORS = ["experiments", "stages", "shared"]
+SHARED = {"causes", "context", "corrections", "keys", "provenance", "simulations", "store", "tabular"}
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
 
 
@@ -77,6 +80,23 @@ def test_arrows_point_down():
         for target, line, _ in imports(path):
             there = room_of(target)
             if there in HEIGHT and there != here and HEIGHT[there] >= HEIGHT[here]:
+                wrong.append(f"{path.relative_to(PACKAGE)}:{line} imports {target}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_arrows_point_down_inside_the_pipeline():
+    def floor(module: str) -> int:
+        room = module.split(".")[2]
+        name = "shared" if room in SHARED else room
+        return -1 - INNER_FLOORS.index(name) if name in INNER_FLOORS else 0
+
+    wrong = []
+    for path in files():
+        here = module_name(path)
+        if not here.startswith("limbfit.pipeline."):
+            continue
+        for target, line, _ in imports(path):
+            if target.startswith("limbfit.pipeline.") and floor(target) > floor(here):
                 wrong.append(f"{path.relative_to(PACKAGE)}:{line} imports {target}")
     assert not wrong, "\n".join(wrong)
 

@@ -13,9 +13,9 @@ from layered import store_blocks
 from limbfit.errors import StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import to_vector
-from limbfit.pipeline.calibrate_stage import groupings, run_calibrate
 from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.predict_stage import run_predict
+from limbfit.pipeline.stages.calibrate import groupings, run_calibrate
+from limbfit.pipeline.stages.predict import run_predict
 from limbfit.pipeline.store import Store
 from limbfit.study import Study, load_study
 

@@ -10,8 +10,8 @@ from scipy.integrate import quad
 
 from limbfit import compress_cube
 from limbfit.errors import InputError
-from limbfit.pipeline.cube import _times, compress
-from limbfit.pipeline.published import KPA, PUBLISHED
+from limbfit.pipeline.experiments.cube import _times, compress
+from limbfit.pipeline.experiments.published import KPA, PUBLISHED
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 MUSCLE = {"c_kPa": 4.0, "m": 4.0, "gamma": 3.0, "tau_s": 0.3}

@@ -8,9 +8,11 @@ import pytest
 
 from limbfit import run_experiment
 from limbfit.errors import InputError
-from limbfit.pipeline import Progress, experiments, study_status
-from limbfit.pipeline.experiments import EXPERIMENTS, Experiment
-from limbfit.pipeline.run import keys
+from limbfit.pipeline import Progress, study_status
+from limbfit.pipeline.experiments import catalogue
+from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment
+from limbfit.pipeline.provenance import code_digest
+from limbfit.pipeline.run import STAGES, keys
 from limbfit.pipeline.store import write_json
 from limbfit.study import load_study
 
@@ -42,7 +44,7 @@ PEAKS = Experiment(
 
 @pytest.fixture(autouse=True)
 def peaks(monkeypatch):
-    monkeypatch.setattr(experiments, "EXPERIMENTS", (PEAKS,))
+    monkeypatch.setattr(catalogue, "EXPERIMENTS", (PEAKS,))
 
 
 def state(study, name: str = "peaks") -> str:
@@ -100,7 +102,7 @@ def test_the_report_is_stale_once_there_is_an_experiment_to_show(study):
 
 def test_an_experiment_changes_when_its_code_does(study, monkeypatch):
     run_experiment(load_study(study), "peaks", listener=quiet)
-    monkeypatch.setattr(experiments, "EXPERIMENTS", (replace(PEAKS, rooms=("errors", "mesh")),))
+    monkeypatch.setattr(catalogue, "EXPERIMENTS", (replace(PEAKS, rooms=("errors", "mesh")),))
     assert state(study) == "stale"
 
 
@@ -116,3 +118,8 @@ def test_names_are_folders_that_do_not_shadow_each_other():
     names = [experiment.name for experiment in EXPERIMENTS]
     assert len(set(names)) == len(names)
     assert not [(a, b) for a in names for b in names if b.startswith(f"{a}-")]
+
+
+def test_the_code_that_decides_stages_and_experiments_is_there():
+    for stage in (*STAGES, *EXPERIMENTS):
+        assert code_digest(stage.rooms)

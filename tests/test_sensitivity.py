@@ -9,11 +9,17 @@ from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
 from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.refinement import richardson
-from limbfit.pipeline.sensitivity import other_indenters, run_contact, run_indenter, run_kappa, run_stiffness
+from limbfit.pipeline.experiments.refinement import richardson
+from limbfit.pipeline.experiments.sensitivity import (
+    other_indenters,
+    run_contact,
+    run_indenter,
+    run_kappa,
+    run_stiffness,
+)
+from limbfit.pipeline.experiments.variants import choose_sites
+from limbfit.pipeline.experiments.volumes import volume_facts
 from limbfit.pipeline.store import Store, read_json, write_json
-from limbfit.pipeline.variants import choose_sites
-from limbfit.pipeline.volumes import volume_facts
 from limbfit.study import IndenterTable, load_study
 
 SETTINGS = """

@@ -14,10 +14,10 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify import Unknowns, separate, shared, two_stages
 from limbfit.indentation import SimulationJob, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.calibrate_stage import run_calibrate, unknowns
 from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.predict_stage import run_predict
 from limbfit.pipeline.run import keys
+from limbfit.pipeline.stages.calibrate import run_calibrate, unknowns
+from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report import build_report
 from limbfit.study import PARAMETERS, SolverTable, Study, load_study
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit import run_experiment
-from limbfit.pipeline.emulator_file import EMULATOR, read_emulator
+from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.report import build_report
 from limbfit.study import load_study
 

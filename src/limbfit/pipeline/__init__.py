@@ -13,7 +13,7 @@ _HOME = {
     "bench_calibrate": "calibration_bench",
     "check_study": "check",
     "compare_site": "compare",
-    "compress_cube": "cube",
+    "compress_cube": "experiments.cube",
     "design_study": "planning",
     "diagnose": "doctor",
     "export_study": "export",

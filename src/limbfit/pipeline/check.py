@@ -11,12 +11,12 @@ from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..indentation import read_indenter
 from ..study import Study
 from .context import Listener, Progress
-from .geometry_stages import given_anatomy, place_site
-from .inputs import marked_image, study_image, study_labels
-from .plausible import record_flags
 from .run import keys
+from .stages.geometry import given_anatomy, place_site
+from .stages.inputs import marked_image, study_image, study_labels
+from .stages.plausible import record_flags
+from .stages.traces import read_site_trace
 from .store import Store
-from .traces_stage import read_site_trace
 
 
 def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:

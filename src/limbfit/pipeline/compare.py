@@ -18,8 +18,8 @@ from ..indentation import Parameters, steps_of
 from ..study import Study
 from .context import Listener
 from .simulate import Indentation, prepare_site, run_febio_site, site_problem
+from .stages.traces import write_curves
 from .store import write_json
-from .traces_stage import write_curves
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from ..fe import OgdenQLV
 from ..fe.linear import SOLVERS, linear_solver
 from ..febio.program import find_febio
 from ..indentation import KPA
-from .cube import RAMP_S, compress
+from .experiments.cube import RAMP_S, compress
 from .provenance import machine, versions
 
 NEEDED_GB = 4.0  # of memory, for one site at the paper's size

@@ -12,7 +12,7 @@ from ..indentation import KPA, Parameters
 from ..study import Site, Study
 from .context import Listener
 from .simulate import Indentation, feb_settings, prepare_site, site_problem
-from .traces_stage import site_record
+from .stages.traces import site_record
 
 FORMATS = ("feb", "febio-optimize", "inp", "calculix")
 _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}

@@ -17,8 +17,8 @@ from .context import Listener
 from .corrections import hand_labels
 from .provenance import input_digests, settings_record, versions
 from .run import run_study
+from .stages.traces import read_curves
 from .store import Store, read_json
-from .traces_stage import read_curves
 
 TOLERANCE = 1e-6  # of a parameter, and of the largest force of a site, relative
 RECORD = "run.json"

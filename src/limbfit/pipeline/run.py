@@ -8,19 +8,19 @@ from typing import Any
 from .. import __version__
 from ..errors import InputError
 from ..study import Study
-from .calibrate_stage import run_calibrate
 from .causes import causes, parts_of
 from .context import Context, Listener, executor_of
 from .corrections import keep_corrections
-from .experiments import do_experiment, experiment_key, experiment_rows, find_experiment, options_of
-from .geometry_stages import run_mesh, run_segment, run_sites, run_surfaces
+from .experiments.catalogue import do_experiment, experiment_key, experiment_rows, find_experiment, options_of
 from .journal import journal
 from .keys import Keys, Stage
-from .predict_stage import run_predict
 from .provenance import input_digests, machine, settings_record, versions
-from .report_stage import run_report
+from .stages.calibrate import run_calibrate
+from .stages.geometry import run_mesh, run_segment, run_sites, run_surfaces
+from .stages.predict import run_predict
+from .stages.report import run_report
+from .stages.traces import run_traces
 from .store import Store, lock, write_json
-from .traces_stage import run_traces
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
 _UNSEEN: dict[str, Any] = {"region": "", "trace": None, "axis": None, "edge": None}
@@ -29,23 +29,36 @@ _IDENTIFY = (
     *("uncertainty", "noise", "discrepancy"),
 )
 _MECHANICS = (
-    *("fe", "indentation", "mesh", "pipeline/simulations", "pipeline/traces_stage", "pipeline/record_noise"),
+    *(
+        "fe",
+        "indentation",
+        "mesh",
+        "pipeline/simulations",
+        "pipeline/stages/traces",
+        "pipeline/stages/record_noise",
+    ),
     *(f"identify/{name}" for name in _IDENTIFY),
 )
-_DOUBTS = ("identify/outliers", "identify/plausibility", "pipeline/outliers", "pipeline/plausible")
+_DOUBTS = (
+    "identify/outliers",
+    "identify/plausibility",
+    "pipeline/stages/outliers",
+    "pipeline/stages/plausible",
+)
+_GEOMETRY = ("anatomy", "pipeline/stages/geometry", "pipeline/stages/inputs", "pipeline/stages/marked_images")
 STAGES = (
-    Stage("segment", run_segment, (), ("image", "segmentation"), rooms=("anatomy",)),
-    Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=("anatomy",)),
-    Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE, ("anatomy",)),
-    Stage("traces", run_traces, (), ("traces",), ("name", "trace"), ("traces",)),
-    Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",), ("anatomy", "mesh")),
+    Stage("segment", run_segment, (), ("image", "segmentation"), rooms=_GEOMETRY),
+    Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=_GEOMETRY),
+    Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE, _GEOMETRY),
+    Stage("traces", run_traces, (), ("traces",), ("name", "trace"), ("traces", "pipeline/stages/traces")),
+    Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",), (*_GEOMETRY, "mesh")),
     Stage(
         "calibrate",
         run_calibrate,
         ("sites", "traces", "mesh"),
         ("material", "calibration", "solver", "indenter"),
         ("name", "fitted", "weight", "edge"),
-        (*_MECHANICS, "pipeline/calibrate_stage"),
+        (*_MECHANICS, "pipeline/stages/calibrate"),
     ),
     Stage(
         "predict",
@@ -53,7 +66,7 @@ STAGES = (
         ("sites", "traces", "mesh", "calibrate"),
         (),
         ("name", "edge"),
-        (*_MECHANICS, *_DOUBTS, "pipeline/predict_stage", "fields"),
+        (*_MECHANICS, *_DOUBTS, "pipeline/stages/predict", "fields"),
     ),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region"), ("report", "pipeline")),
 )

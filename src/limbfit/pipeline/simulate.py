@@ -18,8 +18,8 @@ from ..study import Site, Study
 from .context import Context, Listener
 from .run import keys, run_study
 from .simulations import CURVE_POINTS, planned_model, recorded_model
+from .stages.traces import write_curves
 from .store import Store, write_json
-from .traces_stage import write_curves
 
 FEB_NAME, FORCES = "model.feb", "forces.txt"
 

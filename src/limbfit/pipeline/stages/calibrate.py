@@ -9,21 +9,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StudyError
-from ..identify.calibration import Calibration, CalibrationSettings, State, calibrate
-from ..identify.fidelity import FidelitySettings, Round, calibrate_corrected
-from ..identify.multistart import Multistart, describe, multistart
-from ..identify.objective import Measured, SiteResponse
-from ..identify.parameters import Grouping, Prior, Unknowns, constrained, two_stages
-from ..identify.uncertainty import Uncertainty, estimate_uncertainty
-from ..indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
-from ..study import Site, Study
-from .context import Context
+from ...errors import StudyError
+from ...identify.calibration import Calibration, CalibrationSettings, State, calibrate
+from ...identify.fidelity import FidelitySettings, Round, calibrate_corrected
+from ...identify.multistart import Multistart, describe, multistart
+from ...identify.objective import Measured, SiteResponse
+from ...identify.parameters import Grouping, Prior, Unknowns, constrained, two_stages
+from ...identify.uncertainty import Uncertainty, estimate_uncertainty
+from ...indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
+from ...study import Site, Study
+from ..context import Context
+from ..simulations import SimulationCache
+from ..store import write_json
 from .plausible import stored_flags
 from .record_noise import site_noise
-from .simulations import SimulationCache
-from .store import write_json
-from .traces_stage import site_record
+from .traces import site_record
 
 Array = NDArray[np.float64]
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")

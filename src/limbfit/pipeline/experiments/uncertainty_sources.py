@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.meshing import MeshSettings
-from ..anatomy.sites import indenter_axis, project_to_skin
-from ..anatomy.surfaces import load_anatomy
-from ..indentation import SimulationJob, SiteModel
-from ..study import SolverTable, Study, Vector
-from .context import Context
-from .geometry_stages import MeshJob, coarse_settings, make_mesh, mesh_settings
-from .simulations import SimulationCache
-from .store import file_digest
-from .traces_stage import SiteRecord, site_record
+from ...anatomy.meshing import MeshSettings
+from ...anatomy.sites import indenter_axis, project_to_skin
+from ...anatomy.surfaces import load_anatomy
+from ...indentation import SimulationJob, SiteModel
+from ...study import SolverTable, Study, Vector
+from ..context import Context
+from ..simulations import SimulationCache
+from ..stages.geometry import MeshJob, coarse_settings, make_mesh, mesh_settings
+from ..stages.traces import SiteRecord, site_record
+from ..store import file_digest
 
 Array = NDArray[np.float64]
 

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ..identify.evidence import Evidence
-from ..identify.explore import Explored
-from ..identify.noise import SiteNoise
-from ..identify.objective import SiteResponse
-from ..identify.parameters import Unknowns
-from ..identify.sources import Gain
-from ..identify.uncertainty import DETERMINED, GIVEN, UNDETERMINED, Uncertainty, verdict_of
+from ...identify.evidence import Evidence
+from ...identify.explore import Explored
+from ...identify.noise import SiteNoise
+from ...identify.objective import SiteResponse
+from ...identify.parameters import Unknowns
+from ...identify.sources import Gain
+from ...identify.uncertainty import DETERMINED, GIVEN, UNDETERMINED, Uncertainty, verdict_of
+from ..stages.traces import SiteRecord, write_curves
+from ..store import write_json
+from ..tabular import write_table
 from .emulator_file import EMULATOR, write_runs
-from .store import write_json
-from .tabular import write_table
-from .traces_stage import SiteRecord, write_curves
 from .uncertainty_sources import Change
 
 Array = NDArray[np.float64]

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.amputation import amputate
-from ..anatomy.contours import write_contours
-from ..anatomy.imaging import LabelMap, read_labels, write_labels
-from ..anatomy.layers import LayerSpec
-from ..anatomy.markers import find_markers, match_markers
-from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from ..anatomy.quality import assess
-from ..anatomy.sheet import draw_sheet
-from ..anatomy.sites import indenter_axis, project_to_skin
-from ..anatomy.surfaces import (
+from ...anatomy.amputation import amputate
+from ...anatomy.contours import write_contours
+from ...anatomy.imaging import LabelMap, read_labels, write_labels
+from ...anatomy.layers import LayerSpec
+from ...anatomy.markers import find_markers, match_markers
+from ...anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ...anatomy.quality import assess
+from ...anatomy.sheet import draw_sheet
+from ...anatomy.sites import indenter_axis, project_to_skin
+from ...anatomy.surfaces import (
     Anatomy,
     build_anatomy,
     check_anatomy,
@@ -26,16 +26,16 @@ from ..anatomy.surfaces import (
     read_surface,
     save_anatomy,
 )
-from ..anatomy.thickness import fat_depth, read_thickness, write_thickness
-from ..errors import SiteError
-from ..mesh import write_vtu
-from ..study import Site, Study
-from .context import Context
-from .corrections import DIGEST, LABELS
+from ...anatomy.thickness import fat_depth, read_thickness, write_thickness
+from ...errors import SiteError
+from ...mesh import write_vtu
+from ...study import Site, Study
+from ..context import Context
+from ..corrections import DIGEST, LABELS
+from ..simulations import COARSE
+from ..store import file_digest, read_json, write_json
 from .inputs import automatic_labels, labelled_file, naming, study_image, study_labels
 from .marked_images import MARKED_SKIN, second_skin, without_own_markers
-from .simulations import COARSE
-from .store import file_digest, read_json, write_json
 
 THICKNESS = "fat-depth.vtp"
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..identify.fidelity import Anchor, corrected
-from ..identify.objective import SiteResponse
-from ..identify.prediction import Known, error_percent, summarise
-from ..indentation import (
+from ...identify.fidelity import Anchor, corrected
+from ...identify.objective import SiteResponse
+from ...identify.prediction import Known, error_percent, summarise
+from ...indentation import (
     Parameters,
     Simulation,
     SimulationJob,
@@ -23,11 +23,11 @@ from ..indentation import (
     to_parameters,
     to_vector,
 )
-from .context import Context
+from ..context import Context
+from ..simulations import SimulationCache
+from ..store import write_json
 from .outliers import outlier_record
-from .simulations import SimulationCache
-from .store import write_json
-from .traces_stage import SiteRecord, site_record, write_curves
+from .traces import SiteRecord, site_record, write_curves
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import TraceError
-from ..indentation import SimulationJob, SiteModel
-from ..study import Site, Study
-from ..traces import Regularised, Trace, find_touch_down, read_trace, regularise
-from .context import Context
-from .simulations import CURVE_POINTS, recorded_model
-from .store import write_json
+from ...errors import TraceError
+from ...indentation import SimulationJob, SiteModel
+from ...study import Site, Study
+from ...traces import Regularised, Trace, find_touch_down, read_trace, regularise
+from ..context import Context
+from ..simulations import CURVE_POINTS, recorded_model
+from ..store import write_json
 
 Array = NDArray[np.float64]
 

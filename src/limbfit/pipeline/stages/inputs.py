@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..anatomy.contours import read_contours
-from ..anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
-from ..anatomy.one_limb import check_one_limb
-from ..anatomy.placement import on_grid_of
-from ..anatomy.segmentation import segment
-from ..errors import InputError
-from ..study import Study
-from .corrections import hand_labels
+from ...anatomy.contours import read_contours
+from ...anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
+from ...anatomy.one_limb import check_one_limb
+from ...anatomy.placement import on_grid_of
+from ...anatomy.segmentation import segment
+from ...errors import InputError
+from ...study import Study
+from ..corrections import hand_labels
 
 
 def study_image(study: Study) -> Volume:

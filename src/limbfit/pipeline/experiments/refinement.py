@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ..errors import InputError
-from ..indentation import Simulation
-from .context import Context
-from .geometry_stages import MeshJob, make_mesh, mesh_settings
+from ...errors import InputError
+from ...indentation import Simulation
+from ..context import Context
+from ..simulations import experiment_cache
+from ..stages.geometry import MeshJob, make_mesh, mesh_settings
+from ..store import file_digest, read_json
 from .sensitivity import identified_parameters, store_runs
-from .simulations import experiment_cache
-from .store import file_digest, read_json
 from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants
 
 Array = NDArray[np.float64]

@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..study import Study
-from .context import Context
+from ...errors import InputError
+from ...study import Study
+from ..context import Context
+from ..keys import Keys, Stage
+from ..store import Store, read_json
 from .crossvalidation import run_crossvalidate
 from .cube import COMPRESSION_PERCENT, run_cube
 from .design import run_design
-from .keys import Keys, Stage
 from .refinement import FACTORS, run_refinement
 from .regions import run_regions
 from .sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
-from .store import Store, read_json
 from .uncertainty import run_uncertainty
 
 # Rooms of experiments that simulate, and of those that identify parameters.
@@ -55,7 +55,7 @@ class Experiment(Stage):
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-_OF_SENSITIVITY = (*MECHANICS, "pipeline/sensitivity", "pipeline/variants")
+_OF_SENSITIVITY = (*MECHANICS, "pipeline/experiments/sensitivity", "pipeline/experiments/variants")
 
 
 def _sensitivity(
@@ -78,7 +78,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         run_cube,
         needs=("calibrate",),
         tables=("material",),
-        rooms=("fe", "pipeline/cube", "pipeline/published"),
+        rooms=("fe", "pipeline/experiments/cube", "pipeline/experiments/published"),
         options={"compression_percent": COMPRESSION_PERCENT},
     ),
     Experiment(
@@ -87,14 +87,22 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         needs=("sites", "traces", "mesh", "calibrate"),
         tables=("material", "calibration", "solver", "indenter"),
         site_keys=("name", "region", "fitted", "weight", "edge"),
-        rooms=(*MECHANICS, *IDENTIFY, "identify/regions", "pipeline/calibrate_stage", "pipeline/regions"),
+        rooms=(
+            *MECHANICS,
+            *IDENTIFY,
+            "identify/regions",
+            "pipeline/stages/calibrate",
+            "pipeline/experiments/regions",
+        ),
         options={"sites": "all"},
     ),
     _sensitivity("c", run_stiffness),
-    _sensitivity("kappa", run_kappa, ["pipeline/volumes"], ratios=list(KAPPA_RATIOS)),
+    _sensitivity("kappa", run_kappa, ["pipeline/experiments/volumes"], ratios=list(KAPPA_RATIOS)),
     _sensitivity("contact", run_contact),
     _sensitivity("indenter", run_indenter),
-    _sensitivity("mesh", run_refinement, ["pipeline/refinement", "anatomy"], factors=list(FACTORS)),
+    _sensitivity(
+        "mesh", run_refinement, ["pipeline/experiments/refinement", "anatomy"], factors=list(FACTORS)
+    ),
     Experiment(
         "uncertainty",
         run_uncertainty,
@@ -102,9 +110,12 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         tables=("material", "calibration", "solver", "indenter", "uncertainty"),
         site_keys=("name", "fitted", "weight", "edge"),
         rooms=(
-            *(*MECHANICS, *IDENTIFY, "pipeline/calibrate_stage", "pipeline/record_noise"),
+            *(*MECHANICS, *IDENTIFY, "pipeline/stages/calibrate", "pipeline/stages/record_noise"),
             *(f"identify/{name}" for name in UNCERTAINTY),
-            *(f"pipeline/{name}" for name in ("uncertainty", "uncertainty_record", "uncertainty_sources")),
+            *(
+                f"pipeline/experiments/{name}"
+                for name in ("uncertainty", "uncertainty_record", "uncertainty_sources")
+            ),
         ),
     ),
     Experiment(
@@ -115,7 +126,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         site_keys=("name", "region", "fitted", "weight", "edge"),
         rooms=(
             *(*MECHANICS, *IDENTIFY, "identify/crossvalidation", "identify/emulator", "identify/spread"),
-            *("pipeline/calibrate_stage", "pipeline/crossvalidation"),
+            *("pipeline/stages/calibrate", "pipeline/experiments/crossvalidation"),
         ),
         options={"fit": 0, "choices": 200, "seed": 0, "runs": 12},
     ),
@@ -125,7 +136,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         needs=("sites", "traces", "mesh"),
         tables=("material", "solver", "indenter"),
         site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s"),
-        rooms=(*MECHANICS, "identify/design", "anatomy/under", "pipeline/design"),
+        rooms=(*MECHANICS, "identify/design", "anatomy/under", "pipeline/experiments/design"),
         options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
     ),
 )

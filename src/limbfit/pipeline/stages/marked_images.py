@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..anatomy.imaging import LabelMap, Volume
-from ..anatomy.marked import marked_skin, without_markers
-from ..anatomy.registration import limb_motion
-from ..anatomy.surfaces import write_surface
-from ..study import Study
+from ...anatomy.imaging import LabelMap, Volume
+from ...anatomy.marked import marked_skin, without_markers
+from ...anatomy.registration import limb_motion
+from ...anatomy.surfaces import write_surface
+from ...study import Study
 from .inputs import marked_image, naming
 
 MARKED_SKIN = "skin-markers.stl"

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fe import Result, solve
-from ..fe.laws import Laws
-from ..fe.observables import element_fields
-from ..indentation import Simulation, SimulationJob, SiteModel, build_problem, steps_of, to_parameters
-from ..mesh import read_vtu
-from .simulations import SimulationCache
+from ...fe import Result, solve
+from ...fe.laws import Laws
+from ...fe.observables import element_fields
+from ...indentation import Simulation, SimulationJob, SiteModel, build_problem, steps_of, to_parameters
+from ...mesh import read_vtu
+from ..simulations import SimulationCache
 
 Array = NDArray[np.float64]
 NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))

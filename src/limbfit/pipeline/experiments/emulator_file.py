@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..identify.emulator import Emulator
-from ..identify.objective import SiteResponse
-from .store import atomic
+from ...errors import InputError
+from ...identify.emulator import Emulator
+from ...identify.objective import SiteResponse
+from ..store import atomic
 
 Array = NDArray[np.float64]
 EMULATOR = "emulator.npz"

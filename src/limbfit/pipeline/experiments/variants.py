@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
-from ..mesh import read_vtu
-from ..study import Site
-from .context import Context
-from .simulations import CURVE_POINTS, SimulationCache, planned_model, recorded_model
-from .traces_stage import write_curves
+from ...errors import InputError
+from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
+from ...mesh import read_vtu
+from ...study import Site
+from ..context import Context
+from ..simulations import CURVE_POINTS, SimulationCache, planned_model, recorded_model
+from ..stages.traces import write_curves
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..identify.objective import Measured, SiteResponse
-from ..identify.outliers import Exchange, FirstOrder, as_driven, find_outliers
-from ..indentation import Simulation, SimulationJob
-from .context import Context
+from ...identify.objective import Measured, SiteResponse
+from ...identify.outliers import Exchange, FirstOrder, as_driven, find_outliers
+from ...indentation import Simulation, SimulationJob
+from ..context import Context
+from ..simulations import SimulationCache
 from .plausible import stored_flags
-from .simulations import SimulationCache
-from .traces_stage import SiteRecord
+from .traces import SiteRecord
 
 Array = NDArray[np.float64]
 

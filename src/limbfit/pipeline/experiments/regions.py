@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, StudyError
-from ..identify.calibration import Calibration
-from ..identify.objective import Measured, SiteResponse
-from ..identify.parameters import Unknowns
-from ..identify.regions import Region, RegionFit, fit_regions, mean_percent
-from ..identify.uncertainty import estimate_uncertainty
-from ..indentation import flat_names, to_parameters, to_vector
-from ..study import Site
-from .calibrate_stage import Laboratory, groupings, unknowns
-from .context import Context
-from .record_noise import site_noise
-from .simulations import SimulationCache, experiment_cache
-from .store import write_json
-from .tabular import write_table
-from .traces_stage import SiteRecord, site_record
+from ...errors import InputError, StudyError
+from ...identify.calibration import Calibration
+from ...identify.objective import Measured, SiteResponse
+from ...identify.parameters import Unknowns
+from ...identify.regions import Region, RegionFit, fit_regions, mean_percent
+from ...identify.uncertainty import estimate_uncertainty
+from ...indentation import flat_names, to_parameters, to_vector
+from ...study import Site
+from ..context import Context
+from ..simulations import SimulationCache, experiment_cache
+from ..stages.calibrate import Laboratory, groupings, unknowns
+from ..stages.record_noise import site_noise
+from ..stages.traces import SiteRecord, site_record
+from ..store import write_json
+from ..tabular import write_table
 
 Array = NDArray[np.float64]
 CHOICES = ("all", "fitted")

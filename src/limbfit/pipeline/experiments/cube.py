@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import report
-from ..bench.blocks import HEX, boxes
-from ..errors import InputError, RunError
-from ..fe import History, Material, OgdenQLV, Problem, StepControl, Support, System, iterate
-from ..fe.laws import Laws
-from ..fe.observables import element_fields
-from ..indentation import KPA, materials
-from ..mesh import Mesh
-from .context import Context
+from ... import report
+from ...bench.blocks import HEX, boxes
+from ...errors import InputError, RunError
+from ...fe import History, Material, OgdenQLV, Problem, StepControl, Support, System, iterate
+from ...fe.laws import Laws
+from ...fe.observables import element_fields
+from ...indentation import KPA, materials
+from ...mesh import Mesh
+from ..context import Context
+from ..store import read_json, write_json
 from .published import PUBLISHED
-from .store import read_json, write_json
 
 Array = NDArray[np.float64]
 SIDE_MM, RAMP_S, HOLD_S = 10.0, 0.5, 1.0

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.sites import indenter_axis
-from ..anatomy.surfaces import Anatomy, load_anatomy
-from ..anatomy.under import tissue_under
-from ..identify.plausibility import Flag, RecordFacts, implausible
-from ..indentation import read_indenter
-from ..study import Site, Study
-from .context import Context
-from .traces_stage import read_curves
+from ...anatomy.sites import indenter_axis
+from ...anatomy.surfaces import Anatomy, load_anatomy
+from ...anatomy.under import tissue_under
+from ...identify.plausibility import Flag, RecordFacts, implausible
+from ...indentation import read_indenter
+from ...study import Site, Study
+from ..context import Context
+from .traces import read_curves
 
 Placed = Mapping[str, Mapping[str, Any]]
 

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..indentation import Parameters, flat_names, to_vector
-from ..study import IndenterTable
-from .context import Context
-from .simulations import experiment_cache
-from .store import write_json
-from .tabular import write_table
-from .traces_stage import site_record
+from ...indentation import Parameters, flat_names, to_vector
+from ...study import IndenterTable
+from ..context import Context
+from ..simulations import experiment_cache
+from ..stages.traces import site_record
+from ..store import write_json
+from ..tabular import write_table
 from .variants import (
     ChosenSite,
     Variant,

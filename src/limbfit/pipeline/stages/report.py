@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from .. import report
-from .context import Context
+from ... import report
+from ..context import Context
 
 
 def run_report(context: Context, folder: Path) -> dict[str, Any]:

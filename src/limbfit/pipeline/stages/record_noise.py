@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..identify.noise import SiteNoise, record_noise
-from ..study import Study
-from .traces_stage import SiteRecord, read_site_trace
+from ...identify.noise import SiteNoise, record_noise
+from ...study import Study
+from .traces import SiteRecord, read_site_trace
 
 
 def site_noise(study: Study, record: SiteRecord) -> SiteNoise:

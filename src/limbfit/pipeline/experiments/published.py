@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..fe import Ogden
+from ...fe import Ogden
 
 KPA = 1e-3  # MPa
 

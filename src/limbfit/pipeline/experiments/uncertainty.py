@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RunError
-from ..identify.discrepancy import ResidualModel
-from ..identify.evidence import Evidence, candidate, compare
-from ..identify.explore import Explored, ExploreSettings, explore
-from ..identify.fidelity import Anchor, corrected
-from ..identify.likelihood import Likelihood
-from ..identify.objective import Measured, SiteResponse
-from ..identify.parameters import search_space, shared
-from ..identify.sources import Gain
-from ..identify.uncertainty import Uncertainty, estimate_uncertainty
-from ..indentation import to_vector
-from .calibrate_stage import groupings, stage_titles, unknowns
-from .context import Context
-from .record_noise import site_noise
-from .simulations import experiment_cache
-from .traces_stage import site_record
+from ...errors import RunError
+from ...identify.discrepancy import ResidualModel
+from ...identify.evidence import Evidence, candidate, compare
+from ...identify.explore import Explored, ExploreSettings, explore
+from ...identify.fidelity import Anchor, corrected
+from ...identify.likelihood import Likelihood
+from ...identify.objective import Measured, SiteResponse
+from ...identify.parameters import search_space, shared
+from ...identify.sources import Gain
+from ...identify.uncertainty import Uncertainty, estimate_uncertainty
+from ...indentation import to_vector
+from ..context import Context
+from ..simulations import experiment_cache
+from ..stages.calibrate import groupings, stage_titles, unknowns
+from ..stages.record_noise import site_noise
+from ..stages.traces import site_record
 from .uncertainty_record import Found, Predicted, write_results
 from .uncertainty_sources import Change, changes, variants
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RunError, StudyError
-from ..identify.calibration import CalibrationSettings
-from ..identify.crossvalidation import (
+from ...errors import RunError, StudyError
+from ...identify.calibration import CalibrationSettings
+from ...identify.crossvalidation import (
     Choice,
     Fold,
     choices_of,
@@ -27,18 +27,18 @@ from ..identify.crossvalidation import (
     standing,
     without_regions,
 )
-from ..identify.emulator import Emulator
-from ..identify.fidelity import Anchor, corrected
-from ..identify.objective import SiteResponse
-from ..identify.parameters import Unknowns
-from ..identify.prediction import error_percent
-from ..identify.spread import spread_points
-from ..indentation import to_vector
-from .calibrate_stage import Laboratory, unknowns
-from .context import Context
-from .simulations import experiment_cache
-from .store import write_json
-from .tabular import write_table
+from ...identify.emulator import Emulator
+from ...identify.fidelity import Anchor, corrected
+from ...identify.objective import SiteResponse
+from ...identify.parameters import Unknowns
+from ...identify.prediction import error_percent
+from ...identify.spread import spread_points
+from ...indentation import to_vector
+from ..context import Context
+from ..simulations import experiment_cache
+from ..stages.calibrate import Laboratory, unknowns
+from ..store import write_json
+from ..tabular import write_table
 
 Array = NDArray[np.float64]
 Runs = list[list[SiteResponse]]
