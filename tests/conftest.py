@@ -32,6 +32,35 @@ position = [0.0, 40.0, 50.0]
 """
 
 
+def coarse_mesh(element: str = "tet4", edge_near_mm: float = 8.0) -> str:
+    """Settings of the study with which a simulation takes a second or two, in this process."""
+    return f"""
+[execution]
+workers = 1
+[mesh]
+element = "{element}"
+edge_near_mm = {edge_near_mm}
+edge_far_mm = 24.0
+near_radius_mm = 8.0
+growth = 1.0
+flatness = 2.0
+[solver]
+load_steps = 4
+unload_steps = 3
+"""
+
+
+COARSE = (
+    coarse_mesh()
+    + """
+[calibration]
+max_iterations = 2
+[material]
+start = { c_kPa = 6.0, m = 4.0, gamma = 1.0, tau_s = 1.0 }
+"""
+)
+
+
 def stump(radius: float, length: float, top: float) -> pv.PolyData:
     """Half an ellipsoid of revolution about z, closed by a flat cap at ``top``, outward."""
     whole = pv.Icosphere(radius=1.0, nsub=4)

@@ -8,29 +8,11 @@ import shutil
 import numpy as np
 import pytest
 
+from conftest import COARSE
 from limbfit.errors import InputError
 from limbfit.mesh import read_vtu
 from limbfit.pipeline import Progress, run_study, simulate_site, study_status
 from limbfit.study import load_study
-
-COARSE = """
-[mesh]
-element = "tet4"
-edge_near_mm = 8.0
-edge_far_mm = 24.0
-near_radius_mm = 8.0
-growth = 1.0
-flatness = 2.0
-[solver]
-load_steps = 4
-unload_steps = 3
-[calibration]
-max_iterations = 2
-[execution]
-workers = 1
-[material]
-start = { c_kPa = 6.0, m = 4.0, gamma = 1.0, tau_s = 1.0 }
-"""
 
 
 def quiet(event: Progress) -> None:

@@ -6,10 +6,10 @@ import json
 
 import pytest
 
+from conftest import COARSE
 from limbfit.errors import InputError
 from limbfit.pipeline import Progress, reproduce_study, run_study
 from limbfit.study import load_study
-from test_pipeline import COARSE
 
 
 def quiet(event: Progress) -> None:

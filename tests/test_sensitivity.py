@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from conftest import coarse_mesh
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
@@ -22,22 +23,7 @@ from limbfit.pipeline.experiments.volumes import volume_facts
 from limbfit.pipeline.store import Store, read_json, write_json
 from limbfit.study import IndenterTable, load_study
 
-SETTINGS = """
-[mesh]
-element = "tet10"
-edge_near_mm = 9.0
-edge_far_mm = 24.0
-near_radius_mm = 8.0
-growth = 1.0
-flatness = 2.0
-[solver]
-load_steps = 4
-unload_steps = 3
-[indenter]
-edge_radius_mm = 2.0
-[execution]
-workers = 1
-"""
+SETTINGS = coarse_mesh("tet10", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"
 SKIN = {"c_kPa": 6.0, "m": 6.0, "gamma": 1.0, "tau_s": 0.5}
 MUSCLE = {"c_kPa": 4.0, "m": 3.0, "gamma": 1.0, "tau_s": 0.5}
 

@@ -7,32 +7,20 @@ import json
 import numpy as np
 import pytest
 
+from conftest import COARSE
 from limbfit import run_experiment
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.report import build_report
 from limbfit.study import load_study
 
-QUICK = """
-[mesh]
-element = "tet4"
-edge_near_mm = 8.0
-edge_far_mm = 24.0
-near_radius_mm = 8.0
-growth = 1.0
-flatness = 2.0
-[solver]
-load_steps = 4
-unload_steps = 3
-[calibration]
-max_iterations = 4
-[execution]
-workers = 1
-[material]
-start = { c_kPa = 6.0, m = 4.0, gamma = 1.0, tau_s = 1.0 }
+QUICK = (
+    COARSE.replace("max_iterations = 2", "max_iterations = 4")
+    + """
 [uncertainty]
 runs = 4
 checked = 1
 """
+)
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ import pydicom
 import pytest
 from limbs import leg_image, rotation, write_dicom
 
+from conftest import COARSE
 from limbfit import load_study
 from limbfit.cli import main
 from limbfit.pipeline.run import run_record
 from limbfit.pipeline.store import write_json
-from test_pipeline import COARSE
 
 IN_TAGS = {
     "PatientName": "QUIXOTE^ALONSO^MARKERX1",

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import InputError, RunError
-from .face import NO_LIMITS, Answer, Job, Limits, check_keys
+from .face import NO_LIMITS, Answer, Job, Limits, paired
 from .processes import ProcessExecutor
 
 QUEUES = {
@@ -137,9 +137,7 @@ class DaskExecutor:
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
     ) -> Iterator[Answer]:
-        listed = list(jobs)
-        check_keys(listed, keys)
-        return self._answers(function, listed, list(keys) if keys is not None else [None] * len(listed), lost)
+        return self._answers(function, *paired(jobs, keys), lost)
 
     def _answers(
         self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None

@@ -82,9 +82,14 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def check_keys(jobs: list, keys: Sequence[str] | None) -> None:
-    if keys is not None and len(keys) != len(jobs):
-        raise ValueError(f"{len(keys)} keys for {len(jobs)} jobs")
+def paired(jobs: Iterable[Job], keys: Sequence[str] | None) -> tuple[list[Job], list[str | None]]:
+    """Jobs as a list, and the key of each; None where they have none."""
+    listed = list(jobs)
+    if keys is None:
+        return listed, [None] * len(listed)
+    if len(keys) != len(listed):
+        raise ValueError(f"{len(keys)} keys for {len(listed)} jobs")
+    return listed, list(keys)
 
 
 class SerialExecutor:
@@ -100,9 +105,7 @@ class SerialExecutor:
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
     ) -> Iterator[Answer]:
-        listed = list(jobs)
-        check_keys(listed, keys)
-        return map(function, listed)
+        return map(function, paired(jobs, keys)[0])
 
     def __enter__(self) -> Self:
         return self

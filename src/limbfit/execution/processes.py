@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import RunError
-from .face import NO_LIMITS, Answer, Job, Limits, check_keys
+from .face import NO_LIMITS, Answer, Job, Limits, paired
 from .worker import GRACE_S, READY, Outcome, Worker
 
 TRIES = 2
@@ -39,9 +39,7 @@ class ProcessExecutor:
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
     ) -> Iterator[Answer]:
-        listed = list(jobs)
-        check_keys(listed, keys)
-        return self._answers(function, listed, list(keys) if keys is not None else [None] * len(listed), lost)
+        return self._answers(function, *paired(jobs, keys), lost)
 
     def _answers(
         self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None

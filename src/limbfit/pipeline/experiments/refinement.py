@@ -15,7 +15,7 @@ from ...errors import InputError
 from ...indentation import Simulation
 from ..context import Context
 from ..simulations import experiment_cache
-from ..stages.geometry import MeshJob, make_mesh, mesh_settings
+from ..stages.geometry import make_mesh, mesh_job, mesh_settings
 from ..store import file_digest, read_json
 from .sensitivity import identified_parameters, store_runs
 from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants
@@ -117,18 +117,17 @@ def _meshes(
     settings = mesh_settings(study)
     pairs = [(one, factor) for one in chosen for factor in factors]
     jobs = {
-        (one.site.name, factor): MeshJob(
-            site=one.site.name,
-            surfaces=context.store["surfaces"],
-            surfaces_key=str((context.store.stamp("surfaces") or {})["key"]),
-            position=one.model.position,
-            axis=one.model.axis,
-            settings=replace(
+        (one.site.name, factor): mesh_job(
+            context,
+            one.site.name,
+            one.model.position,
+            one.model.axis,
+            replace(
                 settings,
                 edge_near_mm=factor * settings.edge_near_mm,
                 edge_far_mm=factor * settings.edge_far_mm,
             ),
-            file=_file(context, folder, one, factor),
+            _file(context, folder, one, factor),
         )
         for one, factor in pairs
         if factor != 1.0

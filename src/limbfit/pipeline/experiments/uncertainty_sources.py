@@ -21,7 +21,7 @@ from ...indentation import SimulationJob, SiteModel
 from ...study import SolverTable, Study, Vector
 from ..context import Context
 from ..simulations import SimulationCache
-from ..stages.geometry import MeshJob, coarse_settings, make_mesh, mesh_settings
+from ..stages.geometry import coarse_settings, make_mesh, mesh_job, mesh_settings
 from ..stages.traces import SiteRecord, site_record
 from ..store import file_digest
 
@@ -167,17 +167,8 @@ def _meshed(
 ) -> list[SiteModel]:
     """The models on meshes of other settings; those of an interrupted run are kept."""
     folder.mkdir(parents=True, exist_ok=True)
-    stamp = context.store.stamp("surfaces") or {}
     jobs = [
-        MeshJob(
-            site=model.name,
-            surfaces=context.store["surfaces"],
-            surfaces_key=str(stamp["key"]),
-            position=model.position,
-            axis=model.axis,
-            settings=settings,
-            file=folder / f"{model.name}.vtu",
-        )
+        mesh_job(context, model.name, model.position, model.axis, settings, folder / f"{model.name}.vtu")
         for model in models
     ]
     missing = [job for job in jobs if not job.file.with_suffix(".json").is_file()]

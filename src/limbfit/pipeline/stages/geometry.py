@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -198,6 +199,20 @@ class MeshJob:
     file: Path
 
 
+def mesh_job(
+    context: Context,
+    site: str,
+    position: Sequence[float],
+    axis: Sequence[float],
+    settings: MeshSettings,
+    file: Path,
+) -> MeshJob:
+    """The mesh of a site of the study's surfaces, with any settings."""
+    key = str((context.store.stamp("surfaces") or {})["key"])
+    surfaces = context.store["surfaces"]
+    return MeshJob(site, surfaces, key, tuple(position), tuple(axis), settings, file)
+
+
 def make_mesh(job: MeshJob) -> dict[str, Any]:
     """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
     anatomy, base = _base(job.surfaces, job.surfaces_key, job.settings)
@@ -265,16 +280,14 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
 def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
     """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
     sites = context.stored("sites", "sites.json")["sites"]
-    stamp = context.store.stamp("surfaces") or {}
     jobs = [
-        MeshJob(
-            site=site["site"],
-            surfaces=context.store["surfaces"],
-            surfaces_key=str(stamp["key"]),
-            position=tuple(site["position_mm"]),
-            axis=tuple(site["axis"]),
-            settings=settings,
-            file=folder / f"{site['site']}.vtu",
+        mesh_job(
+            context,
+            site["site"],
+            site["position_mm"],
+            site["axis"],
+            settings,
+            folder / f"{site['site']}.vtu",
         )
         for site in sites
     ]
