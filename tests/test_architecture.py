@@ -12,6 +12,7 @@ PACKAGE = Path(limbfit.__file__).parent
 FLOORS = [
     {"__main__"},
     {"cli"},
+    {"studio"},
     {"pipeline"},
     {"bench"},
     {"report", "phantom"},

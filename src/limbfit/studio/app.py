@@ -1,0 +1,72 @@
+"""The web application: the guard, the routes of every view, and the page's own files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse
+from fastapi.staticfiles import StaticFiles
+
+from ..errors import InputError, LimbfitError
+from ..web.assets import STATIC as SHARED
+from . import (
+    identification_routes,
+    image_routes,
+    model_routes,
+    results_routes,
+    study_routes,
+    traces_routes,
+)
+from .folder import StudyFolder
+from .guard import Door, Guard, TooLargeError
+
+STATIC = Path(__file__).parent / "static"
+ROUTES = (
+    study_routes,
+    image_routes,
+    model_routes,
+    traces_routes,
+    identification_routes,
+    results_routes,
+)
+
+
+def create_app(folder: StudyFolder, door: Door) -> FastAPI:
+    """The application over one study, behind its door."""
+    app = FastAPI(title="limbfit studio", docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.folder = folder
+    for routes in ROUTES:
+        app.include_router(routes.router)
+    for kind, status in ((InputError, 422), (LimbfitError, 409), (FileNotFoundError, 404)):
+        app.add_exception_handler(kind, _told(status))
+    app.add_exception_handler(TooLargeError, _told(413))
+    app.add_exception_handler(RequestValidationError, _unusable)
+    app.add_api_route("/", _page, include_in_schema=False)
+    app.mount("/static", StaticFiles(directory=STATIC))
+    app.mount("/web", StaticFiles(directory=SHARED))
+    app.add_middleware(Guard, door=door)
+    return app
+
+
+def _page() -> FileResponse:
+    return FileResponse(STATIC / "index.html")
+
+
+def _told(status: int) -> Any:
+    def handler(request: Request, error: Exception) -> JSONResponse:
+        text = str(error) or "the request is too large"
+        if isinstance(error, FileNotFoundError):
+            text = f"not there (yet): {error.args[0] if len(error.args) == 1 else 'a file of the study'}"
+        return JSONResponse({"error": text}, status)
+
+    return handler
+
+
+def _unusable(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"][1:])
+    return JSONResponse({"error": f"{place}: {first['msg']}" if place else first["msg"]}, 422)

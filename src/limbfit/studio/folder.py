@@ -1,0 +1,82 @@
+"""The study folder as the studio sees it: loaded when asked, paths kept inside, changes by fingerprints."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..pipeline.store import Store
+from ..study import Study, load_study
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """One study by its file; nothing of it is kept in memory between requests."""
+
+    file: Path
+
+    @property
+    def folder(self) -> Path:
+        return self.file.parent
+
+    @property
+    def results(self) -> Path:
+        return self.folder / "results"
+
+    @property
+    def store(self) -> Store:
+        return Store(self.results)
+
+    def load(self) -> Study:
+        return load_study(self.file)
+
+    def artefact(self, *parts: str) -> Path:
+        """A file under ``results/`` by the parts of its path; each part is a plain name.
+
+        Raises
+        ------
+        InputError
+            Where a part is no plain name, or the file lies outside of ``results/`` (by a link).
+        FileNotFoundError
+            Where there is none.
+        """
+        for part in parts:
+            is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
+            if not is_plain or part.startswith("."):
+                raise InputError("not the name of a file of the study", remedy="names have no path in them")
+        path = self.results.joinpath(*parts)
+        inside = self.results.resolve()
+        if not path.resolve().is_relative_to(inside):
+            raise InputError("the file lies outside of the study's results")
+        if not path.is_file():
+            raise FileNotFoundError("/".join(parts))
+        return path
+
+    def changes(self) -> dict[str, str]:
+        """A fingerprint of each thing that a page may have to read again."""
+        results = self.results
+        logs = sorted((results / "log").glob("*.jsonl"))[-1:]
+        work = results.glob(".work-calibrate-*/runs")
+        return {
+            "study": fingerprint([self.file]),
+            "stages": fingerprint([*sorted(results.glob("*/stage.json")), *sorted(results.glob(".work-*"))]),
+            "labels": fingerprint(results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")),
+            "log": fingerprint([*logs, *work]),
+        }
+
+
+def fingerprint(files: Iterable[Path]) -> str:
+    """Changes when one of the files is written, appears or goes."""
+    seen: list[Any] = []
+    for file in files:
+        try:
+            stat = file.stat()
+        except OSError:
+            seen.append((file.name, None))
+        else:
+            seen.append((str(file), stat.st_mtime_ns, stat.st_size, stat.st_ino))
+    return hashlib.sha256(repr(seen).encode()).hexdigest()[:16]

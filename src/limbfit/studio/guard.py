@@ -1,0 +1,174 @@
+"""Who may talk to the studio: one secret, known hosts, the page's own origin, bounded bodies.
+
+What it is against: other users of the machine and other pages in the same browser. A page of another origin
+can make the browser send requests to 127.0.0.1, by a name that resolves to it too (DNS rebinding): such
+requests carry another ``Host`` or ``Origin``, and no cookie, since ours is ``SameSite=Strict``.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import secrets
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+LARGEST_BODY = 16 << 20  # bytes of a request: a day's painting has less
+_SAFE_METHODS = ("GET", "HEAD")
+# The page's own files and nothing else. Workers and images of niivue are made in memory (blob:, data:).
+PAGE_POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' data: blob:",
+        "font-src 'self'",
+        "connect-src 'self' data: blob:",
+        "worker-src 'self' blob:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+_HEADERS = {
+    "Content-Security-Policy": PAGE_POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+@dataclass(frozen=True)
+class Door:
+    """Where the studio listens and what opens it."""
+
+    host: str
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Values of ``Host`` that are this server; names that merely resolve to it are not."""
+        names = {f"[{self.host}]" if ":" in self.host else self.host}
+        if is_loopback(self.host):
+            names |= {"127.0.0.1", "localhost"}
+        found = {f"{name}:{self.port}" for name in names}
+        return frozenset(found | (names if self.port == 80 else set()))
+
+    @property
+    def cookie(self) -> str:
+        """Cookies are shared by all ports of a host, so the name tells them apart."""
+        return f"limbfit-studio-{self.port}"
+
+    @property
+    def address(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}/?token={self.token}"
+
+    def opens(self, token: str) -> bool:
+        return hmac.compare_digest(token.encode(), self.token.encode())
+
+
+def is_loopback(host: str) -> bool:
+    return host in ("127.0.0.1", "localhost", "::1")
+
+
+class Guard:
+    """ASGI middleware that refuses everything that is not the page of this server."""
+
+    def __init__(self, app: ASGIApp, door: Door) -> None:
+        self.app, self.door = app, door
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        if scope["type"] != "http":  # there are no web sockets here
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        headers = Headers(scope=scope)
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        is_entry = scope["path"] == "/" and scope["method"] in _SAFE_METHODS
+        refused = self._refusal(scope, headers, given if is_entry else "")
+        if refused:
+            await _answer(send, *refused)
+            return
+        cookie = ""
+        if is_entry and self.door.opens(given):
+            cookie = f"{self.door.cookie}={self.door.token}; Path=/; HttpOnly; SameSite=Strict"
+        await self.app(scope, _bounded(receive), _dressed(send, cookie))
+
+    def _refusal(self, scope: Scope, headers: Headers, given: str) -> tuple[int, str] | None:
+        """Status and reason why a request is refused; None where it is not."""
+        if headers.getlist("host") not in [[host] for host in self.door.hosts]:
+            return 421, "this is not the address that limbfit studio printed"
+        origin = headers.get("origin")
+        origins = {f"http://{host}" for host in self.door.hosts}
+        is_changing = scope["method"] not in _SAFE_METHODS
+        if (origin is None and is_changing) or (origin is not None and origin not in origins):
+            return 403, "requests from other pages are refused"
+        site = headers.get("sec-fetch-site", "none")
+        if site not in ("same-origin", "none") and (is_changing or not given):
+            return 403, "requests from other pages are refused"
+        if not self.door.opens(given) and not self.door.opens(self._cookie(headers)):
+            return 401, "open the address that limbfit studio printed: it holds the key of this page"
+        length = headers.get("content-length", "0")
+        if not length.isdigit() or int(length) > LARGEST_BODY:
+            return 413, f"requests have at most {LARGEST_BODY >> 20} MiB"
+        return None
+
+    def _cookie(self, headers: Headers) -> str:
+        jar: SimpleCookie = SimpleCookie()
+        try:
+            jar.load(headers.get("cookie", ""))
+        except CookieError:
+            return ""
+        found = jar.get(self.door.cookie)
+        return "" if found is None else found.value
+
+
+class TooLargeError(Exception):
+    """A body without a stated length went over the limit."""
+
+
+def _bounded(receive: Receive) -> Receive:
+    seen = 0
+
+    async def bounded() -> Message:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > LARGEST_BODY:
+            raise TooLargeError
+        return message
+
+    return bounded
+
+
+def _dressed(send: Send, cookie: str) -> Send:
+    """Every answer with the headers that keep it where it belongs; an answer's own policy stays."""
+
+    async def dressed(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+            if cookie:
+                headers.append("Set-Cookie", cookie)
+        await send(message)
+
+    return dressed
+
+
+async def _answer(send: Send, status: int, reason: str) -> None:
+    body = json.dumps({"error": reason}).encode()
+    raw = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    await _dressed(send, "")({"type": "http.response.start", "status": status, "headers": raw})
+    await send({"type": "http.response.body", "body": body})

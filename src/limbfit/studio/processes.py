@@ -1,0 +1,109 @@
+"""Runs of the study as processes of their own: started, found again after a restart, and stopped.
+
+A run is ``limbfit run STUDY`` in its own session, so that it lives on when the server ends. Whether one runs
+is what the study's lock says, whoever started it; what it does is what its log says.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import psutil
+
+from ..errors import InputError, RunError
+from ..pipeline import STAGE_NAMES
+from .folder import StudyFolder
+
+try:
+    import fcntl
+except ImportError:  # Windows: the process number in the lock's file is all there is
+    fcntl = None  # type: ignore[assignment]
+
+_HOLDER = re.compile(r"process (\d+) \(since ([^)]*)\)")
+
+
+def running(folder: StudyFolder) -> dict[str, Any] | None:
+    """``process`` and ``since`` of the run that holds the study; None where none does."""
+    file = folder.results / ".lock"
+    try:
+        found = _HOLDER.match(file.read_text(encoding="utf-8"))
+    except OSError:
+        return None
+    if found is None or not psutil.pid_exists(int(found[1])) or not _is_held(file):
+        return None
+    return {"process": int(found[1]), "since": found[2]}
+
+
+def _is_held(file: Path) -> bool:
+    if fcntl is None:
+        return True
+    with file.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False
+
+
+def start_run(
+    folder: StudyFolder, until: str | None = None, start: str | None = None, force: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Start ``limbfit run`` on the study; what it says goes to the study's log, as always.
+
+    Raises
+    ------
+    InputError
+        Where the study cannot be read or a stage does not exist.
+    RunError
+        Where a run holds the study.
+    """
+    study = folder.load()
+    holder = running(folder)
+    if holder is not None:
+        raise RunError(f"process {holder['process']} is running this study; stop it first, or wait for it")
+    for name in (until, start, *force):
+        if name is not None and name not in STAGE_NAMES:
+            raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
+    options = [*(["--until", until] if until else []), *(["--from", start] if start else [])]
+    options += [word for name in force for word in ("--force", name)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "limbfit", "run", str(study.file.resolve()), *options],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        cwd=folder.folder,
+        start_new_session=True,
+    )
+    Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
+    return {"process": process.pid}
+
+
+def stop_run(folder: StudyFolder) -> dict[str, Any]:
+    """Interrupt the run that holds the study, as Ctrl-C would; finished work is kept.
+
+    Raises
+    ------
+    RunError
+        Where no run holds the study, or it is no ``limbfit`` command.
+    """
+    holder = running(folder)
+    if holder is None:
+        raise RunError("no run holds this study: there is nothing to stop")
+    try:
+        process = psutil.Process(holder["process"])
+        words = process.cmdline()
+        if not any(Path(word).name in ("limbfit", "limbfit.exe") for word in words[:4]):
+            raise RunError(
+                f"process {process.pid}, which holds this study, is no limbfit command; end it where it runs"
+            )
+        process.send_signal(signal.SIGINT)
+    except psutil.Error:
+        raise RunError(f"process {holder['process']} cannot be interrupted; end it where it runs") from None
+    return holder

@@ -1,0 +1,202 @@
+// The shell: tabs, stages, theme, and what every view is given.
+//
+// A view is a module `views/<name>.js` that exports
+//   mount(element, context)   builds the view in `element`; may return { show(), hide() }
+// and is given
+//   context.api.get(path), .post(path, body), .bytes(path), .url(path)   paths below /api
+//   context.study             the study as GET /api/study tells it; always the newest
+//   context.stages, .run      rows of `limbfit status`, and the run that goes on or null
+//   context.on(listener)      listener({ study, stages, labels, log, run, theme }), true for what changed;
+//                             returns a function that ends it
+//   context.say(text)         a line at the bottom, read out too;  context.warn(text) one that stays
+//   context.refresh()         ask for changes at once
+// Nothing is kept here that is not in the study's files.
+import { api, ApiError } from "/static/api.js";
+import { el, replace } from "/static/dom.js";
+
+const VIEWS = [
+  ["image", "Image"],
+  ["model", "Model"],
+  ["traces", "Traces"],
+  ["identification", "Identification"],
+  ["results", "Results"],
+];
+const TOPICS = ["study", "stages", "labels", "log"];
+const EVERY_MS = 1000;
+const listeners = new Set();
+const mounted = new Map();
+let seen = null;
+
+const context = {
+  api,
+  study: null,
+  stages: [],
+  run: null,
+  on(listener) {
+    listeners.add(listener);
+    return () => listeners.delete(listener);
+  },
+  say(text) {
+    document.getElementById("status").textContent = text;
+  },
+  warn(text) {
+    const notice = document.getElementById("notice");
+    notice.hidden = !text;
+    replace(notice, el("span", {}, text), el("button", { type: "button", class: "quiet", onclick: () => context.warn("") }, "Close"));
+  },
+  refresh: () => poll(true),
+};
+
+async function poll(now = false) {
+  let found;
+  try {
+    found = await api.get("changes");
+  } catch (error) {
+    const lost = error instanceof ApiError && error.status === 401;
+    offline(lost ? "This page belongs to a server that has ended: open the address that limbfit studio printed last." : "The server does not answer. Runs go on; start limbfit studio again to see them.");
+    return;
+  } finally {
+    if (!now) setTimeout(poll, document.hidden ? 5 * EVERY_MS : EVERY_MS);
+  }
+  offline("");
+  const run = JSON.stringify(found.run);
+  const changed = Object.fromEntries(TOPICS.map((topic) => [topic, seen?.[topic] !== found[topic]]));
+  changed.run = JSON.stringify(context.run) !== run;
+  const first = seen === null;
+  seen = found;
+  context.run = found.run;
+  if (first || TOPICS.some((topic) => changed[topic]) || changed.run) await tell(changed);
+}
+
+async function tell(changed) {
+  try {
+    if (changed.study || context.study === null) context.study = await api.get("study");
+    if (changed.study || changed.stages || changed.labels || changed.run) {
+      const found = await api.get("stages");
+      [context.stages, context.run] = [found.stages, found.run];
+    }
+    if (context.broken) context.warn((context.broken = ""));
+  } catch (error) {
+    context.warn((context.broken = error.message));
+    seen = null;
+  }
+  head();
+  for (const listener of [...listeners]) listener(changed);
+}
+
+function offline(text) {
+  document.body.classList.toggle("offline", text !== "");
+  if (text) context.warn(text);
+  else if (offline.said) context.warn("");
+  offline.said = text;
+}
+
+const MARKS = { done: "✓", stale: "↻", begun: "…", missing: "○" };
+
+function head() {
+  const name = context.study?.name ?? "";
+  document.title = name ? `${name} – limbfit studio` : "limbfit studio";
+  document.getElementById("study-name").textContent = name;
+  const items = context.stages.map((row) =>
+    el("span", { class: `stage ${row.state}`, title: [row.state, ...(row.why ?? [])].join("; ") },
+      el("span", { class: "mark", "aria-hidden": "true" }, MARKS[row.state] ?? "?"),
+      row.stage, el("span", { class: "hidden-text" }, `: ${row.state}`)));
+  const run = context.run ? [el("span", { class: "stage running" }, `running (process ${context.run.process})`)] : [];
+  replace(document.getElementById("strip"), ...items, ...run);
+}
+
+async function open(name) {
+  const main = document.getElementById("view");
+  const before = mounted.get(context.view);
+  for (const [key] of VIEWS) {
+    const tab = document.getElementById(`tab-${key}`);
+    tab.setAttribute("aria-selected", String(key === name));
+    tab.tabIndex = key === name ? 0 : -1;
+  }
+  context.view = name;
+  if (before && before.name !== name) {
+    before.element.hidden = true;
+    before.view?.hide?.();
+  }
+  const known = mounted.get(name);
+  if (known) {
+    known.element.hidden = false;
+    known.view?.show?.();
+    return;
+  }
+  const element = el("section", { class: `view ${name}`, role: "tabpanel", id: `panel-${name}`, "aria-labelledby": `tab-${name}` });
+  main.append(element);
+  mounted.set(name, { name, element });
+  try {
+    const module = await import(`/static/views/${name}.js`);
+    mounted.get(name).view = await module.mount(element, context);
+  } catch (error) {
+    replace(element, el("p", { class: "failed" }, `This view does not open: ${error.message}`));
+    console.error(error);
+  }
+}
+
+function route() {
+  const name = location.hash.replace(/^#\/?/, "").split("/")[0];
+  const known = VIEWS.some(([key]) => key === name);
+  open(known ? name : context.study?.has_image === false ? "traces" : "image");
+}
+
+function tabs() {
+  const bar = document.getElementById("tabs");
+  VIEWS.forEach(([key, title], i) => {
+    bar.append(el("button", {
+      type: "button", role: "tab", id: `tab-${key}`, "aria-controls": `panel-${key}`, "aria-selected": "false",
+      title: `${title} (Alt+${i + 1})`, onclick: () => (location.hash = `#/${key}`),
+    }, title));
+  });
+  const go = (i) => {
+    const [key] = VIEWS[(i + VIEWS.length) % VIEWS.length];
+    location.hash = `#/${key}`;
+    document.getElementById(`tab-${key}`).focus();
+  };
+  bar.addEventListener("keydown", (event) => {
+    const at = VIEWS.findIndex(([key]) => key === context.view);
+    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: VIEWS.length - 1 }[event.key];
+    if (to !== undefined) {
+      go(to);
+      event.preventDefault();
+    }
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.altKey && !event.ctrlKey && !event.metaKey && event.key >= "1" && event.key <= String(VIEWS.length)) {
+      go(Number(event.key) - 1);
+      event.preventDefault();
+    }
+  });
+}
+
+function theme() {
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  const button = document.getElementById("theme");
+  const set = (dark, tellViews = true) => {
+    document.documentElement.dataset.theme = dark ? "dark" : "light";
+    button.textContent = dark ? "Light" : "Dark";
+    button.setAttribute("aria-label", dark ? "Use light colours" : "Use dark colours");
+    if (tellViews) for (const listener of [...listeners]) listener({ theme: true });
+  };
+  const kept = localStorage.getItem("limbfit-theme");
+  set(kept ? kept === "dark" : system.matches, false);
+  system.addEventListener("change", () => localStorage.getItem("limbfit-theme") ?? set(system.matches));
+  button.addEventListener("click", () => {
+    const dark = document.documentElement.dataset.theme !== "dark";
+    localStorage.setItem("limbfit-theme", dark ? "dark" : "light");
+    set(dark);
+  });
+}
+
+async function begin() {
+  if (location.search) history.replaceState(null, "", `/${location.hash}`); // the key stays out of sight
+  theme();
+  tabs();
+  await poll();
+  addEventListener("hashchange", route);
+  route();
+}
+
+begin();

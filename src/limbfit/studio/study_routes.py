@@ -1,0 +1,117 @@
+"""What every view needs: the study, its stages, what changed, and files to download."""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import FileResponse
+
+from ..pipeline import study_status
+from ..pipeline.provenance import input_files
+from ..study import Study
+from .folder import StudyFolder, fingerprint
+from .processes import running
+
+router = APIRouter(prefix="/api")
+# A report has scripts of its own: shown in a browser, it is kept apart from this page and its cookie.
+REPORT_POLICY = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; img-src data: blob:; "
+    "script-src 'unsafe-inline'; style-src 'unsafe-inline'; font-src data:; connect-src 'none'"
+)
+
+
+def study_folder(request: Request) -> StudyFolder:
+    """The folder that this server shows."""
+    return request.app.state.folder
+
+
+Folder = Annotated[StudyFolder, Depends(study_folder)]
+
+
+@router.get("/study")
+def get_study(folder: Folder) -> dict[str, Any]:
+    """The study as it stands: its tables, without paths of inputs, and what the server runs on."""
+    study = folder.load()
+    return {
+        "name": study.study.name,
+        "description": study.study.description,
+        "folder": folder.folder.resolve().name,
+        "has_image": study.image is not None,
+        "tissues": list(study.tissues),
+        "material": study.material.model_dump(mode="json"),
+        "indenter": study.indenter.model_dump(mode="json", exclude={"file"}),
+        "sites": [
+            {**site.model_dump(mode="json", exclude={"trace"}), "has_trace": site.trace is not None}
+            for site in study.sites
+        ],
+        "notes": list(study.notes),
+    }
+
+
+@router.get("/stages")
+def get_stages(folder: Folder) -> dict[str, Any]:
+    """State of every stage, as ``limbfit status`` tells it, and the run that goes on, if any."""
+    return {"stages": stages_of_folder(folder), "run": running(folder)}
+
+
+@router.get("/changes")
+def get_changes(folder: Folder) -> dict[str, Any]:
+    """Fingerprints by topic; a page reads again what stands on a topic whose fingerprint changed."""
+    return {**folder.changes(), "run": running(folder)}
+
+
+@router.get("/files/{stage}/{name}")
+def get_file(folder: Folder, stage: str, name: str, download: bool = False) -> FileResponse:
+    """A stored artefact ``results/<stage>/<name>``; with ``download`` as a file to keep."""
+    return _file(folder, (stage, name), download)
+
+
+@router.get("/files/{stage}/{group}/{name}")
+def get_file_of_group(
+    folder: Folder, stage: str, group: str, name: str, download: bool = False
+) -> FileResponse:
+    """A stored artefact ``results/<stage>/<group>/<name>``, such as a table of the report."""
+    return _file(folder, (stage, group, name), download)
+
+
+def _file(folder: StudyFolder, parts: tuple[str, ...], download: bool) -> FileResponse:
+    path = folder.artefact(*parts)
+    headers = {}
+    if path.suffix.lower() in (".html", ".htm", ".svg", ".xml"):
+        headers["Content-Security-Policy"] = REPORT_POLICY
+    return FileResponse(path, filename=parts[-1] if download else None, headers=headers)
+
+
+class _Remembered:
+    """The last answer, for as long as no file that decides it has changed."""
+
+    def __init__(self) -> None:
+        self.lock = Lock()
+        self.mark, self.rows = "", []  # type: str, list[dict[str, Any]]
+
+
+_remembered = _Remembered()
+
+
+def stages_of_folder(folder: StudyFolder) -> list[dict[str, Any]]:
+    """`study_status`, which reads every input file: again only where one was written."""
+    study = folder.load()
+    mark = _mark(folder, study)
+    with _remembered.lock:
+        if _remembered.mark != mark:
+            _remembered.rows = study_status(study)
+            _remembered.mark = mark
+        return _remembered.rows
+
+
+def _mark(folder: StudyFolder, study: Study) -> str:
+    inputs = {study.path(path) for paths in input_files(study).values() for path in paths}
+    below = [
+        file for path in sorted(inputs) for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
+    ]
+    changes = folder.changes()
+    return repr(
+        (str(folder.file), changes["study"], changes["stages"], changes["labels"], fingerprint(below))
+    )
