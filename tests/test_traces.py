@@ -14,7 +14,7 @@ import pytest
 from scipy.io import savemat
 
 from limbfit.errors import TraceError
-from limbfit.traces import Trace, check_trace, find_touch_down, read_trace, regularise
+from limbfit.traces import Trace, check_trace, find_touch_down, read_trace, regularise, touch_down_at
 
 SHARED = Path(__file__).parents[1] / ".." / "shared"
 OPENLIMB = SHARED / "reference" / "openlimb-study"
@@ -393,3 +393,24 @@ def test_the_late_touch_down_of_the_poor_run_is_found():
     touch = find_touch_down(read_trace(RELAXATION / "230403-FF1A.csv"))
     assert touch.displacement_mm == pytest.approx(3.4, abs=0.2)
     assert not touch.in_contact_at_start
+
+
+def test_stated_touch_down_and_peak_are_taken():
+    trace = record(slack=0.4)[0]
+    found = find_touch_down(trace)
+    stated = touch_down_at(trace, found.time_s + 0.3)
+    assert stated.displacement_mm == pytest.approx(found.displacement_mm + 0.3 * 0.96, abs=0.01)
+    assert stated.baseline_N == found.baseline_N
+    turn = 5.4 / 0.96
+    later = regularise(trace, stated, peak_s=turn + 0.1)
+    assert later.corners_s[1] == pytest.approx(turn + 0.1 - stated.time_s)
+    assert later.depth_mm == pytest.approx(5.0 - 0.3 * 0.96, abs=0.12)
+    assert regularise(trace, found).corners_s[1] == pytest.approx(turn - found.time_s, abs=0.01)
+
+
+def test_stated_times_off_the_record_are_refused():
+    trace = record()[0]
+    with pytest.raises(TraceError, match=r"touch_down_s: 7 s is not on the way in; give a time from 0"):
+        touch_down_at(trace, 7.0)
+    with pytest.raises(TraceError, match=r"peak_s: the way in cannot end at 30 s; the record turns at 5\.6"):
+        regularise(trace, find_touch_down(trace), peak_s=30.0)

@@ -23,7 +23,8 @@ from .stages.traces import run_traces
 from .store import Store, lock, write_json
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
-_UNSEEN: dict[str, Any] = {"region": "", "trace": None, "axis": None, "edge": None}
+_RECORD = ("trace", "touch_down_s", "peak_s")
+_UNSEEN: dict[str, Any] = {"region": "", **dict.fromkeys((*_RECORD, "axis", "edge"))}
 _IDENTIFY = (
     *("calibration", "fidelity", "multistart", "objective", "parameters", "prediction", "trust_region"),
     *("uncertainty", "noise", "discrepancy"),
@@ -50,7 +51,7 @@ STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation"), rooms=_GEOMETRY),
     Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=_GEOMETRY),
     Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE, _GEOMETRY),
-    Stage("traces", run_traces, (), ("traces",), ("name", "trace"), ("traces", "pipeline/stages/traces")),
+    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD), ("traces", "pipeline/stages/traces")),
     Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",), (*_GEOMETRY, "mesh")),
     Stage(
         "calibrate",

@@ -11,7 +11,7 @@ Units: s, mm, N; force positive when pushing, displacement positive into the lim
 from .reading import read_trace
 from .record import COLUMNS, Trace, check_trace
 from .regularise import Regularised, regularise
-from .touchdown import TouchDown, find_touch_down
+from .touchdown import TouchDown, find_touch_down, touch_down_at
 
 __all__ = [
     "COLUMNS",
@@ -22,4 +22,5 @@ __all__ = [
     "find_touch_down",
     "read_trace",
     "regularise",
+    "touch_down_at",
 ]

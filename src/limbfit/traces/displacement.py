@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from ..errors import TraceError
 from .numerics import Array, bins, noise_level
 
 _MAX_KNOTS = 12
@@ -61,10 +62,16 @@ class BrokenLine:
         return float(np.interp(displacement, np.maximum.accumulate(u), t))
 
 
-def broken_line(time: Array, displacement: Array) -> BrokenLine:
+def broken_line(time: Array, displacement: Array, peak_s: float | None = None) -> BrokenLine:
     """Fit as few straight pieces as describe the displacement to 0.3 % of the travel (or its noise).
 
-    Corners are added where the misfit is largest and all of them moved to their least-squares place.
+    Corners are added where the misfit is largest and all of them moved to their least-squares place;
+    with ``peak_s`` the end of the way in is put there.
+
+    Raises
+    ------
+    TraceError
+        Where the way in cannot end at ``peak_s``.
     """
     t, u, _ = bins(time, displacement, 5000)
     at, coarse, n = bins(t, u, 300)
@@ -77,18 +84,41 @@ def broken_line(time: Array, displacement: Array) -> BrokenLine:
         # Averages over a corner are blunt: no misfit, and no place for another corner.
         miss[np.searchsorted(at, knots[1:-1]).clip(1, len(at) - 1)[:, None] - [0, 1]] = 0.0
         if miss.max() <= tolerance or len(knots) >= _MAX_KNOTS:
-            return BrokenLine(knots, values, tolerance)
+            line = BrokenLine(knots, values, tolerance)
+            return line if peak_s is None else _turning_at(peak_s, line, t, u)
         knots = np.sort(np.append(knots, at[np.argmax(miss)]))
+
+
+def _turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLine:
+    """The line whose way in ends at a stated time, its other corners where they were."""
+    turn = int(np.flatnonzero(line.times == line.peak_s)[0])
+    low = float(line.times[max(turn - 1, 0)])
+    high = float(line.times[min(turn + 1, len(line.times) - 1)])
+    knots = line.times.copy()
+    knots[turn] = peak_s
+    if low < peak_s < high:
+        moved = BrokenLine(knots, _values(t, u, knots)[0], line.tolerance)
+        if moved.peak_s == peak_s:
+            return moved
+    raise TraceError(
+        f"the way in cannot end at {peak_s:g} s",
+        place="peak_s",
+        remedy=f"the record turns at {line.peak_s:.3f} s; stay near it, between {low:.3f} and {high:.3f} s",
+    )
+
+
+def _values(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
+    """Least-squares values of a continuous broken line with corners at ``knots``, and its misfit."""
+    hats = np.stack([np.interp(t, knots, row) for row in np.eye(len(knots))], axis=1)
+    fit = np.asarray(np.linalg.lstsq(hats, u, rcond=None)[0], dtype=np.float64)
+    return fit, hats @ fit - u
 
 
 def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
     """Least-squares corner times and values of a continuous broken line through (t, u)."""
 
     def values(inner: Array) -> tuple[Array, Array]:
-        place = np.r_[knots[0], inner, knots[-1]]
-        hats = np.stack([np.interp(t, place, row) for row in np.eye(len(place))], axis=1)
-        fit = np.asarray(np.linalg.lstsq(hats, u, rcond=None)[0], dtype=np.float64)
-        return fit, hats @ fit - u
+        return _values(t, u, np.r_[knots[0], inner, knots[-1]])
 
     inner = knots[1:-1]
     if inner.size:

@@ -72,7 +72,9 @@ _BINS = 200  # per part: a smoothing spline of so many averages equals that of a
 _PINNED = 1e3  # weight of a shared end point, in weights of its whole part
 
 
-def regularise(trace: Trace, touch_down: TouchDown, smoothing: float | None = None) -> Regularised:
+def regularise(
+    trace: Trace, touch_down: TouchDown, smoothing: float | None = None, peak_s: float | None = None
+) -> Regularised:
     """The record as smooth curves counted from touch-down.
 
     Parameters
@@ -80,13 +82,15 @@ def regularise(trace: Trace, touch_down: TouchDown, smoothing: float | None = No
     smoothing : penalty on the squared second derivative of force, s^3 (``lam`` of
         ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
         cross-validation chooses it for loading and unloading each.
+    peak_s : when the way in ends, as someone states it; found where it is not given.
 
     Raises
     ------
     TraceError
-        Where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be chosen.
+        Where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be chosen, or
+        the way in cannot end where it is stated to.
     """
-    line = broken_line(trace.time_s, trace.displacement_mm)
+    line = broken_line(trace.time_s, trace.displacement_mm, peak_s)
     start = touch_down.time_s
     corners = _corners(line, start, touch_down.displacement_mm)
     force = trace.force_N - touch_down.baseline_N

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,6 +69,25 @@ def find_touch_down(trace: Trace) -> TouchDown:
         baseline_N=float(weight @ [e.baseline for e in estimates]),
         in_contact_at_start=bool(best - travel[0] < 2 * sd and moving < MIN_SAMPLES),
     )
+
+
+def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
+    """The touch-down at a time that someone states; baseline and uncertainty are those of the onset.
+
+    Raises
+    ------
+    TraceError
+        Where the time does not lie on the way in, or the force does not rise on it.
+    """
+    line = broken_line(trace.time_s, trace.displacement_mm)
+    first, last = float(trace.time_s[0]), line.peak_s
+    if not first <= time_s < last:
+        raise TraceError(
+            f"{time_s:g} s is not on the way in",
+            place="touch_down_s",
+            remedy=f"give a time from {first:.3f} s to before {last:.3f} s",
+        )
+    return replace(find_touch_down(trace), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...errors import TraceError
 from ...indentation import SimulationJob, SiteModel
 from ...study import Site, Study
-from ...traces import Regularised, Trace, find_touch_down, read_trace, regularise
+from ...traces import Regularised, Trace, find_touch_down, read_trace, regularise, touch_down_at
 from ..context import Context
 from ..simulations import CURVE_POINTS, recorded_model
 from ..store import write_json
@@ -27,14 +27,16 @@ def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[
     file = study.path(site.trace)
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
     try:
-        touch = find_touch_down(trace)
-        smooth = regularise(trace, touch, table.smoothing)
+        stated = site.touch_down_s
+        touch = find_touch_down(trace) if stated is None else touch_down_at(trace, stated)
+        smooth = regularise(trace, touch, table.smoothing, site.peak_s)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
     facts = {
         "touch_down_s": touch.time_s,
         "touch_down_mm": touch.displacement_mm,
         "touch_down_uncertainty_mm": touch.uncertainty_mm,
+        "peak_s": touch.time_s + float(smooth.corners_s[1]),
         "peak_force_N": smooth.peak_force_N,
         "depth_mm": smooth.depth_mm,
         "noise_N": smooth.noise_N,
