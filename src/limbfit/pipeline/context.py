@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from .store import Store
 class Progress:
     """One step of a stage: ``done`` of ``total`` (``total`` 0: not known), and what is going on in words.
 
-    ``fit``: the words are the identified parameters and their error so far.
+    ``fit``: the words are the identified parameters and their error so far, ``facts`` the same as numbers.
     """
 
     stage: str
@@ -23,6 +23,7 @@ class Progress:
     total: float = 0.0
     text: str = ""
     fit: bool = False
+    facts: Mapping[str, Any] | None = None
 
 
 Listener = Callable[[Progress], None]
@@ -37,8 +38,16 @@ class Context:
     executor: Executor
     listener: Listener
 
-    def tell(self, stage: str, done: float, total: float, text: str = "", fit: bool = False) -> None:
-        self.listener(Progress(stage, done, total, text, fit))
+    def tell(
+        self,
+        stage: str,
+        done: float,
+        total: float,
+        text: str = "",
+        fit: bool = False,
+        facts: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.listener(Progress(stage, done, total, text, fit, facts))
 
     def stored(self, stage: str, name: str) -> Any:
         """A JSON artefact of a finished stage."""

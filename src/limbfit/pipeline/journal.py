@@ -52,6 +52,7 @@ def journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
             done=event.done,
             total=event.total,
             text=text,
+            **({} if event.facts is None else {"facts": dict(event.facts)}),
         )
         listener(event)
 

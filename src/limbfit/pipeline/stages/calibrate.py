@@ -69,6 +69,24 @@ class Laboratory:
         jobs = [record.job(parameters, sensitivities=False) for record in self.records]
         return self._run(jobs, f"correction {self.corrections}", again=True)
 
+    def _facts(self, state: State) -> dict[str, Any]:
+        """The newest iterate in numbers: error in percent of the largest force, parameters, cost."""
+        last = state.history[-1]
+        return {
+            "iterate": len(state.history) - 1,
+            "evaluations": self.evaluations,
+            "cost": last.cost,
+            "error_percent": float(np.mean(last.errors_percent)),
+            "error_percent_by_site": dict(
+                zip(
+                    (record.site.name for record in self.records),
+                    map(float, last.errors_percent),
+                    strict=True,
+                )
+            ),
+            "parameters": to_parameters(np.array(last.parameters), self.context.study.tissues),
+        }
+
     def _run(self, jobs: Sequence[SimulationJob], what: str, again: bool = False) -> list[SiteResponse]:
         found = []
         self.warnings = {}
@@ -87,7 +105,9 @@ class Laboratory:
 
         def tell(state: State) -> None:
             name = titles[state.history[-1].stage]
-            self.context.tell(self.title, 0, 0, f"{name}: {_describe(state, study.tissues)}", fit=True)
+            facts = {"of": name, **self._facts(state)}
+            words = f"{name}: {_describe(state, study.tissues)}"
+            self.context.tell(self.title, 0, 0, words, fit=True, facts=facts)
 
         if study.mesh.coarse is None:
             found = calibrate(
