@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import psutil
 import pytest
@@ -156,35 +155,6 @@ def test_doctor_says_what_there_is_and_what_cannot_be_written(tmp_path):
     (bad,) = [row for row in worse["checks"] if row["state"] == "failed"]
     assert bad["check"] == "write access"
     assert bad["remedy"]
-
-
-KILLS = [pytest.param(3, id="3"), pytest.param(30, id="30", marks=pytest.mark.slow)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kills", KILLS)
-def test_a_run_killed_at_random_moments_ends_the_same(alone, tmp_path, kills):
-    """Kill -9 until the stages before the meshes are done; stages that were finished are not done again."""
-    straight = shutil.copytree(alone, tmp_path / "straight")
-    start = time.monotonic()
-    assert run_cli("run", str(straight), "--until", "traces").returncode == 0
-    span = time.monotonic() - start
-    for i in range(kills):
-        begun = {stage: row["finished"] for stage, row in rows_of(alone).items()}
-        run = subprocess.Popen(
-            [sys.executable, "-m", "limbfit", "run", str(alone), "--until", "traces"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        time.sleep(span * (i + 1) / (kills + 1))
-        run.kill()
-        run.wait()
-        for stage, row in rows_of(alone).items():
-            assert begun[stage] is None or row["finished"] == begun[stage]
-    assert run_cli("run", str(alone), "--until", "traces").returncode == 0
-    for file in ("traces/1.csv", "traces/2.csv", "sites/sites.json"):
-        assert (alone / "results" / file).read_bytes() == (straight / "results" / file).read_bytes()
-    assert not list((alone / "results").glob(".work-*"))
 
 
 SOLVER = """

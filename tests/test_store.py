@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.store import Store, disk_errors, file_digest, lock, read_json, write_json
+from limbfit.pipeline.store import EARLIER, Store, disk_errors, file_digest, lock, read_json, write_json
 
 
 def test_stage_is_done_only_for_its_key(tmp_path):
@@ -48,6 +49,53 @@ def test_unfinished_work_of_other_inputs_is_dropped(tmp_path):
     store.work_folder("mesh", "old").mkdir()
     store.make("mesh", "new", lambda folder: {})
     assert not store.work_folder("mesh", "old").exists()
+
+
+def test_simulations_of_unfinished_work_of_other_inputs_are_kept_until_the_stage_is_done(tmp_path):
+    store = Store(tmp_path)
+    old = store.work_folder("calibrate", "old") / "runs"
+    old.mkdir(parents=True)
+    (old / "a.npz").write_bytes(b"a")
+
+    def produce(folder):
+        assert (folder / EARLIER / "a.npz").read_bytes() == b"a"
+        return {}
+
+    store.make("calibrate", "new", produce)
+    assert [p.name for p in store["calibrate"].iterdir()] == ["stage.json"]
+
+
+def test_a_stage_that_was_complete_when_killed_is_only_put_in_place(tmp_path):
+    store = Store(tmp_path)
+    store.make("mesh", "a", lambda folder: {"made": 1})
+    store["mesh"].rename(store.work_folder("mesh", "a"))  # killed just before the renaming
+
+    def again(folder):
+        raise AssertionError("the stage is done twice")
+
+    assert store.make("mesh", "a", again)["made"] == 1
+    assert store.state("mesh", "a").state == "done"
+
+
+def test_what_a_kill_between_renames_has_left_is_put_right(tmp_path):
+    store = Store(tmp_path)
+    for stage in ("mesh", "sites"):
+        store.make(stage, "a", lambda folder: {})
+    store["mesh"].rename(tmp_path / ".old-mesh")
+    (tmp_path / ".old-sites").mkdir()
+    (tmp_path / ".run.json.1234.part").write_text("{")
+    with lock(tmp_path):
+        assert store.state("mesh", "a").state == "done"
+        assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "mesh", "sites"]
+
+
+def test_a_file_is_readable_by_whom_the_user_lets_read(tmp_path):
+    before = os.umask(0o022)
+    try:
+        write_json(tmp_path / "x.json", 1)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "x.json").stat().st_mode & 0o777 == 0o644
 
 
 def test_failed_rewrite_leaves_the_old_file(tmp_path):

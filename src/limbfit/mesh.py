@@ -306,13 +306,16 @@ def _add_arrays(data: vtkFieldData, arrays: Mapping[str, NDArray]) -> None:
 
 
 def _write(grid: vtkUnstructuredGrid, path: Path) -> None:
+    draft = path.with_name(f".{path.name}.part")  # a run that is killed leaves no half of a mesh at ``path``
     writer = vtkXMLUnstructuredGridWriter()
-    writer.SetFileName(str(path))
+    writer.SetFileName(str(draft))
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
     if not writer.Write():
+        draft.unlink(missing_ok=True)
         raise ProblemError("cannot be written", file=path, remedy="check the folder and the free disk space")
+    draft.replace(path)
 
 
 def read_vtu(path: str | Path) -> Mesh:

@@ -1,14 +1,14 @@
 """Runs MMG in a process of its own: a mesher can take the interpreter down with it.
 
-Called as ``python _mmg_worker.py TASK.npz MESH.npz``; imports nothing of limbfit so that it starts quickly.
+Called as ``python _mmg_worker.py TASK.npz MESH.npz``; imports next to nothing of limbfit, to start quickly.
 """
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 from mmgpy import MmgMesh3D
+
+from limbfit.anatomy._worker import work
 
 SMALLEST_PART = 0.1  # of the smallest wanted edge: MMG's lower bound where curvature asks for more
 
@@ -39,7 +39,4 @@ def remesh(task: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    source, target = sys.argv[1:3]
-    with np.load(source) as stored:
-        outcome = remesh(dict(stored))
-    np.savez(target, allow_pickle=False, **outcome)
+    work(remesh)

@@ -1,16 +1,16 @@
 """Runs Netgen in a process of its own: a mesher can take the interpreter down with it.
 
-Called as ``python _netgen_worker.py TASK.npz MESH.npz``; imports nothing of limbfit, to start quickly.
+Called as ``python _netgen_worker.py TASK.npz MESH.npz``; imports next to nothing of limbfit, for its start.
 MMG remeshes the surface alone to the wanted edges; Netgen fills it and does not see the old tetrahedra.
 """
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 from mmgpy import MmgMeshS
 from netgen.meshing import FaceDescriptor, Mesh, MeshingParameters, Pnt
+
+from limbfit.anatomy._worker import work
 
 SMALLEST_PART = 0.1  # of the smallest wanted edge: MMG's lower bound where curvature asks for more
 GRADING = 0.5
@@ -61,7 +61,4 @@ def surface(task: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 if __name__ == "__main__":
-    source, target = sys.argv[1:3]
-    with np.load(source) as stored:
-        outcome = remesh(dict(stored))
-    np.savez(target, allow_pickle=False, **outcome)
+    work(remesh)

@@ -14,7 +14,7 @@ from ..indentation import Simulation, SimulationJob, SiteModel, simulate
 from ..study import Site, Study
 from .context import Context
 from .provenance import code_digest
-from .store import atomic, digest, file_digest
+from .store import EARLIER, RUNS, atomic, digest, file_digest
 
 ROOMS = ("fe", "indentation", "mesh")  # whose code decides a simulation
 COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
@@ -24,7 +24,8 @@ CURVE_POINTS = 81  # times, evenly over the indentation, at which measured and s
 class SimulationCache:
     """Finished simulations in ``folder``, one file each.
 
-    ``also`` are folders of earlier runs: what is found there is copied, since they may be replaced.
+    ``also`` are folders of earlier runs, beside those of interrupted attempts: what is found there is copied,
+    since they may be replaced.
     ``work`` does a job; what it tells beyond `simulate` is in the simulation's facts.
     """
 
@@ -35,7 +36,7 @@ class SimulationCache:
         work: Callable[[SimulationJob], Simulation] = simulate,
     ) -> None:
         self.folder, self.work = folder, work
-        self.places = (folder, *also)
+        self.places = (folder, folder.parent / EARLIER, *also)
         folder.mkdir(parents=True, exist_ok=True)
 
     def run(
@@ -160,5 +161,5 @@ def planned_model(context: Context, site: Site) -> SiteModel:
 
 def experiment_cache(context: Context, folder: Path) -> SimulationCache:
     """Simulations of the experiment in ``folder``; all others of the study count as done."""
-    others = sorted(place for place in context.store.folder.glob("*/runs") if place.parent != folder)
-    return SimulationCache(folder / "runs", also=others)
+    others = sorted(place for place in context.store.folder.glob(f"*/{RUNS}") if place.parent != folder)
+    return SimulationCache(folder / RUNS, also=others)

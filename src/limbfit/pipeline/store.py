@@ -2,7 +2,7 @@
 
 A stage works in ``results/.work-<stage>-<key>`` and is renamed to ``results/<stage>`` when complete. The key
 is a digest of everything the stage depends on, so a run that was killed finds its own unfinished folder again
-and goes on in it, and a folder of other inputs is dropped.
+and goes on in it. Of an unfinished folder of other inputs the simulations are kept, since some may serve.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +29,9 @@ except ImportError:  # Windows: no advisory lock there; the pid in the file stil
     fcntl = None  # type: ignore[assignment]
 
 STAMP = "stage.json"
+RUNS = "runs"  # a stage's kept simulations
+EARLIER = ".earlier"  # those of attempts with other inputs, while the stage is not complete
+_DRAFT, _OLD = ".part", ".old-"
 
 
 def digest(*parts: Any) -> str:
@@ -71,13 +74,13 @@ def _plain(value: Any) -> Any:
 @contextmanager
 def atomic(path: Path) -> Iterator[BinaryIO]:
     """A binary stream whose content appears at ``path`` only when the block ends well."""
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{_DRAFT}")
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with draft.open("xb") as stream:
             yield stream
-        os.replace(name, path)
+        os.replace(draft, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
         raise
 
 
@@ -122,37 +125,61 @@ class Store:
     def make(self, stage: str, key: str, produce: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
         """Run ``produce(folder)`` in the stage's work folder and put the folder in its place.
 
-        ``produce`` returns facts for the stamp. Seconds add up over interrupted attempts.
+        ``produce`` returns facts for the stamp. Seconds add up over interrupted attempts. A folder that was
+        complete when a run was killed is only put in its place.
         """
         work = self.work_folder(stage, key)
-        self._drop_others(stage, work)
         with disk_errors(self.folder):
             work.mkdir(parents=True, exist_ok=True)
-            clock = _Clock(work / ".seconds")
-            try:
-                facts = produce(work)
-            finally:
-                seconds = clock.stop()
-            clock.file.unlink(missing_ok=True)
-            stamp = {
-                "stage": stage,
-                "key": key,
-                "seconds": round(seconds, 3),
-                "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-                **facts,
-            }
-            write_json(work / STAMP, stamp)
+            if not (work / STAMP).is_file():
+                self._take_over_others(stage, work)
+                self._complete(stage, key, work, produce)
             self._put_in_place(work, self[stage])
-        return stamp
+        return read_json(self[stage] / STAMP)
 
-    def _drop_others(self, stage: str, keep: Path) -> None:
+    def _complete(self, stage: str, key: str, work: Path, produce: Callable[[Path], dict[str, Any]]) -> None:
+        clock = _Clock(work / ".seconds")
+        try:
+            facts = produce(work)
+        finally:
+            seconds = clock.stop()
+        clock.file.unlink(missing_ok=True)
+        shutil.rmtree(work / EARLIER, ignore_errors=True)
+        for draft in work.rglob(f".*{_DRAFT}"):  # of attempts that were killed while writing
+            draft.unlink()
+        stamp = {
+            "stage": stage,
+            "key": key,
+            "seconds": round(seconds, 3),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            **facts,
+        }
+        write_json(work / STAMP, stamp)
+
+    def _take_over_others(self, stage: str, work: Path) -> None:
+        """Drop unfinished folders of other inputs, but for their simulations."""
+        earlier = work / EARLIER
         for folder in self.folder.glob(f".work-{stage}-*"):
-            if folder != keep:
+            if folder != work:
+                for file in (*folder.glob(f"{EARLIER}/*.npz"), *folder.glob(f"{RUNS}/*.npz")):
+                    earlier.mkdir(exist_ok=True)
+                    file.rename(earlier / file.name)
                 shutil.rmtree(folder, ignore_errors=True)
+
+    def mend(self) -> None:
+        """Put right what a run that was killed while it wrote or renamed has left."""
+        for draft in self.folder.glob(f".*{_DRAFT}"):
+            draft.unlink()
+        for old in self.folder.glob(f"{_OLD}*"):
+            place = self.folder / old.name.removeprefix(_OLD)
+            if place.exists():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.rename(place)
 
     def _put_in_place(self, work: Path, place: Path) -> None:
         """Renames only: at each moment the old folder, none, or the new one stands there, never a mixture."""
-        old = self.folder / f".old-{place.name}"
+        old = self.folder / f"{_OLD}{place.name}"
         shutil.rmtree(old, ignore_errors=True)
         if place.exists():
             place.rename(old)
@@ -165,13 +192,13 @@ class _Clock:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.before = float(file.read_text()) if file.is_file() else 0.0
+        self.before = float(read_json(file)) if file.is_file() else 0.0
         self.start = perf_counter()
 
     def stop(self) -> float:
         total = self.before + perf_counter() - self.start
         if self.file.parent.is_dir():
-            self.file.write_text(f"{total:.3f}")
+            write_json(self.file, round(total, 3))
         return total
 
 
@@ -225,4 +252,6 @@ def lock(folder: Path) -> Iterator[None]:
         stream.truncate()
         stream.write(f"process {os.getpid()} (since {datetime.now(UTC):%Y-%m-%d %H:%M} UTC)")
         stream.flush()
+        with disk_errors(folder):
+            Store(folder).mend()
         yield

@@ -1,0 +1,128 @@
+"""Kill -9 of a whole run at random moments: the next run ends the same, and does nothing twice."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from conftest import COARSE
+from limbfit.mesh import read_vtu
+from limbfit.pipeline.run import STAGE_NAMES
+
+READERS = {
+    ".json": lambda file: json.loads(file.read_text()),
+    ".npz": lambda file: [array.shape for array in np.load(file).values()],
+    ".vtu": read_vtu,
+    ".csv": lambda file: np.array(list(csv.reader(file.open(encoding="utf-8")))),  # rows of one length
+}
+SAME = ("sites/sites.json", "traces/*.csv", "mesh/*.vtu", "calibrate/calibration.json", "predict/*.csv")
+
+
+def begin(folder: Path, workers: int) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "limbfit", "run", str(folder), "--workers", str(workers)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+    )
+
+
+def finish(folder: Path, workers: int) -> None:
+    run = begin(folder, workers)
+    _, err = run.communicate(timeout=600)
+    assert run.returncode == 0, err
+
+
+def finished(results: Path) -> dict[str, str]:
+    """When each stage that stands in its place was done."""
+    files = {stage: results / stage / "stage.json" for stage in STAGE_NAMES}
+    return {stage: file.read_text() for stage, file in files.items() if file.is_file()}
+
+
+def kept(results: Path) -> dict[tuple[str, str], int]:
+    """When each kept simulation was written, by its stage and name, wherever it lies now."""
+    found = {}
+    for file in [*results.glob("*/runs/*.npz"), *results.glob(".work-*/runs/*.npz")]:
+        stage = file.parent.parent.name.removeprefix(".work-").split("-")[0]
+        found[stage, file.name] = file.stat().st_mtime_ns
+    return found
+
+
+def assert_whole(results: Path) -> None:
+    """Every file of every finished stage can be read."""
+    for stage in finished(results):
+        for file in (results / stage).rglob("*"):
+            if file.suffix in READERS and not file.name.startswith("."):
+                READERS[file.suffix](file)
+
+
+def group_is_empty(group: int, within_s: float = 5.0) -> bool:
+    """Whether all processes of a killed run are gone soon: workers and meshers too."""
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        alive = [p for p in psutil.process_iter() if _group_of(p.pid) == group and p.status() != "zombie"]
+        if not alive:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def _group_of(pid: int) -> int | None:
+    try:
+        return os.getpgid(pid)
+    except ProcessLookupError:
+        return None
+
+
+def killed(folder: Path, after_s: float, workers: int) -> str:
+    """Start a run and kill its main process; what was under way."""
+    run = begin(folder, workers)
+    time.sleep(after_s)
+    run.send_signal(signal.SIGKILL)
+    run.communicate()
+    assert group_is_empty(run.pid)
+    done = finished(folder / "results")
+    return next((stage for stage in STAGE_NAMES if stage not in done and stage != "segment"), "nothing")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [3, 30])
+def test_a_run_killed_at_random_moments_ends_the_same(study, tmp_path, kills):
+    file = study / "study.toml"
+    file.write_text(file.read_text() + COARSE)
+    straight = shutil.copytree(study, tmp_path / "straight")
+    start = time.monotonic()
+    finish(straight, 1)
+    span = time.monotonic() - start
+    moments = np.random.default_rng(7).uniform(0.1 * span, span, kills)
+    for i, moment in enumerate(moments):
+        folder, workers = shutil.copytree(study, tmp_path / f"killed-{i}"), 1 + i % 2
+        results = folder / "results"
+        where = killed(folder, moment, workers)
+        print(f"kill {i + 1}: {moment:.1f} s of {span:.1f} s, {workers} worker(s), before {where} was done")
+        assert_whole(results)
+        stages, simulations = finished(results), kept(results)
+        finish(folder, workers)
+        assert_whole(results)
+        now, again = finished(results), kept(results)
+        assert all(now[stage] == stamp for stage, stamp in stages.items())
+        assert all(again[name] == written for name, written in simulations.items())
+        for pattern in SAME:
+            for one in straight.glob(f"results/{pattern}"):
+                assert (results / one.relative_to(straight / "results")).read_bytes() == one.read_bytes(), one
+        names = [p.name for p in results.rglob(".*") if p.name != ".lock"]
+        assert not names, names
+        shutil.rmtree(folder)
