@@ -6,8 +6,9 @@ make themselves (inline SVG in which names were already escaped).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,18 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Interactive:
+    """A figure that a script makes: ``what`` names how, ``content`` is its data, ``label`` what it shows."""
+
+    kind: ClassVar[str] = "interactive"
+    name: str
+    what: str
+    label: str
+    caption: str
+    content: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class Cell:
     """A table cell. ``share`` in [0, 1] draws a bar behind it, ``shade`` in [-1, 1] a diverging colour."""
 
@@ -76,7 +89,7 @@ class Table:
     folded: bool = False
 
 
-Block = Prose | Note | Bullets | Figure | Table
+Block = Prose | Note | Bullets | Figure | Interactive | Table
 
 
 @dataclass(frozen=True)

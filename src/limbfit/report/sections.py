@@ -9,6 +9,7 @@ from . import figures, pictures, tables
 from .comparison import comparison
 from .doubts import doubts
 from .experiments import experiment_sections
+from .interactive import convergence_curves, explorer, record_curves
 from .methods import method_section
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
 from .slices import slices_figure
@@ -175,6 +176,7 @@ def _verdict(store: Store) -> tuple[str, ...]:
 def model(store: Store) -> Section:
     """Surfaces, sites and volumes."""
     blocks = _blocks(
+        explorer(store),
         slices_figure(store),
         pictures.surface_figure(store),
         pictures.marker_figure(store),
@@ -207,6 +209,7 @@ def records(store: Store) -> Section:
     chosen = [site for site in (*store.fitted, *store.traces) if store.curves("traces", site)]
     blocks = _blocks(
         figures.record_figure(store, chosen[0]) if chosen else None,
+        record_curves(store, tuple(dict.fromkeys(chosen))),
         tables.trace_table(store) if store.traces else None,
         otherwise="No indentation records are stored yet.",
     )
@@ -287,7 +290,11 @@ def convergence(store: Store) -> Section:
         tables.iteration_table(stage) for stage in stages if stage.get("iterations")
     )
     blocks = _blocks(
-        Bullets(texts) if texts else None, figure, *details, otherwise="No identification is stored yet."
+        Bullets(texts) if texts else None,
+        figure,
+        convergence_curves(store),
+        *details,
+        otherwise="No identification is stored yet.",
     )
     return Section("convergence", "Convergence of the identification", blocks)
 

@@ -1,9 +1,9 @@
 """Named arrays as one block of bytes that a script reads without copying, and back.
 
-The block is: 8 bytes ``LFARRAY1``; the length of the head, uint32; the head, JSON padded with spaces so that what
-follows stands at a multiple of 8; the arrays, each at a multiple of 8 from there on. All numbers are
-little-endian. The head has ``arrays``: name to ``type`` (``f4``, ``u4``, ``u2``, ``u1``, ``i4``), ``shape`` and
-``at`` (bytes from the end of the head), and ``facts``: any JSON. ``static/arrays.js`` reads it.
+The block is: 8 bytes ``LFARRAY1``; the length of the head, uint32; the head, JSON padded with spaces so that
+what follows stands at a multiple of 8; the arrays, each at a multiple of 8 from there on. All numbers are
+little-endian. The head has ``arrays``: name to ``type`` (``f4``, ``u4``, ``u2``, ``u1``, ``i4``), ``shape``
+and ``at`` (bytes from the end of the head), and ``facts``: any JSON. ``static/arrays.js`` reads it.
 """
 
 from __future__ import annotations

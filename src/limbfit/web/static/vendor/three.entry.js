@@ -1,8 +1,6 @@
-// What three.min.js holds: the parts of three.js that viewer.js uses. See VENDOR.md.
+// What three.min.js holds: the parts of three.js that camera.js and viewer.js use. See VENDOR.md.
 export {
-  WebGLRenderer, Scene, OrthographicCamera, Group, Mesh, LineSegments, BufferGeometry, BufferAttribute, ShaderMaterial,
-  MeshLambertMaterial, MeshBasicMaterial, LineBasicMaterial, HemisphereLight, DirectionalLight, DataTexture, SphereGeometry,
-  CylinderGeometry, ConeGeometry, Raycaster, Vector2, Vector3, Matrix4, Box3, Sphere, Plane, Quaternion, Color, DoubleSide,
-  FrontSide, RGBAFormat, LinearFilter, ColorManagement,
+  WebGLRenderer, Scene, OrthographicCamera, Group, Mesh, BufferGeometry, BufferAttribute, ShaderMaterial, MeshLambertMaterial,
+  MeshBasicMaterial, HemisphereLight, DirectionalLight, DataTexture, SphereGeometry, CylinderGeometry, Raycaster, Vector2,
+  Vector3, Box3, Color, DoubleSide, RGBAFormat, LinearFilter, ColorManagement,
 } from "three";
-export { TrackballControls } from "three/examples/jsm/controls/TrackballControls.js";
