@@ -17,7 +17,7 @@ FLOORS = [
     {"bench"},
     {"report", "phantom"},
     {"indentation"},
-    {"study", "febio", "fields"},
+    {"study", "febio", "fields", "acquire"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh"},
     {"errors", "_version"},

@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import Field, field_validator, model_validator
 
 from ..errors import StudyError
+from .acquisition import AcquireTable
 from .tables import (
     PARAMETERS,
     CalibrationTable,
@@ -48,6 +49,7 @@ class Study(Table):
     solver: SolverTable = SolverTable()
     febio: FebioTable = FebioTable()
     execution: ExecutionTable = ExecutionTable()
+    acquire: AcquireTable = AcquireTable()
     file: Path = Field(default=Path("study.toml"), exclude=True)
     notes: tuple[str, ...] = Field(default=(), exclude=True)
 

@@ -1,0 +1,148 @@
+"""limbfit's end of the line protocol, without a wire: bytes in, reports out; commands in, bytes out.
+
+A command that the device does not answer is sent again under a new number; one that is replaced by a newer
+one for the same pin is not.  Nothing here reads a clock: times are given, in s.
+"""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+
+from ..errors import RunError
+from .events import PINS, RATE_HZ, Hold, Move, Sample, Stop
+from .messages import (
+    Accepted,
+    Beat,
+    Bye,
+    Command,
+    Declined,
+    Hello,
+    Identity,
+    OutOfReach,
+    Report,
+    SetLimits,
+    Tripped,
+    command_body,
+    parse_report,
+)
+from .wire import DEVICE_LINE, VERSION, Decoder, Encoder, Refusals, salt_of
+
+AGAIN_S = 0.006  # a command is answered at once: after so long it is sent again
+ATTEMPTS = 6
+
+
+@dataclass
+class _Pending:
+    command: Command
+    due: float
+    attempts: int = 1
+
+
+class HostEnd:
+    """Encodes, decodes, numbers, repeats; one per session."""
+
+    def __init__(self) -> None:
+        self.nonce = secrets.token_hex(8)
+        self.identity: Identity | None = None
+        self._encoder = Encoder(first=0)
+        self._decoder = Decoder(DEVICE_LINE, last=-1)
+        self._pending: dict[int, _Pending] = {}
+
+    @property
+    def refused(self) -> Refusals:
+        return self._decoder.refused
+
+    def hello(self) -> bytes:
+        """The greeting; its answer comes out of `greet`."""
+        return self._encoder.encode(Hello(self.nonce).body)[1]
+
+    def greet(self, data: bytes) -> Identity | None:
+        """Bytes until the device has said who it is.
+
+        Raises
+        ------
+        RunError
+            Where it is another version, has other pins or another rate than limbfit knows.
+        """
+        for line in self._decoder.feed(data):
+            report = parse_report(line.body, line.number)
+            if not isinstance(report, Identity):
+                self.refused.unknown += 1
+                continue
+            _check(report)
+            salt = salt_of(self.nonce, report.nonce)
+            self._encoder = Encoder(salt)
+            self._decoder.restart(salt)
+            self.identity = report
+            return report
+        return None
+
+    def send(self, command: Command, now: float) -> bytes:
+        """The line of a command; one that needs an answer is remembered until it comes."""
+        number, line = self._encoder.encode(command_body(command))
+        if isinstance(command, (Beat, Bye)):
+            return line
+        self._replace(command)
+        self._pending[number] = _Pending(command, now + AGAIN_S)
+        return line
+
+    def _replace(self, command: Command) -> None:
+        """What a newer command makes void: the older ones for its pin; a stop, all."""
+        match command:
+            case Stop():
+                self._pending.clear()
+            case Move(pin=pin) | Hold(pin=pin):
+                for number, old in list(self._pending.items()):
+                    if isinstance(old.command, (Move, Hold)) and old.command.pin == pin:
+                        del self._pending[number]
+
+    def feed(self, data: bytes) -> list[Sample | Declined | Tripped | OutOfReach]:
+        """What the device says that concerns the session, in order."""
+        found: list[Sample | Declined | Tripped | OutOfReach] = []
+        for line in self._decoder.feed(data):
+            report: Report | None = parse_report(line.body, line.number)
+            match report:
+                case None | Identity():
+                    self.refused.unknown += 1
+                case Accepted(number=number):
+                    self._pending.pop(number, None)
+                case Declined(number=number):
+                    if self._pending.pop(number, None) is not None:
+                        found.append(report)
+                case _:
+                    found.append(report)
+        return found
+
+    def again(self, now: float) -> tuple[bytes, str]:
+        """Lines of commands that went unanswered; and, where one did too often, what to stop for."""
+        lines, reason = b"", ""
+        for number, waiting in list(self._pending.items()):
+            if now < waiting.due:
+                continue
+            del self._pending[number]
+            if waiting.attempts >= ATTEMPTS and not isinstance(waiting.command, Stop):
+                reason = "the device does not answer commands"
+                continue
+            fresh, line = self._encoder.encode(command_body(waiting.command))
+            self._pending[fresh] = _Pending(waiting.command, now + AGAIN_S, waiting.attempts + 1)
+            lines += line
+        return lines, reason
+
+
+def limits_command(
+    pin: int, force_mN: int, clamp_mN: int, stroke_um: int, speed_um_s: int, watchdog_ms: float
+) -> SetLimits:
+    """The device's share of a session's limits."""
+    return SetLimits(pin, force_mN, clamp_mN, stroke_um, speed_um_s, max(round(watchdog_ms), 1))
+
+
+def _check(identity: Identity) -> None:
+    if identity.version != VERSION:
+        raise RunError(
+            f"the device speaks version {identity.version} of the protocol, limbfit {VERSION}; "
+            "see docs/device-protocol.md"
+        )
+    if (identity.pins, identity.rate_hz) != (PINS, RATE_HZ):
+        found = f"{identity.pins} pins at {identity.rate_hz} Hz"
+        raise RunError(f"the device has {found}; limbfit knows {PINS} at {RATE_HZ} Hz")

@@ -1,0 +1,276 @@
+"""What lines say: each message as a type, to a body and from one.
+
+A body that is not exactly one of these is no message: `parse_command` and `parse_report` return None, and the
+line is counted as unknown and not acted on.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from .events import PINS, Fence, Hold, Move, Sample, Stop
+from .wire import VERSION
+
+WORD = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}"
+_WORD = re.compile(rf"{WORD}\Z", re.ASCII)
+_INTEGER = re.compile(r"-?[0-9]{1,9}\Z", re.ASCII)
+_NONCE = re.compile(r"[0-9a-f]{16}\Z")
+_SAMPLE = re.compile(
+    rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
+)
+MAX_MICRO = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
+
+
+# -- from limbfit to the device
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Opens a session; the only line without salt."""
+
+    nonce: str
+    version: int = VERSION
+
+    @property
+    def body(self) -> str:
+        return f"HELLO {self.version} {self.nonce}"
+
+
+@dataclass(frozen=True, slots=True)
+class SetLimits:
+    """The device's own limits for this session: it takes the lower of these and those built in."""
+
+    pin: int
+    force_mN: int
+    clamp_mN: int
+    position_um: int
+    speed_um_s: int
+    watchdog_ms: int
+
+    @property
+    def body(self) -> str:
+        return (
+            f"LIMITS {self.pin} {self.force_mN} {self.clamp_mN} {self.position_um} {self.speed_um_s} "
+            f"{self.watchdog_ms}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """What the session is at, for the device's display and log: ``SITE`` or ``PHASE`` and a word."""
+
+    kind: str
+    word: str
+
+    @property
+    def body(self) -> str:
+        return f"{self.kind} {self.word}"
+
+
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """limbfit lives, and has dealt with the sample of this number."""
+
+    number: int
+
+    @property
+    def body(self) -> str:
+        return f"BEAT {self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class Bye:
+    """Ends the session."""
+
+    body = "BYE"
+
+
+Command = Hello | SetLimits | Note | Beat | Bye | Move | Hold | Stop | Fence
+
+
+def command_body(command: Command) -> str:
+    """The body of a command; the reason of a stop becomes a word, since reasons hold what devices said."""
+    match command:
+        case Move(pin, target, speed, halt):
+            return f"MOVE {pin} {target} {speed} {halt}"
+        case Hold(pin):
+            return f"HOLD {pin}"
+        case Fence(pin, position):
+            return f"FENCE {pin} {position}"
+        case Stop():
+            return "STOP"
+    return command.body
+
+
+def parse_command(body: str) -> Command | None:
+    """The command that a body states, or None."""
+    verb, *words = body.split(" ")
+    if verb in ("SITE", "PHASE") and len(words) == 1:
+        return Note(verb, words[0]) if _WORD.match(words[0]) else None
+    if verb == "HELLO" and len(words) == 2:
+        version = _integers(words[:1])
+        return Hello(words[1], version[0]) if version and _NONCE.match(words[1]) else None
+    numbers = _integers(words)
+    if numbers is None or any(abs(n) > MAX_MICRO for n in numbers if verb != "BEAT"):
+        return None
+    match verb, numbers:
+        case "BEAT", [number]:
+            return Beat(number)
+        case "MOVE", [pin, target, speed, halt] if _is_pin(pin) and target >= 0 < speed and halt >= 0:
+            return Move(pin, target, speed, halt)
+        case "HOLD", [pin] if _is_pin(pin):
+            return Hold(pin)
+        case "FENCE", [pin, position] if _is_pin(pin) and position > 0:
+            return Fence(pin, position)
+        case "STOP", []:
+            return Stop("")
+        case "BYE", []:
+            return Bye()
+        case "LIMITS", [pin, force, clamp, position, speed, watchdog] if _is_pin(pin) and min(numbers) > 0:
+            return SetLimits(pin, force, clamp, position, speed, watchdog)
+    return None
+
+
+def _is_pin(pin: int) -> bool:
+    return 1 <= pin <= PINS
+
+
+def _integers(words: list[str]) -> list[int] | None:
+    return [int(word) for word in words] if all(_INTEGER.match(word) for word in words) else None
+
+
+# -- from the device to limbfit
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a device says of itself when greeted.
+
+    ``clock`` is ``real``, or ``paced``: the device's time waits for limbfit, which then lives by it.
+    ``touch_fF`` is the capacitance of a head that touches skin; ``calibrated`` the day of its calibration.
+    """
+
+    nonce: str
+    pins: int
+    rate_hz: int
+    stroke_um: int
+    range_mN: int
+    touch_fF: int
+    clock: str
+    model: str
+    serial: str
+    calibrated: str
+    version: int = VERSION
+
+    @property
+    def body(self) -> str:
+        return (
+            f"ID {self.version} {self.nonce} {self.pins} {self.rate_hz} {self.stroke_um} {self.range_mN} "
+            f"{self.touch_fF} {self.clock} {self.model} {self.serial} {self.calibrated}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The command of this number is being done."""
+
+    number: int
+
+    @property
+    def body(self) -> str:
+        return f"OK {self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class Declined:
+    """The command of this number is not done, and why, in a word."""
+
+    number: int
+    code: str
+
+    @property
+    def body(self) -> str:
+        return f"NO {self.number} {self.code}"
+
+
+@dataclass(frozen=True, slots=True)
+class Tripped:
+    """The device stopped by itself: why, in a word, and at which pin (0: none)."""
+
+    code: str
+    pin: int
+
+    @property
+    def body(self) -> str:
+        return f"FAULT {self.code} {self.pin}"
+
+
+@dataclass(frozen=True, slots=True)
+class OutOfReach:
+    """After a stop these pins (a bit each) do not come home."""
+
+    pins: int
+
+    @property
+    def body(self) -> str:
+        return f"STUCK {self.pins}"
+
+
+Report = Identity | Accepted | Declined | Tripped | OutOfReach | Sample
+
+
+def sample_body(sample: Sample) -> str:
+    channels = (*sample.position_um, *sample.force_mN, *sample.capacitance_fF)
+    return f"S {sample.time_us},{sample.flags},{sample.moving}," + ",".join(map(str, channels))
+
+
+def parse_report(body: str, number: int) -> Report | None:
+    """The report that a body states, or None; ``number`` is its line's."""
+    if body.startswith("S "):
+        return _sample(body, number)
+    verb, *words = body.split(" ")
+    if verb == "ID" and len(words) == 11:
+        return _identity(words)
+    if verb == "NO" and len(words) == 2 and _INTEGER.match(words[0]) and _WORD.match(words[1]):
+        return Declined(int(words[0]), words[1])
+    if verb == "FAULT" and len(words) == 2 and _WORD.match(words[0]) and _INTEGER.match(words[1]):
+        pin = int(words[1])
+        return Tripped(words[0], pin) if pin == 0 or _is_pin(pin) else None
+    numbers = _integers(words)
+    match verb, numbers:
+        case "OK", [done]:
+            return Accepted(done)
+        case "STUCK", [pins] if 0 <= pins < 1 << PINS:
+            return OutOfReach(pins)
+    return None
+
+
+def _sample(body: str, number: int) -> Sample | None:
+    match = _SAMPLE.match(body)
+    if match is None:
+        return None
+    values = tuple(map(int, match[4][1:].split(",")))
+    return Sample(
+        number,
+        int(match[1]),
+        int(match[2]),
+        int(match[3]),
+        values[:PINS],
+        values[PINS : 2 * PINS],
+        values[2 * PINS :],
+    )
+
+
+def _identity(words: list[str]) -> Identity | None:
+    numbers = _integers([words[0], *words[2:7]])
+    names = words[8:]
+    if numbers is None or not _NONCE.match(words[1]) or not all(map(_WORD.match, names)):
+        return None
+    if min(numbers) <= 0 or words[7] not in ("real", "paced"):
+        return None
+    version, pins, rate, stroke, range_mN, touch = numbers
+    model, serial, calibrated = names
+    return Identity(
+        words[1], pins, rate, stroke, range_mN, touch, words[7], model, serial, calibrated, version
+    )

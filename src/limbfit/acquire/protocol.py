@@ -1,0 +1,341 @@
+"""The protocol's state machine: events in, actions out, no clock, no wire, no file.
+
+One `Protocol` is one session.  `Protocol.handle` takes an event and the time in s (of whatever clock its
+caller has), and returns what is to be done.  Where a session can go stands in `phases.TRANSITIONS` alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .events import (
+    PERIOD_US,
+    Abort,
+    Action,
+    Begin,
+    Confirm,
+    Event,
+    Fence,
+    Flags,
+    Hold,
+    KeyDown,
+    KeyUp,
+    LinkLost,
+    Move,
+    Sample,
+    Stop,
+)
+from .phases import CLAMPED, FINAL, TRANSITIONS, WAITS_FOR_OPERATOR, Outcome, Phase
+from .safety import ClampWatch, Guard, Violation, deaf, device_violation, session_limits
+from .settings import Settings, micro
+
+QUIET_S = 0.05  # a command is under way for less: nothing is concluded from a pin that does not move yet
+NEAR_UM = 60  # a pin that is so near to its target has arrived
+CLAMP_ROUNDS = 8
+SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
+STOP_PATIENCE_S = 15.0  # and so is one that has not come home by then
+
+
+@dataclass(frozen=True)
+class Device:
+    """What a session must know of the device: see `device.Identity`."""
+
+    stroke_um: int
+    range_mN: int
+    touch_fF: int
+
+
+class Protocol:
+    """One session's state, changed by `handle` alone.
+
+    Attributes
+    ----------
+    phase : where the session is; ``reason``: why it was stopped, empty where it was not.
+    touch_um, start_um, depth_um : positions of the test pin, as they are found.
+    cycle : ramps begun so far, those of preconditioning included.
+    """
+
+    def __init__(self, settings: Settings, device: Device) -> None:
+        self.settings, self.device = settings, device
+        self.phase, self.reason = Phase.IDLE, ""
+        self.touch_um = self.start_um = self.depth_um = self.cycle = 0
+        self.guard = Guard(
+            session_limits(settings, device.stroke_um, device.range_mN, 1_000_000 // PERIOD_US)
+        )
+        self._watch = ClampWatch(settings.clamps)
+        self._entered = self._heard = 0.0
+        self._rounds = 0
+        self._key = False
+        self._tare: list[int] = []
+        self._touching: int | None = None  # where the capacitance first said so
+
+    @property
+    def is_over(self) -> bool:
+        return self.phase in FINAL
+
+    def handle(self, event: Event, now: float) -> tuple[Action, ...]:
+        """What an event leads to.
+
+        Parameters
+        ----------
+        now : s, never less than in the call before.
+        """
+        if isinstance(event, Sample):
+            self._heard = now
+            return self._sample(event, now)
+        if self.is_over:
+            return ()
+        match event:
+            case Begin() if self.phase is Phase.IDLE:
+                self._heard = now
+                return self._go(Outcome.BEGUN, now)
+            case Abort(reason=reason):
+                return self._stop(reason, now)
+            case LinkLost(reason=reason):
+                return self._lost(reason, now)
+            case Confirm() if self.phase is Phase.POSITION:
+                self._key = True
+            case KeyDown() if self.phase is Phase.READY:
+                return self._go(Outcome.KEY_HELD, now)
+            case KeyUp() if self.phase is Phase.SEARCH:
+                self._key = False
+                return (Hold(self.settings.pin),)
+        return self._late(now)
+
+    # -- whatever the phase
+
+    def _sample(self, sample: Sample, now: float) -> tuple[Action, ...]:
+        if self.phase in FINAL or self.phase is Phase.IDLE:
+            return ()
+        if self.phase is not Phase.STOPPING:
+            wrong = device_violation(sample.flags) or self.guard.check(sample) or self._in_phase(sample)
+            if wrong:
+                return self._stop(wrong.text, now)
+        outcome = _ENDS[self.phase](self, sample, now)
+        return self._go(outcome, now) if outcome else self._late(now)
+
+    def _in_phase(self, sample: Sample) -> Violation | None:
+        """Limits that hold in some phases only."""
+        if self.phase in CLAMPED and (wrong := self._watch.check(sample)):
+            return wrong
+        pin = self.settings.pin
+        if self.phase is Phase.APPROACH and self._touching is not None:
+            felt, travel = self._felt(sample), sample.position_um[pin - 1] - self._touching
+        elif self.phase in (Phase.SEARCH, Phase.LOAD):
+            felt, travel = self._felt(sample), sample.position_um[pin - 1] - self.touch_um
+        else:
+            return None
+        return deaf(travel, felt, micro(self.settings.touch_N) // 2, pin)
+
+    def _late(self, now: float) -> tuple[Action, ...]:
+        """Every phase has its time."""
+        if self.phase in FINAL or self.phase is Phase.IDLE:
+            return ()
+        if self.phase is Phase.STOPPING:
+            silent, long = now - self._heard > SILENCE_S, now - self._entered > STOP_PATIENCE_S
+            return self._go(Outcome.OUT_OF_REACH, now) if silent or long else ()
+        waits = self.phase in WAITS_FOR_OPERATOR
+        limit = self.settings.operator_limit_s if waits else self.settings.time_limit_s
+        if now - self._entered > limit:
+            return self._stop(f"{self.phase} took longer than {limit:g} s", now)
+        return ()
+
+    def _stop(self, reason: str, now: float) -> tuple[Action, ...]:
+        if (self.phase, Outcome.STOP) not in TRANSITIONS:
+            return ()
+        self.reason = reason
+        return self._go(Outcome.STOP, now)
+
+    def _lost(self, reason: str, now: float) -> tuple[Action, ...]:
+        self.reason = f"{self.reason}; {reason}" if self.reason else reason
+        if self.phase is not Phase.STOPPING:
+            self._go(Outcome.STOP, now)
+        return self._go(Outcome.OUT_OF_REACH, now)
+
+    def _go(self, outcome: Outcome, now: float) -> tuple[Action, ...]:
+        self.phase = TRANSITIONS[self.phase, outcome]
+        self._entered = now
+        enter = _ENTERS.get(self.phase)
+        return enter(self) if enter else ()
+
+    # -- moves
+
+    def _drive(self, target_um: int, speed_mm_s: float, halt_mN: int = 0) -> tuple[Action, ...]:
+        return (Move(self.settings.pin, target_um, micro(speed_mm_s), halt_mN),)
+
+    def _home(self, pins: tuple[int, ...]) -> tuple[Action, ...]:
+        return tuple(Move(pin, 0, micro(self.settings.retract_speed_mm_s)) for pin in pins)
+
+    def _enter_position(self) -> tuple[Action, ...]:
+        self._key = False
+        return self._home(tuple(range(1, len(self.guard.limits.force_mN) + 1)))
+
+    def _enter_clamp(self) -> tuple[Action, ...]:
+        self._rounds += 1
+        speed = self.settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5)
+        halt = micro(self.settings.clamp_N)
+        return tuple(Move(pin, self.device.stroke_um, micro(speed), halt) for pin in self.settings.clamps)
+
+    def _enter_approach(self) -> tuple[Action, ...]:
+        self._touching = None
+        halt = self._zero() + micro(self.settings.touch_N)
+        return self._drive(self.device.stroke_um, self.settings.approach_speed_mm_s, max(halt, 1))
+
+    def _enter_start(self) -> tuple[Action, ...]:
+        fence = Fence(self.settings.pin, self._deepest())
+        return (fence, *self._drive(self.start_um, self.settings.retract_speed_mm_s))
+
+    def _enter_search(self) -> tuple[Action, ...]:
+        self._key, self.depth_um = True, 0
+        deepest = self.touch_um + micro(self.settings.search_depth_mm)
+        halt = self._zero() + micro(self.settings.search_force_N)
+        return self._drive(min(deepest, self.device.stroke_um), self.settings.search_speed_mm_s, halt)
+
+    def _enter_load(self) -> tuple[Action, ...]:
+        self.cycle += 1
+        return self._drive(self.depth_um, self.settings.ramp_speed_mm_s)
+
+    def _enter_unload(self) -> tuple[Action, ...]:
+        return self._drive(self.start_um, self.settings.ramp_speed_mm_s)
+
+    def _enter_retract(self) -> tuple[Action, ...]:
+        return self._home((self.settings.pin,))
+
+    def _enter_release(self) -> tuple[Action, ...]:
+        return self._home(self.settings.clamps)
+
+    def _enter_stopping(self) -> tuple[Action, ...]:
+        return (Stop(self.reason),)
+
+    # -- how phases end
+
+    def _zero(self) -> int:
+        """What the test pin's sensor shows off the skin."""
+        return sum(self._tare) // len(self._tare) if self._tare else 0
+
+    def _deepest(self) -> int:
+        return min(self.touch_um + micro(self.settings.depth_limit_mm), self.device.stroke_um)
+
+    def _felt(self, sample: Sample) -> int:
+        return sample.force_mN[self.settings.pin - 1] - self._zero()
+
+    def _rests(self, sample: Sample, now: float, pins: tuple[int, ...]) -> bool:
+        return now - self._entered > QUIET_S and not any(sample.is_moving(pin) for pin in pins)
+
+    def _arrived(self, sample: Sample, now: float, target_um: int) -> bool:
+        pin = self.settings.pin
+        near = abs(sample.position_um[pin - 1] - target_um) < NEAR_UM
+        return near and self._rests(sample, now, (pin,))
+
+    def _end_position(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.IN_PLACE if self._key and sample.flags & Flags.HOME else None
+
+    def _end_clamp(self, sample: Sample, now: float) -> Outcome | None:
+        pins = self.settings.clamps
+        return Outcome.FORCES_REACHED if self._rests(sample, now, pins) else None
+
+    def _end_settle(self, sample: Sample, now: float) -> Outcome | None:
+        self._tare.append(sample.force_mN[self.settings.pin - 1])
+        if now - self._entered < self.settings.settle_s:
+            return None
+        least = micro(self.settings.clamp_N - self.settings.clamp_tolerance_N)
+        force, pin = min((sample.force_mN[pin - 1], pin) for pin in self.settings.clamps)
+        if force >= least:
+            return Outcome.HELD
+        if self._rounds < CLAMP_ROUNDS:
+            return Outcome.SLACKENED
+        return self._fail(f"pin {pin} clamps with {force / 1000:.1f} N only, after {CLAMP_ROUNDS} rounds")
+
+    def _end_approach(self, sample: Sample, now: float) -> Outcome | None:
+        pin = self.settings.pin
+        touches = sample.capacitance_fF[pin - 1] >= self.device.touch_fF
+        if touches and self._touching is None:
+            self._touching = sample.position_um[pin - 1]
+        if not self._rests(sample, now, (pin,)):
+            return None
+        if self._felt(sample) >= micro(self.settings.touch_N) // 2 and touches:
+            self.touch_um = sample.position_um[pin - 1]
+            self.start_um = max(self.touch_um - micro(self.settings.start_gap_mm), 0)
+            self.guard.set_depth(pin, self._deepest())
+            return Outcome.TOUCHED
+        if touches:
+            return None  # the limb gave way: the limits of deafness and time decide
+        if self._felt(sample) >= micro(self.settings.touch_N) // 2:
+            return self._fail(f"pin {pin} feels a force where its capacitance sees no skin")
+        return self._fail(f"pin {pin} met nothing up to the end of its stroke")
+
+    def _end_back(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.AT_START if self._arrived(sample, now, self.start_um) else None
+
+    def _end_search(self, sample: Sample, now: float) -> Outcome | None:
+        self.depth_um = max(self.depth_um, sample.position_um[self.settings.pin - 1])
+        if not self._rests(sample, now, (self.settings.pin,)):
+            return None
+        enough = self.depth_um - self.touch_um >= micro(self.settings.min_depth_mm)
+        return Outcome.DEPTH_FOUND if enough else Outcome.TOO_SHALLOW
+
+    def _end_pause(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.RESTED if now - self._entered >= self.settings.pause_s else None
+
+    def _end_load(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.AT_DEPTH if self._arrived(sample, now, self.depth_um) else None
+
+    def _end_unload(self, sample: Sample, now: float) -> Outcome | None:
+        if not self._arrived(sample, now, self.start_um):
+            return None
+        if self.cycle == self.settings.cycles:
+            return Outcome.CYCLES_DONE
+        return Outcome.NEXT_CYCLE if self.cycle < self.settings.precondition else Outcome.REST
+
+    def _end_retract(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.HOME if self._arrived(sample, now, 0) else None
+
+    def _end_release(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.HOME if sample.flags & Flags.HOME and now - self._entered > QUIET_S else None
+
+    def _end_stopping(self, sample: Sample, now: float) -> Outcome | None:
+        if sample.flags & Flags.GIVEN_UP:
+            return Outcome.OUT_OF_REACH
+        if sample.flags & Flags.STOPPED and sample.flags & Flags.HOME:
+            return Outcome.RETRACTED
+        return None
+
+    def _fail(self, reason: str) -> Outcome:
+        self.reason = reason
+        return Outcome.STOP
+
+    def _never(self, sample: Sample, now: float) -> Outcome | None:
+        """Ends by the operator, not by a sample."""
+        return None
+
+
+_ENTERS: dict[Phase, Callable[[Protocol], tuple[Action, ...]]] = {
+    Phase.POSITION: Protocol._enter_position,
+    Phase.CLAMP: Protocol._enter_clamp,
+    Phase.APPROACH: Protocol._enter_approach,
+    Phase.BACK: Protocol._enter_start,
+    Phase.SEARCH: Protocol._enter_search,
+    Phase.RETURN: Protocol._enter_start,
+    Phase.LOAD: Protocol._enter_load,
+    Phase.UNLOAD: Protocol._enter_unload,
+    Phase.RETRACT: Protocol._enter_retract,
+    Phase.RELEASE: Protocol._enter_release,
+    Phase.STOPPING: Protocol._enter_stopping,
+}
+_ENDS: dict[Phase, Callable[[Protocol, Sample, float], Outcome | None]] = {
+    Phase.POSITION: Protocol._end_position,
+    Phase.CLAMP: Protocol._end_clamp,
+    Phase.SETTLE: Protocol._end_settle,
+    Phase.APPROACH: Protocol._end_approach,
+    Phase.BACK: Protocol._end_back,
+    Phase.READY: Protocol._never,
+    Phase.SEARCH: Protocol._end_search,
+    Phase.RETURN: Protocol._end_back,
+    Phase.PAUSE: Protocol._end_pause,
+    Phase.LOAD: Protocol._end_load,
+    Phase.UNLOAD: Protocol._end_unload,
+    Phase.RETRACT: Protocol._end_retract,
+    Phase.RELEASE: Protocol._end_release,
+    Phase.STOPPING: Protocol._end_stopping,
+}

@@ -1,0 +1,225 @@
+"""The record of a session: plain CSV with a checksum every 50 ms, written as it comes.
+
+    #limbfit-recording 1
+    #head {"device": {...}, "settings": {...}, ...}
+    host_us,device_us,number,flags,moving,p1_um,...,f1_mN,...,c1_fF,...
+    10321,8000,5,8,0,0,...
+    #event {"at_us": 12001, "event": "phase", "phase": "clamp"}
+    #block 0 6210 9D1C06AB
+
+A ``#block`` line closes all bytes since the one before: its index, their number, and their CRC-32 continued
+from the block before.  What a crash leaves after the last of them is not believed; that is less than 0.1 s.
+Comments start with ``#``, so a table reader that skips them reads the rows.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import threading
+import time
+from binascii import crc32
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RunError, TraceError
+from .events import PINS, Sample
+
+FIRST = "#limbfit-recording 1"
+ROWS = 25  # per block: 50 ms
+SYNC_S = 1.0  # how often the disk is asked to keep what was written
+MAX_BYTES = 2_000_000_000
+_NAMES = ("host_us", "device_us", "number", "flags", "moving")
+COLUMNS = (
+    *_NAMES,
+    *(
+        f"{letter}{pin}_{unit}"
+        for letter, unit in (("p", "um"), ("f", "mN"), ("c", "fF"))
+        for pin in range(1, PINS + 1)
+    ),
+)
+
+Integers = NDArray[np.int64]
+
+
+class Recorder:
+    """Writes a session's record; rows are given in one thread, and written in another.
+
+    Raises
+    ------
+    RunError
+        From `sample` or `close`, once the file could not be written (a full disk).
+    """
+
+    def __init__(self, file: Path, head: dict[str, Any]) -> None:
+        self.file = file
+        self._lines = [FIRST, f"#head {json.dumps(head, allow_nan=False)}", ",".join(COLUMNS)]
+        self._rows = self._index = self._crc = 0
+        self._failed = ""
+        self._full: SimpleQueue[bytes | None] = SimpleQueue()
+        self._handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        self._close_block()
+        self._writer = threading.Thread(target=self._write, name="recorder", daemon=True)
+        self._writer.start()
+
+    def sample(self, sample: Sample, host_us: int) -> None:
+        channels = (*sample.position_um, *sample.force_mN, *sample.capacitance_fF)
+        self._lines.append(
+            f"{host_us},{sample.time_us},{sample.number},{sample.flags},{sample.moving},"
+            + ",".join(map(str, channels))
+        )
+        self._rows += 1
+        if self._rows >= ROWS:
+            self._close_block()
+
+    def event(self, name: str, host_us: int, **facts: Any) -> None:
+        """Something that happened; kept with the next block, or at once where it ends one."""
+        content = json.dumps({"at_us": host_us, "event": name, **facts}, allow_nan=False)
+        self._lines.append(f"#event {content}")
+
+    def close(self) -> None:
+        self._close_block()
+        self._full.put(None)
+        self._writer.join()
+        if self._failed:
+            raise RunError(f"{self.file}: the record is not complete: {self._failed}")
+
+    def _close_block(self) -> None:
+        if self._failed:
+            raise RunError(f"{self.file}: cannot be written: {self._failed}")
+        data = ("\n".join(self._lines) + "\n").encode("ascii")
+        self._crc = crc32(data, self._crc)
+        self._full.put(data + b"#block %d %d %08X\n" % (self._index, len(data), self._crc))
+        self._lines, self._rows, self._index = [], 0, self._index + 1
+
+    def _write(self) -> None:
+        kept = time.monotonic()
+        try:
+            while (data := self._full.get()) is not None:
+                while data:
+                    data = data[os.write(self._handle, data) :]
+                if time.monotonic() - kept > SYNC_S:
+                    os.fdatasync(self._handle) if hasattr(os, "fdatasync") else os.fsync(self._handle)
+                    kept = time.monotonic()
+            os.fsync(self._handle)
+        except OSError as error:
+            self._failed = error.strerror or type(error).__name__
+        finally:
+            os.close(self._handle)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A record that was read: one row per sample; (n,) or (n, 14) integers in the units of `events`.
+
+    ``lost_bytes`` stand after the last block that is whole.
+    """
+
+    head: dict[str, Any]
+    events: tuple[dict[str, Any], ...]
+    host_us: Integers
+    device_us: Integers
+    number: Integers
+    flags: Integers
+    moving: Integers
+    position_um: Integers
+    force_mN: Integers
+    capacitance_fF: Integers
+    lost_bytes: int
+
+    def phases(self) -> list[tuple[str, int, int]]:
+        """Each phase with the host times (us) at which it began and ended."""
+        marks = [(e["phase"], int(e["at_us"])) for e in self.events if e.get("event") == "phase"]
+        last = int(self.host_us[-1]) + 1 if self.host_us.size else 0
+        ends = [at for _, at in marks[1:]] + [max(last, marks[-1][1] if marks else 0)]
+        return [(phase, start, end) for (phase, start), end in zip(marks, ends, strict=True)]
+
+
+def read_recording(file: str | Path) -> Recording:
+    """Read a record, finished or not, up to the last block that is whole.
+
+    Raises
+    ------
+    TraceError
+        Where it is no record, or its first block is damaged.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise TraceError("no such record", file=path)
+    if path.stat().st_size > MAX_BYTES:
+        raise TraceError(f"larger than {MAX_BYTES:g} bytes", file=path)
+    data = path.read_bytes()
+    if not data.startswith(FIRST.encode()):
+        raise TraceError("not a record of limbfit acquire", file=path, place="line 1")
+    content, used = _whole(data)
+    if not content:
+        raise TraceError("its first block is damaged", file=path, remedy="nothing can be read from it")
+    head, events, rows = _sorted_lines(content, path)
+    table = _table(rows, path)
+    first = len(_NAMES)
+    position, force, capacitance = np.split(table[:, first:], 3, axis=1)
+    host_us, device_us, number, flags, moving = table[:, :first].T
+    lost = len(data) - used
+    return Recording(
+        head, events, host_us, device_us, number, flags, moving, position, force, capacitance, lost
+    )
+
+
+_CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
+
+
+def _whole(data: bytes) -> tuple[bytes, int]:
+    """The content of all blocks up to the first that is not whole, and how many bytes they take."""
+    parts: list[bytes] = []
+    at = crc = 0
+    while (mark := data.find(b"\n#block ", at)) >= 0:
+        part, closing = data[at : mark + 1], _CLOSING.match(data, mark + 1)
+        crc = crc32(part, crc)
+        if closing is None:
+            break
+        index, size, stated = int(closing[1]), int(closing[2]), int(closing[3], 16)
+        if (index, size, stated) != (len(parts), len(part), crc):
+            break
+        parts.append(part)
+        at = closing.end()
+    return b"".join(parts), at
+
+
+def _sorted_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dict[str, Any], ...], list[str]]:
+    """Head, events and rows."""
+    head: dict[str, Any] = {}
+    events, rows = [], []
+    try:
+        for line in content.decode("ascii").split("\n"):
+            if line.startswith("#head "):
+                head = json.loads(line[6:])
+            elif line.startswith("#event "):
+                events.append(json.loads(line[7:]))
+            elif line[:1].isdigit():
+                rows.append(line)
+        for event in events:
+            event["at_us"], event["event"] = int(event["at_us"]), str(event["event"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise TraceError("a line of it is not what a record holds", file=path) from None
+    if not isinstance(head, dict):
+        raise TraceError("its head is not a table", file=path)
+    return head, tuple(events), rows
+
+
+def _table(rows: list[str], path: Path) -> Integers:
+    if not rows:
+        return np.zeros((0, len(COLUMNS)), dtype=np.int64)
+    try:
+        table = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", dtype=np.int64, ndmin=2)
+    except (ValueError, OverflowError):
+        raise TraceError("its rows are not integers in columns", file=path) from None
+    if table.shape[1] != len(COLUMNS):
+        raise TraceError(f"{table.shape[1]} columns instead of {len(COLUMNS)}", file=path)
+    return table

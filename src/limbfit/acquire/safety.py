@@ -1,0 +1,163 @@
+"""Every limit of the experiment, in one place: checked on each sample by limbfit and again by the device.
+
+`Guard` is what both ends run; `Limits` are the numbers.  What only one end can know - that the limb has moved
+in the clamps, that a sensor does not answer to a push, that a step takes too long - stands below it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from .events import PINS, Flags, Sample
+from .settings import Settings, micro
+
+FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and so many samples, is dead
+FROZEN_SAMPLES = 8
+SPEED_WINDOW_US = 10_000
+SPEED_MARGIN = 1.25  # of a measured speed over a limit: encoder noise, and the corner of a ramp
+LOST_CLAMP_MN = 500  # a clamping pin that pushes less has lost the limb
+CLAMP_JUMP_MN = 3000  # and so has one whose force changes by more, within the time below
+CLAMP_JUMP_US = 200_000
+DEAF_UM = 1500  # a push so far beyond touch must be felt
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Per pin: largest force (mN) and position (um).
+
+    For all: speed towards the limb (um/s), sensor range (mN), and how many samples alike mean a dead sensor.
+    """
+
+    force_mN: tuple[int, ...]
+    position_um: tuple[int, ...]
+    speed_um_s: int
+    range_mN: int
+    alike: int
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A limit that was passed; ``code`` is short and fixed, ``text`` is for people."""
+
+    code: str
+    pin: int
+    text: str
+
+
+def session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: int) -> Limits:
+    """The limits of a session before the skin has been met; see `Guard.set_depth`."""
+    force = [micro(settings.clamp_limit_N)] * PINS
+    force[settings.pin - 1] = micro(settings.force_limit_N)
+    return Limits(
+        force_mN=tuple(force),
+        position_um=(stroke_um,) * PINS,
+        speed_um_s=micro(settings.speed_limit_mm_s),
+        range_mN=range_mN,
+        alike=max(round(FROZEN_S * rate_hz), FROZEN_SAMPLES),
+    )
+
+
+class Guard:
+    """Looks at every sample; remembers only what a limit in time needs."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self._past: deque[Sample] = deque()
+        self._last: tuple[int, ...] = ()
+        self._alike = [0] * PINS
+
+    def set_depth(self, pin: int, position_um: int) -> None:
+        """From now on a pin may not go beyond a position."""
+        position = list(self.limits.position_um)
+        position[pin - 1] = min(position_um, position[pin - 1])
+        old = self.limits
+        self.limits = Limits(old.force_mN, tuple(position), old.speed_um_s, old.range_mN, old.alike)
+
+    def check(self, sample: Sample) -> Violation | None:
+        """The first limit that the sample passes."""
+        limits = self.limits
+        for pin, (force, most) in enumerate(zip(sample.force_mN, limits.force_mN, strict=True), 1):
+            if abs(force) >= limits.range_mN:
+                return Violation("saturated", pin, f"the force sensor of pin {pin} is saturated")
+            if force > most:
+                text = f"pin {pin}: {force / 1000:.2f} N is over the limit of {most / 1000:g} N"
+                return Violation("force", pin, text)
+        for pin, (position, most) in enumerate(zip(sample.position_um, limits.position_um, strict=True), 1):
+            if position > most + 100:
+                text = f"pin {pin}: {position / 1000:.2f} mm is over the limit of {most / 1000:.2f} mm"
+                return Violation("depth", pin, text)
+        return self._too_fast(sample) or self._frozen(sample)
+
+    def _too_fast(self, sample: Sample) -> Violation | None:
+        past = self._past
+        past.append(sample)
+        while len(past) > 2 and sample.time_us - past[1].time_us >= SPEED_WINDOW_US:
+            past.popleft()
+        span = sample.time_us - past[0].time_us
+        if span < SPEED_WINDOW_US:
+            return None
+        most = SPEED_MARGIN * self.limits.speed_um_s * span / 1e6
+        for pin, (now, then) in enumerate(zip(sample.position_um, past[0].position_um, strict=True), 1):
+            if now - then > most:
+                speed = (now - then) / span * 1000
+                text = (
+                    f"pin {pin}: {speed:.1f} mm/s is over the limit of {self.limits.speed_um_s / 1000:g} mm/s"
+                )
+                return Violation("speed", pin, text)
+        return None
+
+    def _frozen(self, sample: Sample) -> Violation | None:
+        """A live sensor is noisy: one that repeats itself does not measure."""
+        if self._last:
+            alike = self._alike
+            for k, (now, then) in enumerate(zip(sample.force_mN, self._last, strict=True)):
+                alike[k] = alike[k] + 1 if now == then else 0
+                if alike[k] >= self.limits.alike:
+                    self._last = sample.force_mN
+                    return Violation(
+                        "dead", k + 1, f"the force sensor of pin {k + 1} is dead: it repeats itself"
+                    )
+        self._last = sample.force_mN
+        return None
+
+
+class ClampWatch:
+    """Whether the held limb stays where it is: the forces of the pins that clamp it only relax, slowly."""
+
+    def __init__(self, pins: tuple[int, ...]) -> None:
+        self.pins = pins
+        self._past: deque[Sample] = deque()
+
+    def check(self, sample: Sample) -> Violation | None:
+        past = self._past
+        past.append(sample)
+        while sample.time_us - past[0].time_us > CLAMP_JUMP_US:
+            past.popleft()
+        for pin in self.pins:
+            now, then = sample.force_mN[pin - 1], past[0].force_mN[pin - 1]
+            if now < LOST_CLAMP_MN:
+                return Violation("limb", pin, f"the limb has moved: pin {pin} has lost it")
+            if abs(now - then) > CLAMP_JUMP_MN:
+                text = f"the limb has moved: the force of pin {pin} jumped by {(now - then) / 1000:+.1f} N"
+                return Violation("limb", pin, text)
+        return None
+
+
+def device_violation(flags: int) -> Violation | None:
+    """What the device says of itself."""
+    if flags & Flags.BUTTON:
+        return Violation("button", 0, "the device's emergency stop was pressed")
+    if flags & Flags.NO_POWER:
+        return Violation("power", 0, "the actuators have no power")
+    if flags & Flags.STOPPED:
+        return Violation("device", 0, "the device stopped by itself")
+    return None
+
+
+def deaf(travel_um: int, felt_mN: int, least_mN: int, pin: int) -> Violation | None:
+    """A force sensor that feels nothing of a push that the capacitance saw begin."""
+    if travel_um > DEAF_UM and felt_mN < least_mN:
+        text = f"pin {pin} touches ({travel_um / 1000:.1f} mm ago) but feels no force: see its force sensor"
+        return Violation("deaf", pin, text)
+    return None

@@ -1,0 +1,23 @@
+"""A FitSocket that is a program: pins, sensors, a limb, faults, and the device's end of the line protocol.
+
+No hardware was at hand.  What is here behaves as the documents say a device must, with speeds, noise and play
+that such devices plausibly have; it is no model of a particular one.
+"""
+
+from .faults import FAULT_KINDS, Fault, read_faults
+from .fitsocket import VirtualFitSocket
+from .limb import Limb
+from .server import Serving, serve
+from .surrogate import Surrogate, fit_surrogate
+
+__all__ = [
+    "FAULT_KINDS",
+    "Fault",
+    "Limb",
+    "Serving",
+    "Surrogate",
+    "VirtualFitSocket",
+    "fit_surrogate",
+    "read_faults",
+    "serve",
+]

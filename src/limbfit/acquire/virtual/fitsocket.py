@@ -1,0 +1,365 @@
+"""The device's end of the line protocol, stepped in time, without a wire and without a clock.
+
+`VirtualFitSocket.step` is one millisecond of the device: motors, limb, sensors, its own limits and watchdog,
+and every second time a sample.  `VirtualFitSocket.feed` takes what came from limbfit.  Both return
+what goes out.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections import deque
+
+import numpy as np
+
+from ..events import PINS, RATE_HZ, Fence, Flags, Hold, Move, Sample, Stop
+from ..messages import (
+    Accepted,
+    Beat,
+    Bye,
+    Command,
+    Declined,
+    Hello,
+    Identity,
+    Note,
+    OutOfReach,
+    SetLimits,
+    Tripped,
+    parse_command,
+    sample_body,
+)
+from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, Limits
+from ..wire import HOST_LINE, VERSION, Decoder, Encoder, salt_of
+from .faults import Fault, FaultClock
+from .limb import Limb
+from .pins import STROKE_MM, Motors, Sensors
+
+STEP_US = 1000
+EVERY = 1_000_000 // RATE_HZ // STEP_US  # steps per sample
+RETRACT_MM_S = 100.0
+# Built in: no session's limits go beyond them.
+MOST_FORCE_MN = 45_000
+MOST_SPEED_UM_S = 12_000
+MOST_RETRACT_UM_S = 100_000
+MOST_WATCHDOG_MS = 500
+LAG_US = 50_000  # a driven pin that stands for so long is stuck
+PATIENCE_US = 3_000_000  # pins that are not home so long after a stop are out of reach
+
+
+class VirtualFitSocket:
+    """One device with one limb in it.
+
+    Attributes
+    ----------
+    time_us : of the device.
+    stopped : the code of the stop that is latched, empty for none.
+    is_armed : a session runs, samples are sent, the watchdog watches.
+    acknowledged_us : device time of the newest sample that limbfit has dealt with.
+    """
+
+    def __init__(
+        self, limb: Limb, *, seed: int = 0, faults: tuple[Fault, ...] = (), clock: str = "real"
+    ) -> None:
+        self.limb, self.clock = limb, clock
+        self._random = np.random.default_rng(seed)
+        self.motors = Motors(STEP_US / 1e6)
+        self.sensors = Sensors(self._random, STEP_US / 1e6)
+        self.faults = FaultClock(faults)
+        self._serial = f"V{seed:06d}"[:40]
+        self.time_us = 0
+        self.stopped, self.is_armed = "", False
+        self.acknowledged_us = 0
+        self._begun_us = self._stopped_us = 0
+        self._watchdog_us = MOST_WATCHDOG_MS * 1000
+        self._most = Limits(
+            (MOST_FORCE_MN,) * PINS, (round(1000 * STROKE_MM),) * PINS, MOST_SPEED_UM_S, 1 << 30, 1 << 30
+        )
+        self._guard = Guard(self._most)
+        self._halts = [0] * PINS
+        self._lags = np.zeros(PINS, dtype=int)
+        self._force: tuple[int, ...] = (0,) * PINS
+        self._given_up = False
+        self._shifted: dict[Fault, float] = {}
+        self._sent: deque[tuple[int, int]] = deque(maxlen=2000)
+        self._held: deque[tuple[int, bytes]] = deque()
+        self.connect()
+
+    # -- sessions
+
+    def connect(self) -> None:
+        """A host is at the wire."""
+        self._decoder = Decoder(HOST_LINE, last=-1)
+        self._encoder: Encoder | None = None
+
+    @property
+    def refused(self) -> object:
+        return self._decoder.refused
+
+    def disconnect(self) -> None:
+        """The host has gone: whatever is not home goes home."""
+        if self.is_armed:
+            self._leave()
+        self._encoder = None
+
+    @property
+    def has_session(self) -> bool:
+        """Whether a host has been greeted."""
+        return self._encoder is not None
+
+    @property
+    def is_home(self) -> bool:
+        return bool(self.motors.at_home().all())
+
+    def feed(self, data: bytes) -> bytes:
+        """Lines of the host; what is said in answer."""
+        if self.faults.on("deaf"):
+            return b""
+        out = b""
+        for line in self._decoder.feed(data):
+            command = parse_command(line.body)
+            if command is None:
+                self._decoder.refused.unknown += 1
+                continue
+            out += self._command(command, line.number)
+        return self._through_faults(out)
+
+    def _command(self, command: Command, number: int) -> bytes:
+        if isinstance(command, Hello):
+            return (
+                self._greet(command) if self._encoder is None else self._say(Declined(number, "greeted").body)
+            )
+        if self._encoder is None:
+            self._decoder.refused.unknown += 1
+            return b""
+        match command:
+            case Beat():
+                self._beat(command.number)
+                return b""
+            case Bye():
+                self._leave()
+                return b""
+        code = self._obey(command)
+        return self._say(Declined(number, code).body if code else Accepted(number).body)
+
+    def _greet(self, hello: Hello) -> bytes:
+        if hello.version != VERSION:
+            self._decoder.refused.unknown += 1
+            return b""
+        if self.is_home and not self.faults.on("button"):
+            self.stopped, self._given_up = "", False
+        sensors = self.sensors
+        identity = Identity(
+            secrets.token_hex(8),
+            PINS,
+            RATE_HZ,
+            round(1000 * STROKE_MM),
+            sensors.range_mN,
+            sensors.touch_fF,
+            self.clock,
+            "VirtualFitSocket",
+            self._serial,
+            "2000-01-01",
+        )
+        line = Encoder(first=0).encode(identity.body)[1]
+        salt = salt_of(hello.nonce, identity.nonce)
+        self._encoder = Encoder(salt)
+        self._decoder.restart(salt)
+        return line
+
+    def _obey(self, command: Command) -> str:
+        """Do a command; why not, in a word."""
+        match command:
+            case SetLimits():
+                return self._arm(command)
+            case Note(kind="SITE", word=word):
+                return "" if self.limb.bring(word, self._pin) else "unknown-site"
+            case Note(word=word):
+                self.faults.enter(word)
+                return ""
+            case Stop():
+                self._stop("asked")
+                return ""
+        if not self.is_armed:
+            return "not-armed"
+        if isinstance(command, Hold):
+            self.motors.halt(command.pin - 1)
+            return ""
+        if isinstance(command, Fence):
+            self._guard.set_depth(command.pin, command.position_um)
+            return ""
+        assert isinstance(command, Move)
+        return self._move(command)
+
+    _pin = 1
+
+    def _arm(self, limits: SetLimits) -> str:
+        if self.is_armed:
+            return "armed"
+        if self.stopped:
+            return "stopped"
+        force = [min(limits.clamp_mN, MOST_FORCE_MN)] * PINS
+        force[limits.pin - 1] = min(limits.force_mN, MOST_FORCE_MN)
+        most = min(limits.position_um, round(1000 * STROKE_MM))
+        alike = max(round(FROZEN_S * 1e6 / STEP_US), FROZEN_SAMPLES)
+        speed = min(limits.speed_um_s, MOST_SPEED_UM_S)
+        self._guard = Guard(Limits(tuple(force), (most,) * PINS, speed, self.sensors.range_mN, alike))
+        self._watchdog_us = 1000 * min(limits.watchdog_ms, MOST_WATCHDOG_MS)
+        self._pin = limits.pin
+        self.is_armed = True
+        self.faults = FaultClock(self.faults.faults)
+        self._begun_us = self.acknowledged_us = self.time_us
+        self._lags[:] = 0
+        self._sent.clear()
+        return ""
+
+    def _move(self, move: Move) -> str:
+        k = move.pin - 1
+        inward = move.target_um > 1000 * self.motors.position_mm[k]
+        if self.stopped:
+            return "stopped"
+        if move.target_um > self._guard.limits.position_um[k]:
+            return "position"
+        if move.speed_um_s > (self._guard.limits.speed_um_s if inward else MOST_RETRACT_UM_S):
+            return "speed"
+        if move.halt_mN and self._force[k] >= move.halt_mN and inward:
+            self.motors.halt(k)
+            return ""
+        self._halts[k] = move.halt_mN if inward else 0
+        self._lags[k] = 0
+        self.motors.drive(k, move.target_um / 1000, move.speed_um_s / 1000)
+        return ""
+
+    def _beat(self, number: int) -> None:
+        for sent, at in self._sent:
+            if sent == number:
+                self.acknowledged_us = max(self.acknowledged_us, at)
+                break
+        while self._sent and self._sent[0][0] <= number:
+            self._sent.popleft()
+
+    def _leave(self) -> None:
+        if not self.is_home:
+            self._stop("left")
+        self.is_armed = False
+
+    def hangs_up(self) -> None:
+        """The host says nothing any more, by a clock that is not the device's."""
+        if self.is_armed and not self.stopped:
+            self._stop("watchdog")
+
+    # -- time
+
+    def step(self) -> bytes:
+        """One millisecond; what is said at its end."""
+        self.time_us += STEP_US
+        self.faults.now_us = self.time_us - self._begun_us if self.is_armed else self.faults.now_us + STEP_US
+        jammed = [fault.pin - 1 for fault in self.faults.on("stuck")]
+        powered = not self.faults.on("power")
+        self._move_limb()
+        self.motors.step(jammed, powered)
+        self.limb.step(self.motors.head_mm)
+        sample = self._measure(powered)
+        self._halt_at_forces()
+        out = self._watch(sample, powered)
+        out += self._look_home()
+        if self.is_armed and self.time_us // STEP_US % EVERY == 0 and self._encoder is not None:
+            number, line = self._encoder.encode(sample_body(sample))
+            self._sent.append((number, self.time_us))
+            out += line
+        return self._through_faults(out)
+
+    def _measure(self, powered: bool) -> Sample:
+        faults = self.faults
+        position, self._force, seen = self.sensors.read(
+            self.motors.position_mm,
+            self.motors.head_mm,
+            self.limb.force_N,
+            self.limb.gap_mm,
+            [fault.pin - 1 for fault in faults.on("dead")],
+            [fault.pin - 1 for fault in faults.on("saturated")],
+        )
+        flags = (
+            Flags.HOME * self.is_home | Flags.STOPPED * bool(self.stopped) | Flags.NO_POWER * (not powered)
+        )
+        flags |= Flags.BUTTON * bool(faults.on("button")) | Flags.GIVEN_UP * self._given_up
+        moving = int(np.packbits(self.motors.driving, bitorder="little").view("<u2")[0])
+        return Sample(0, self.time_us, int(flags), moving, position, self._force, seen)
+
+    def _halt_at_forces(self) -> None:
+        for k, most in enumerate(self._halts):
+            if most and self._force[k] >= most:
+                self._halts[k] = 0
+                if not self.stopped:
+                    self.motors.halt(k)
+
+    def _watch(self, sample: Sample, powered: bool) -> bytes:
+        """The device's own limits; a stop of its own is told."""
+        if self.stopped or not (self.is_armed or self.faults.on("button")):
+            return b""
+        code, pin = "", 0
+        self._lags = np.where(self.motors.lags(), self._lags + STEP_US, 0)
+        if self.faults.on("button"):
+            code = "button"
+        elif not powered:
+            code = "power"
+        elif violation := self._guard.check(sample):
+            code, pin = violation.code, violation.pin
+        elif self._lags.max() > LAG_US:
+            code, pin = "stuck", int(self._lags.argmax()) + 1
+        elif self.time_us - self.acknowledged_us > self._watchdog_us:
+            code = "watchdog"
+        if not code:
+            return b""
+        self._stop(code)
+        return self._say(Tripped(code, pin).body)
+
+    def _stop(self, code: str) -> None:
+        if not self.stopped:
+            self.stopped, self._stopped_us = code, self.time_us
+        self._halts = [0] * PINS
+        self.motors.retract(RETRACT_MM_S)
+
+    def _look_home(self) -> bytes:
+        """After a stop: is everything home?  A pin that was stuck or without power is tried on and on."""
+        if not self.stopped:
+            return b""
+        if self.is_home:
+            self._given_up = False
+            return b""
+        self.motors.retract(RETRACT_MM_S)
+        if self._given_up or self.time_us - self._stopped_us < PATIENCE_US:
+            return b""
+        self._given_up = True
+        pins = sum(1 << int(k) for k in np.flatnonzero(~self.motors.at_home()))
+        return self._say(OutOfReach(pins).body)
+
+    # -- what goes wrong
+
+    def _move_limb(self) -> None:
+        for fault in self.faults.faults:
+            if fault.kind == "limb":
+                moved = fault.value * self.faults.share(fault)
+                self.limb.shift(fault.pin, moved - self._shifted.get(fault, 0.0))
+                self._shifted[fault] = moved
+
+    def _say(self, body: str) -> bytes:
+        return self._encoder.encode(body)[1] if self._encoder is not None else b""
+
+    def _through_faults(self, out: bytes) -> bytes:
+        """What of it goes out now: lost, late or corrupt lines."""
+        if self.faults.on("lost"):
+            out = b""
+        if out and self.faults.on("corrupt"):
+            out = b"\n".join(self._spoil(line) for line in out.split(b"\n")[:-1]) + b"\n"
+        late = self.faults.on("late")
+        if out and (late or self._held):
+            due = self.time_us + round(1000 * max([fault.value for fault in late], default=0.0))
+            self._held.append((max(due, self._held[-1][0] if self._held else 0), out))
+            out = b""
+        while self._held and self._held[0][0] <= self.time_us:
+            out += self._held.popleft()[1]
+        return out
+
+    def _spoil(self, line: bytes) -> bytes:
+        at = int(self._random.integers(len(line)))
+        return line[:at] + bytes([(line[at] + 1) % 256]) + line[at + 1 :]

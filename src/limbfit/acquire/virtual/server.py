@@ -1,0 +1,241 @@
+"""The virtual FitSocket on a wire: a TCP port or a pseudo terminal, in real time or paced by its host."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+import tty
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from ...errors import InputError, RunError
+from ..events import PERIOD_US
+from ..links import Link, TcpLink
+from .fitsocket import EVERY, VirtualFitSocket
+
+AHEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with
+HANG_S = 2.0  # wall time after which a paced device takes its host for gone
+GREETING_S = 5.0  # a connection that does not become a session is closed
+STALL_S = 0.25  # a device that could not run for so long does not make up for it
+IDLE_S = 0.02
+
+
+class PtyLink:
+    """The master of a pseudo terminal; its slave looks like a serial port."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.name = os.ttyname(self._slave)
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self._master, 1 << 16)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            raise RunError("the terminal is gone") from None
+
+    def write(self, data: bytes) -> None:
+        """What does not fit is lost, as on a serial line that nobody reads."""
+        with suppress(BlockingIOError):
+            os.write(self._master, data)
+
+    def close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@dataclass
+class Serving:
+    """Where a device can be reached; ``stop`` ends `serve` (from a signal handler or another thread)."""
+
+    listener: socket.socket | None = None
+    pty: PtyLink | None = None
+    stopping: bool = field(default=False)
+    refused: int = 0  # connections beside the one that holds the device
+
+    @classmethod
+    def on_port(cls, host: str, port: int) -> Serving:
+        """Listen on a TCP port; 0 takes a free one.
+
+        Raises
+        ------
+        InputError
+            Where the address is none of this machine's, or the port is taken.
+        """
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, port))
+        except (OSError, OverflowError) as error:
+            listener.close()
+            reason = getattr(error, "strerror", None) or "no such port"
+            raise InputError(f"port {port} cannot be taken: {reason}", place="--port") from None
+        listener.listen(1)
+        listener.setblocking(False)
+        return cls(listener=listener)
+
+    @classmethod
+    def on_terminal(cls) -> Serving:
+        return cls(pty=PtyLink())
+
+    @property
+    def address(self) -> str:
+        """As `limbfit acquire --device` takes it."""
+        if self.pty is not None:
+            return f"serial:{self.pty.name}"
+        assert self.listener is not None
+        host, port = self.listener.getsockname()[:2]
+        return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+    def stop(self) -> None:
+        self.stopping = True
+
+    def close(self) -> None:
+        if self.pty is not None:
+            self.pty.close()
+        if self.listener is not None:
+            self.listener.close()
+
+
+def serve(
+    device: VirtualFitSocket,
+    serving: Serving,
+    *,
+    speed: float = 1.0,
+    tell: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Run a device until `Serving.stop`.
+
+    Parameters
+    ----------
+    speed : how much faster than the wall's the device's clock may go; only a paced device waits for its host.
+    tell : is told of sessions and stops, a line each.
+    """
+    _Server(device, serving, speed, tell).run()
+    serving.close()
+
+
+class _Server:
+    def __init__(
+        self, device: VirtualFitSocket, serving: Serving, speed: float, tell: Callable[[str], None]
+    ) -> None:
+        self.device, self.serving, self.tell = device, serving, tell
+        self.period_s = PERIOD_US / 1e6 / speed
+        self.paced = device.clock == "paced"
+        self.link: Link | None = serving.pty
+        self.stopped = ""
+        self.next = self.heard = time.monotonic()
+
+    def run(self) -> None:
+        while not self.serving.stopping:
+            self._wait()
+            self._listen()
+            self._time()
+            self._look()
+        if self.link is not None:
+            self.link.close() if self.serving.pty is None else None
+
+    def _runs(self) -> bool:
+        """Whether there is anything to step: a session, or pins that are not home."""
+        return self.device.is_armed or not self.device.is_home
+
+    def _waits(self) -> bool:
+        """Whether a paced device has to wait for its host."""
+        device = self.device
+        return (
+            self.paced
+            and self.link is not None
+            and device.is_armed
+            and time.monotonic() - self.heard < HANG_S
+            and device.time_us - device.acknowledged_us >= AHEAD_US
+        )
+
+    def _wait(self) -> None:
+        now = time.monotonic()
+        due = self.next - now if self._runs() and not self._waits() else IDLE_S
+        watched: list[Any] = [self.link] if self.link is not None else []
+        if self.serving.listener is not None:
+            watched.append(self.serving.listener)
+        if due > 0:
+            select.select(watched, [], [], due)
+
+    def _listen(self) -> None:
+        self._accept()
+        if self.link is None:
+            return
+        try:
+            data = self.link.read()
+            if data:
+                self.heard = time.monotonic()
+                self.link.write(self.device.feed(data))
+        except RunError as error:
+            self._drop(str(error))
+
+    def _accept(self) -> None:
+        if self.serving.listener is None:
+            return
+        try:
+            connection, _ = self.serving.listener.accept()
+        except OSError:
+            return
+        if self.link is not None:
+            connection.close()
+            self.serving.refused += 1
+            return
+        self.link = TcpLink(connection)
+        self.heard = time.monotonic()
+        self.device.connect()
+        self.tell("a host is connected")
+
+    def _time(self) -> None:
+        now = time.monotonic()
+        if not self._runs():
+            self.next = now
+            return
+        if now - self.next > STALL_S:
+            self.next = now
+        while self.next <= now and self._runs() and not self._waits():
+            out = b"".join([self.device.step() for _ in range(EVERY)])
+            self.next += self.period_s
+            if out and self.link is not None:
+                try:
+                    self.link.write(out)
+                except RunError as error:
+                    self._drop(str(error))
+
+    def _look(self) -> None:
+        """Hosts that hang, sessions that are over, stops to be told."""
+        device, silent = self.device, time.monotonic() - self.heard
+        if self.paced and device.is_armed and silent > HANG_S:
+            device.hangs_up()
+        if device.stopped != self.stopped:
+            self.stopped = device.stopped
+            self.tell(f"stop: {self.stopped}" if self.stopped else "ready")
+        if self.link is None:
+            return
+        over = device.stopped and device.is_home and silent > 1.0
+        if self.serving.pty is not None:
+            ended = device.has_session and not device.is_armed and device.is_home
+            if ended or (over and device.has_session):
+                device.disconnect()
+                device.connect()
+        elif (not device.is_armed and silent > GREETING_S) or over:
+            self._drop("no session")
+
+    def _drop(self, reason: str) -> None:
+        if self.link is not None and self.serving.pty is None:
+            self.link.close()
+            self.link = None
+        self.device.disconnect()
+        self.tell(f"the host is gone: {reason}")
