@@ -91,7 +91,7 @@ def _check_unchanged(study: Study, known: Mapping[str, Any], file: Path) -> None
         changed = [
             table
             for table in {**known["settings"], **now}
-            if table != "execution" and known["settings"].get(table) != now.get(table)
+            if table not in ("execution", "acquire") and known["settings"].get(table) != now.get(table)
         ]
     if changed:
         raise InputError(
