@@ -38,6 +38,11 @@ _SPACES = {
 }
 
 
+def colour_of(name: str, number: int) -> tuple[float, float, float]:
+    """The colour of a tissue; those without one of their own take turns by their number."""
+    return COLOURS.get(name, _OTHER_COLOURS[number % len(_OTHER_COLOURS)])
+
+
 def is_seg_nrrd(path: Path) -> bool:
     return path.name.lower().endswith((".seg.nrrd", ".seg.nhdr"))
 
@@ -75,7 +80,7 @@ def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
     }
     extent = " ".join(f"0 {n - 1}" for n in labels.size)
     for n, (value, name) in enumerate(sorted(labels.names.items())):
-        colour = COLOURS.get(name, _OTHER_COLOURS[n % len(_OTHER_COLOURS)])
+        colour = colour_of(name, n)
         header |= {
             f"Segment{n}_ID": f"Segment_{value}",
             f"Segment{n}_Name": name,

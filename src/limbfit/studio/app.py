@@ -43,6 +43,7 @@ def create_app(folder: StudyFolder, door: Door) -> FastAPI:
     for kind, status in ((InputError, 422), (LimbfitError, 409), (FileNotFoundError, 404)):
         app.add_exception_handler(kind, _told(status))
     app.add_exception_handler(TooLargeError, _told(413))
+    app.add_exception_handler(Exception, _internal)
     app.add_exception_handler(RequestValidationError, _unusable)
     app.add_api_route("/", _page, include_in_schema=False)
     app.mount("/static", StaticFiles(directory=STATIC))
@@ -63,6 +64,12 @@ def _told(status: int) -> Any:
         return JSONResponse({"error": text}, status)
 
     return handler
+
+
+def _internal(request: Request, error: Exception) -> JSONResponse:
+    name = type(error).__name__
+    text = f"internal error: {name}; set LIMBFIT_TRACEBACK=1 to see where, and please report it"
+    return JSONResponse({"error": text}, 500)
 
 
 def _unusable(request: Request, error: Exception) -> JSONResponse:

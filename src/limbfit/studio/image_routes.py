@@ -1,7 +1,155 @@
-"""The routes of the view Image."""
+"""The view Image: the image and its labels as NIfTI, surfaces for 3-D, and labels corrected by hand."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+from fastapi import APIRouter, Response
+from pydantic import BaseModel, Field
+
+from ..anatomy.imaging import LabelMap, Volume, read_labels
+from ..anatomy.labelfiles import colour_of
+from ..anatomy.surfaces import read_surface
+from ..errors import InputError, RunError
+from ..pipeline.stages.inputs import study_image
+from ..study import Study
+from .corrected import LABELS, save_labels, shown_labels
+from .processes import running
+from .study_routes import Folder
 
 router = APIRouter(prefix="/api/image")
+# Index axes to the right, to the front and up: the order in which the page counts voxels.
+PAGE_AXES = np.diag([-1.0, -1.0, 1.0])
+MOST_RUNS = 2_000_000
+Whole = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(gt=0)]
+Label = Annotated[int, Field(ge=0, le=255)]
+
+
+class Painting(BaseModel):
+    """Painted voxels as runs ``[first, count, label]`` of the page's order, and on which labels they are."""
+
+    base: Annotated[str, Field(min_length=1, max_length=80)]
+    runs: Annotated[list[tuple[Whole, Positive, Label]], Field(min_length=1, max_length=MOST_RUNS)]
+
+
+@router.get("")
+def get_facts(folder: Folder) -> dict[str, Any]:
+    """What there is to see: labels with names and colours, surfaces, and whether labels can be saved."""
+    study = folder.load()
+    if study.image is None:
+        return {"has_image": False}
+    surfaces = sorted(file.name for file in (folder.results / "surfaces").glob("*.stl"))
+    facts: dict[str, Any] = {"has_image": True, "surfaces": surfaces, "labels": None}
+    shown = shown_labels(folder)
+    if shown is not None:
+        labels = read_labels(shown.file)
+        facts["labels"] = {
+            "base": shown.digest,
+            "saved_to": shown.saved_to(study),
+            "names": [
+                {"value": value, "name": name, "colour": _hex(colour_of(name, n))}
+                for n, (value, name) in enumerate(sorted(labels.names.items()))
+            ],
+        }
+    return facts
+
+
+@router.get("/volume")
+def get_volume(folder: Folder) -> Response:
+    """The image as NIfTI, its voxels in the page's order."""
+    return _nifti(_study_volume(folder.load()).along(PAGE_AXES))
+
+
+@router.get("/labels")
+def get_labels(folder: Folder) -> Response:
+    """The label map as NIfTI, voxels as in `get_volume`; the header ``X-Base`` names its content."""
+    shown = shown_labels(folder)
+    if shown is None:
+        raise FileNotFoundError(LABELS)
+    answer = _nifti(read_labels(shown.file).along(PAGE_AXES))
+    answer.headers["X-Base"] = shown.digest
+    return answer
+
+
+@router.post("/labels")
+def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
+    """Save painted voxels into the study's label map; stages below it turn stale.
+
+    It is refused where the labels are others than those that were painted on, and while a run goes on.
+    """
+    study, shown = folder.load(), shown_labels(folder)
+    if shown is None:
+        raise FileNotFoundError(LABELS)
+    if running(folder) is not None:
+        raise RunError("a run of this study goes on; stop it or wait for it before labels are saved")
+    if shown.digest != painting.base:
+        raise RunError("the labels have changed since they were opened here; open them anew and paint again")
+    labels = read_labels(shown.file)
+    painted = paint(labels, painting.runs)
+    changed = int((painted.array != labels.array).sum())
+    if changed:
+        save_labels(folder, study, shown, painted)
+    again = shown_labels(folder)
+    assert again is not None
+    return {"changed_voxels": changed, "base": again.digest, "saved_to": again.saved_to(folder.load())}
+
+
+@router.get("/surfaces/{name}")
+def get_surface(folder: Folder, name: str) -> Response:
+    """A surface of the model as binary STL, in RAS millimetres as the page's 3-D view wants it."""
+    surface = read_surface(folder.artefact("surfaces", name), "LPS")
+    corners = (surface.points * [-1.0, -1.0, 1.0])[surface.faces].astype("<f4")
+    rows = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    rows["corners"] = corners
+    head = b"RAS".ljust(80) + np.uint32(len(corners)).tobytes()
+    return Response(head + rows.tobytes(), media_type="model/stl")
+
+
+def paint(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
+    """The labels with runs of voxels of the page's order set.
+
+    Raises
+    ------
+    InputError
+        For voxels outside of the map and for labels that it does not have.
+    """
+    turned = labels.along(PAGE_AXES)
+    flat = turned.array.ravel().copy()
+    table = np.array(runs, dtype=np.int64)
+    if (table[:, 0] + table[:, 1]).max() > flat.size:
+        raise InputError("painted voxels lie outside of the label map")
+    unknown = sorted(set(table[:, 2].tolist()) - {0, *labels.names})
+    if unknown:
+        raise InputError(f"the label map has no label {unknown[0]}")
+    for first, count, value in table.tolist():
+        flat[first : first + count] = value
+    return turned.with_array(flat.reshape(turned.array.shape)).along(labels.direction)
+
+
+def _study_volume(study: Study) -> Volume:
+    if study.image is None:
+        raise InputError("the study has no image", file=study.file, place="image")
+    return study_image(study)
+
+
+def _nifti(grid: Volume | LabelMap) -> Response:
+    array = grid.array
+    if array.dtype != np.uint8 and np.array_equal(array, np.round(array)) and np.abs(array).max() < 2**15:
+        array = array.astype(np.int16)
+    image = sitk.GetImageFromArray(np.ascontiguousarray(array))
+    image.SetSpacing(grid.spacing.tolist())
+    image.SetOrigin(grid.origin.tolist())
+    image.SetDirection(grid.direction.ravel().tolist())
+    with TemporaryDirectory() as place:
+        file = Path(place) / "image.nii"
+        sitk.WriteImage(image, str(file))
+        return Response(file.read_bytes(), media_type="application/octet-stream")
+
+
+def _hex(colour: tuple[float, float, float]) -> str:
+    return "#" + "".join(f"{round(255 * part):02x}" for part in colour)

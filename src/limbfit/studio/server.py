@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 import webbrowser
 from collections.abc import Callable
@@ -58,7 +59,7 @@ def serve(
     tell(door.address)
     config = uvicorn.Config(
         create_app(folder, door),
-        log_level=logging.WARNING,
+        log_level=logging.WARNING if os.environ.get("LIMBFIT_TRACEBACK") else logging.CRITICAL,
         access_log=False,  # addresses hold the token
         server_header=False,
         timeout_graceful_shutdown=2,
