@@ -14,6 +14,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 from vtkmodules.vtkCommonCore import vtkLogger
 
+from ..web.shapes import patient_frame
 from .page import Figure
 from .panels import FIELD_MAP, PAPER, Mark, Shot, View, colour_bar, legend, strip
 from .store import Json, Store
@@ -41,10 +42,7 @@ def unit(values: Iterable[float]) -> Array:
 
 def limb_frame(store: Store) -> Array:
     """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
-    up = unit(store.surfaces.get("cut_normal") or (0.0, 0.0, 1.0))
-    back = np.array([0.0, 1.0, 0.0])
-    back = unit(back - (back @ up) * up) if abs(up[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
-    return np.array([np.cross(back, up), back, up])
+    return patient_frame(store.surfaces.get("cut_normal"))
 
 
 @contextmanager

@@ -1,7 +1,95 @@
-"""The routes of the view Model."""
+"""The routes of the view Model: surfaces, meshes and sites, and the changes of sites in the study file."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from . import scene
+from .editing import add_site, remove_site, set_site
+from .study_routes import Folder
 
 router = APIRouter(prefix="/api/model")
+Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
+Place = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Text = Annotated[str, Field(max_length=200)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class NewSite(_Strict):
+    """A site that a click places; without a record it is one to be simulated, to ``depth_mm``."""
+
+    name: Text
+    position: Place
+    region: Text = ""
+    depth_mm: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+
+
+class SiteChange(_Strict):
+    """What changes of a site; what is not given stays."""
+
+    name: Text | None = None
+    region: Text | None = None
+    fitted: bool | None = None
+    position: Place | None = None
+
+
+def _block(content: bytes) -> Response:
+    return Response(content, media_type="application/octet-stream")
+
+
+@router.get("/scene")
+def get_scene(folder: Folder) -> dict[str, Any]:
+    """Surfaces, sites and meshes as they stand."""
+    return scene.scene_of(folder)
+
+
+@router.get("/surface/{name}")
+def get_surface(folder: Folder, name: str) -> Response:
+    """A surface as a block of arrays (see limbfit/web/arrays.py)."""
+    return _block(scene.surface_block(folder, name))
+
+
+@router.get("/layer/{site}/{layer}")
+def get_layer(folder: Folder, site: str, layer: str) -> Response:
+    """The inner face of a layer, of a site's mesh."""
+    return _block(scene.layer_block(folder, site, layer))
+
+
+@router.get("/mesh/{site}")
+def get_mesh(folder: Folder, site: str) -> Response:
+    """The mesh of a site with the quality of its cells."""
+    return _block(scene.mesh_block(folder, site))
+
+
+@router.post("/sites")
+def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
+    """Add a site on the skin; the scene as it is afterwards."""
+    position = scene.on_skin(folder, site.position)
+    more = {"region": site.region or None, "depth_mm": site.depth_mm}
+    add_site(folder.file, site.name, position, {key: value for key, value in more.items() if value})
+    return scene.scene_of(folder)
+
+
+@router.post("/sites/{name}")
+def post_change(folder: Folder, name: str, change: SiteChange) -> dict[str, Any]:
+    """Move, rename or describe a site, or switch fitted; the scene as it is afterwards."""
+    values: dict[str, Any] = change.model_dump(exclude_none=True)
+    if change.position is not None:
+        scene.check_movable(folder.load(), name)
+        values["position"] = scene.on_skin(folder, change.position)
+    if values:
+        set_site(folder.file, name, values)
+    return scene.scene_of(folder)
+
+
+@router.post("/sites/{name}/remove")
+def post_removal(folder: Folder, name: str) -> dict[str, Any]:
+    """Take a site out of the study file; its record stays."""
+    remove_site(folder.file, name)
+    return scene.scene_of(folder)

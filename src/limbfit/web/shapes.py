@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
 from ..mesh import TET_FACES, Mesh, cell_volumes, dihedral_angles, node_jacobians
@@ -50,6 +50,16 @@ class Volume:
         """What a script needs, by the names that ``static/volume.js`` expects."""
         names = ("points", "cells", "regions", "faces", "owners", "neighbours")
         return {name: getattr(self, name) for name in names}
+
+
+def patient_frame(cut_normal: ArrayLike | None) -> NDArray[np.float64]:
+    """Rows: the patient's left, posterior and proximal direction, the last one along the limb (LPS)."""
+    up = np.asarray((0.0, 0.0, 1.0) if cut_normal is None else cut_normal, dtype=float)
+    up = up / np.linalg.norm(up)
+    back = np.array([0.0, 1.0, 0.0])
+    back = back - (back @ up) * up if abs(up[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
+    back /= np.linalg.norm(back)
+    return np.array([np.cross(back, up), back, up])
 
 
 def read_shell(file: Path, most_faces: int | None = None) -> Shell:

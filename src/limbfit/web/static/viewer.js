@@ -299,8 +299,6 @@ function siteMark(site, size) {
   mark.add(new THREE.Mesh(new THREE.SphereGeometry(size, 20, 14), paint));
   if (!site.filled) {
     const heart = new THREE.Mesh(new THREE.SphereGeometry(0.62 * size, 16, 12), new THREE.MeshBasicMaterial({ color: "#ffffff" }));
-    heart.renderOrder = 1;
-    heart.material.depthTest = true;
     heart.position.set(...site.axis.map((value) => -0.5 * size * value));
     mark.add(heart);
   }

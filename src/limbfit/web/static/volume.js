@@ -6,7 +6,7 @@
 export function skinOf(mesh, { visible, plane = null, whole = false }) {
   const { regions, owners, neighbours, faces } = mesh;
   const keeps = whole && plane ? keptCells(mesh, plane) : null;
-  const shown = (cell) => visible[regions[cell]] && (!keeps || keeps[cell]);
+  const shown = (cell) => Boolean(visible[regions[cell]] && (!keeps || keeps[cell]));
   const out = newCorners();
   for (let f = 0; f < owners.length; f++) {
     const first = owners[f], second = neighbours[f];

@@ -1,0 +1,164 @@
+"""What the view Model shows: surfaces, places of sites, meshes; and places that a click gives."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..anatomy.sites import project_to_skin
+from ..anatomy.surfaces import Anatomy, load_anatomy
+from ..errors import InputError, SiteError
+from ..mesh import read_vtu
+from ..pipeline.stages.geometry import given_anatomy, place_site
+from ..pipeline.store import read_json
+from ..study import Site, Study
+from ..web.arrays import pack
+from ..web.shapes import Shell, cell_quality, interface, patient_frame, volume_of
+from .folder import StudyFolder
+
+SKIN = "skin"
+
+
+def anatomy_of(folder: StudyFolder, study: Study) -> Anatomy | None:
+    """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
+    if (folder.results / "surfaces" / "surfaces.json").is_file():
+        return load_anatomy(folder.results / "surfaces")
+    return None if study.surfaces is None else given_anatomy(study)
+
+
+def scene_of(folder: StudyFolder) -> dict[str, Any]:
+    """Surfaces by name, the patient's sides, every site as the study file has it now, and what is meshed.
+
+    A site without a place (not matched to a marker yet, or off the skin) has ``problem`` in words.
+    """
+    study = folder.load()
+    anatomy = anatomy_of(folder, study)
+    stored = {row["site"]: row for row in _stored(folder, "sites", "sites.json").get("sites", [])}
+    meshes = _stored(folder, "mesh", "mesh.json")
+    return {
+        "surfaces": [] if anatomy is None else [SKIN, *anatomy.bones],
+        "frame": patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
+        "sites": [_site_row(site, study, anatomy, stored.get(site.name)) for site in study.sites],
+        "meshes": [site.name for site in study.sites if _mesh_file(folder, site.name) is not None],
+        "layers": list(study.tissues[:-1]),
+        "quality": meshes.get("sites", {}),
+    }
+
+
+def _stored(folder: StudyFolder, stage: str, name: str) -> dict[str, Any]:
+    file = folder.results / stage / name
+    return dict(read_json(file)) if file.is_file() else {}
+
+
+def _mesh_file(folder: StudyFolder, site: str) -> Path | None:
+    file = folder.results / "mesh" / f"{site}.vtu"
+    return file if file.is_file() else None
+
+
+def _site_row(
+    site: Site, study: Study, anatomy: Anatomy | None, stored: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "name": site.name,
+        "region": site.region,
+        "fitted": site.fitted,
+        "has_trace": site.trace is not None,
+        "depth_mm": site.depth_mm,
+        "given": "position" if site.position is not None else "near",
+        "position_mm": None,
+        "axis": None,
+        "problem": None,
+    }
+    try:
+        placed = stored
+        if site.position is not None:
+            placed = None if anatomy is None else place_site(site, study, anatomy, None)
+        if placed is None:
+            row["problem"] = "not on the skin yet: run the stages until sites"
+        else:
+            row |= {key: placed[key] for key in ("position_mm", "axis", "off_skin_mm", "marker")}
+    except SiteError as error:
+        row["problem"] = error.what
+    return row
+
+
+def surface_block(folder: StudyFolder, name: str) -> bytes:
+    """One surface as a block of arrays: ``points``, ``faces``.
+
+    Raises
+    ------
+    InputError
+        For a name that the model does not have.
+    """
+    anatomy = anatomy_of(folder, folder.load())
+    found = {} if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}
+    if name not in found:
+        raise InputError("the model has no such surface", remedy="run the stages until surfaces")
+    surface = found[name]
+    return _shell_block(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
+
+
+def _shell_block(shell: Shell) -> bytes:
+    return pack({"points": shell.points, "faces": shell.faces})
+
+
+def layer_block(folder: StudyFolder, site: str, layer: str) -> bytes:
+    """The inner face of a layer in the mesh of a site, as a block of arrays: ``points``, ``faces``."""
+    mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
+    if layer not in mesh.region_names[:-1]:
+        raise InputError("the mesh has no such layer", remedy="make the meshes again")
+    return _shell_block(interface(volume_of(mesh), mesh.region_names.index(layer)))
+
+
+def mesh_block(folder: StudyFolder, site: str) -> bytes:
+    """The mesh of a site: the arrays of `Volume` and the quality of each cell; ``regions`` are its names."""
+    mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
+    facts = {"regions": list(mesh.region_names), "element": mesh.cell_type, "cells": len(mesh.cells)}
+    return pack({**volume_of(mesh).arrays(), **cell_quality(mesh)}, facts)
+
+
+def on_skin(folder: StudyFolder, position: Sequence[float]) -> list[float]:
+    """The point of the skin nearest to a place (LPS, mm).
+
+    Raises
+    ------
+    InputError
+        Where there is no skin, or the place is far off it.
+    """
+    study = folder.load()
+    anatomy = anatomy_of(folder, study)
+    if anatomy is None:
+        raise InputError("there is no skin yet to place a site on", remedy="run the stages until surfaces")
+    point, _ = project_to_skin(anatomy, position)
+    return [float(value) for value in point]
+
+
+def check_movable(study: Study, name: str) -> None:
+    """Raise where a site's place is not the study file's to change.
+
+    Raises
+    ------
+    InputError
+        For a site that is placed by the markups file, or an unknown one.
+    """
+    site = study.site(name)
+    markups = study.markups
+    if markups is None:
+        return
+    if not _places_of_file(study.file).get(site.name, False):
+        raise InputError(
+            f"site {name} has its place from the markups file {markups.file}",
+            file=study.file,
+            place="markups",
+            remedy="move its control point in 3D Slicer",
+        )
+
+
+def _places_of_file(file: Path) -> dict[str, bool]:
+    """Whether each site of a study file has a place of its own there."""
+    sites = tomllib.loads(file.read_text(encoding="utf-8")).get("sites", [])
+    return {str(site.get("name")): "position" in site or "near" in site for site in sites}
