@@ -1,7 +1,151 @@
-"""The routes of the view Traces."""
+"""The view Traces: records raw and regularised, doubts about them, touch-down and peak as stated."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict
+
+from ..anatomy.surfaces import load_anatomy
+from ..errors import InputError
+from ..pipeline.stages.plausible import record_flags
+from ..pipeline.stages.traces import read_site_trace
+from ..study import Site, Study
+from ..traces.numerics import bins
+from .editing import set_site
+from .folder import StudyFolder, fingerprint
+from .study_routes import Folder, stages_of_folder
 
 router = APIRouter(prefix="/api/traces")
+MOST_POINTS, CURVE_POINTS = 2000, 400  # of a raw record and of a regularised one on the page
+_MOST_KEPT = 64
+_kept: dict[str, dict[str, Any]] = {}
+
+
+class Times(BaseModel):
+    """When the indenter meets the skin and when its way in ends (s of the record); null: found by limbfit."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    touch_down_s: float | None = None
+    peak_s: float | None = None
+
+
+@router.get("")
+def get_records(folder: Folder) -> dict[str, Any]:
+    """Every site with what its record says, and the flags on the records."""
+    study = folder.load()
+    rows: list[dict[str, Any]] = []
+    records: dict[str, dict[str, Any]] = {}
+    for site in study.sites:
+        row: dict[str, Any] = {"site": site.name, "region": site.region, "fitted": site.fitted, "error": None}
+        if site.trace is not None:
+            try:
+                records[site.name] = _read(study, site)
+            except InputError as error:
+                row["error"] = str(error)
+        found = records.get(site.name, {})
+        row |= {
+            "has_trace": site.trace is not None,
+            "facts": found.get("facts"),
+            "stated": found.get("stated"),
+        }
+        rows.append(row)
+    return {"sites": rows, "flags": _flags(folder, study, records)}
+
+
+@router.get("/{name}")
+def get_record(folder: Folder, name: str) -> dict[str, Any]:
+    """One record raw and regularised; times in s of the record, displacement in mm, force in N."""
+    study = folder.load()
+    return _read(study, _recorded(study, name))
+
+
+@router.post("/{name}/preview")
+def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
+    """The record as it would be with other times; nothing is stored."""
+    study = folder.load()
+    return _read(study, _with_times(_recorded(study, name), times))
+
+
+@router.post("/{name}")
+def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
+    """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
+    study = folder.load()
+    site = _with_times(_recorded(study, name), times)
+    found = _read(study, site)
+    set_site(folder.file, name, {"touch_down_s": site.touch_down_s, "peak_s": site.peak_s})
+    return found
+
+
+def _recorded(study: Study, name: str) -> Site:
+    site = study.site(name)
+    if site.trace is None:
+        raise InputError(f"site {name} has no record", file=study.file, place=f"sites.{name}")
+    return site
+
+
+def _with_times(site: Site, times: Times) -> Site:
+    rounded = {key: None if at is None else round(at, 4) for key, at in times.model_dump().items()}
+    return site.model_copy(update=rounded)
+
+
+def _read(study: Study, site: Site) -> dict[str, Any]:
+    """A record with its curves, for as long as neither its file nor what is stated of it changes."""
+    assert site.trace is not None
+    file = study.path(site.trace)
+    key = repr((str(file), fingerprint([file]), study.traces, site.touch_down_s, site.peak_s))
+    if key not in _kept:
+        if len(_kept) >= _MOST_KEPT:
+            _kept.clear()
+        _kept[key] = _record(study, site)
+    return {"site": site.name, **_kept[key]}
+
+
+def _record(study: Study, site: Site) -> dict[str, Any]:
+    trace, smooth, facts = read_site_trace(study, site)
+    even = smooth.resample(CURVE_POINTS)
+    time, force, _ = bins(trace.time_s, trace.force_N, MOST_POINTS)
+    _, moved, _ = bins(trace.time_s, trace.displacement_mm, MOST_POINTS)
+    start = facts["touch_down_s"]
+    return {
+        "facts": {key: value for key, value in facts.items() if not key.startswith("knots")},
+        "stated": {"touch_down_s": site.touch_down_s, "peak_s": site.peak_s},
+        "samples": len(trace.time_s),
+        "step_s": float(np.median(np.diff(trace.time_s))),
+        "raw": {
+            "time_s": _short(time),
+            "displacement_mm": _short(moved),
+            "force_N": _short(force),
+        },
+        "regularised": {
+            "time_s": _short(even.time_s + start),
+            "displacement_mm": _short(even.displacement_mm),
+            "force_N": _short(even.force_N),
+        },
+    }
+
+
+def _short(values: np.ndarray) -> list[float]:
+    return np.round(values, 5).tolist()
+
+
+def _flags(folder: StudyFolder, study: Study, records: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Flags on the records as they are now, and those of the last prediction against the model."""
+    placed, anatomy = {}, None
+    if (folder.results / "sites" / "sites.json").is_file():
+        rows = folder.store.read("sites", "sites.json")["sites"]
+        placed = {row["site"]: row for row in rows if row["site"] in records}
+        anatomy = load_anatomy(folder.results / "surfaces")
+    facts = {name: one["facts"] for name, one in records.items()}
+    steps = {name: one["step_s"] for name, one in records.items()}
+    flags = [flag.to_dict() for flag in record_flags(study, facts, steps, placed, anatomy)]
+    if (folder.results / "predict" / "predict.json").is_file():
+        states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
+        old = "" if states.get("predict") == "done" else " (of the last prediction, which is stale)"
+        for flag in folder.store.read("predict", "predict.json").get("flags", []):
+            if flag["found"] == "against the model":
+                flags.append({**flag, "text": flag["text"] + old})
+    return flags

@@ -1,6 +1,193 @@
-// The view Traces.
-import { el } from "/static/dom.js";
+// The view Traces: records raw and regularised; touch-down and peak are dragged and stored in the study file.
+import { el, replace } from "/static/dom.js";
+import { HandledChart } from "/static/handles.js";
 
-export function mount(element, context) {
-  element.append(el("p", { class: "padded" }, context.study?.name ?? ""));
+const TIME = { title: "Time", unit: "s" };
+const FORCE = { title: "Force", unit: "N" };
+const DEPTH = { title: "Displacement", unit: "mm" };
+const PREVIEW_MS = 250;
+
+export async function mount(element, context) {
+  const view = new TracesView(element, context);
+  await view.refresh();
+  context.on((changed) => (changed.study || changed.stages) && view.refresh());
+  context.on((changed) => changed.theme && view.charts.forEach((chart) => chart.draw()));
+  return {};
+}
+
+class TracesView {
+  constructor(element, context) {
+    this.context = context;
+    this.charts = [];
+    this.site = null;
+    element.classList.add("split");
+    this.side = el("div", { class: "side" });
+    this.area = el("div", { class: "stagearea padded" });
+    element.append(this.side, this.area);
+  }
+
+  async refresh() {
+    if (this.dragging) return;
+    try {
+      this.found = await this.context.api.get("traces");
+    } catch (error) {
+      this.context.warn(error.message);
+      return;
+    }
+    const known = this.found.sites.map((row) => row.site);
+    if (!known.includes(this.site)) this.site = this.found.sites.find((row) => row.facts)?.site ?? known[0];
+    this.list();
+    await this.open(this.site);
+  }
+
+  list() {
+    const of = (name) => this.found.flags.filter((flag) => flag.sites.includes(name)).length;
+    const rows = this.found.sites.map((row) => {
+      const flags = of(row.site);
+      const notes = [row.fitted ? "fitted" : "held out", row.region];
+      if (!row.has_trace) notes.push("no record");
+      if (row.error) notes.push("unreadable");
+      if (row.stated && Object.values(row.stated).some((value) => value !== null)) notes.push("set by hand");
+      return el("li", {}, el("button", { type: "button", class: "site", "data-site": row.site, "aria-pressed": String(row.site === this.site),
+        onclick: () => this.choose(row.site) },
+      el("strong", {}, row.site), el("span", {}, notes.filter(Boolean).join(", ")),
+      flags || row.error ? el("span", { class: "flagged" }, `⚠ ${flags || 1}`) : null));
+    });
+    replace(this.side, el("h2", {}, "Records"), el("ul", { class: "plain sites" }, rows),
+      el("p", { class: "hint" }, "⚠ counts what is doubtful about a record. Drag touch-down or peak, or move it with the arrow keys: the time is stored in the study file at once."));
+  }
+
+  async choose(name) {
+    this.site = name;
+    this.list();
+    this.side.querySelector(`[data-site="${CSS.escape(name)}"]`)?.focus();
+    await this.open(name);
+  }
+
+  async open(name) {
+    this.charts.forEach((chart) => chart.close());
+    this.charts = [];
+    const row = this.found.sites.find((one) => one.site === name);
+    const flags = this.found.flags.filter((flag) => flag.sites.includes(name)).map((flag) => el("li", { class: "doubt" }, `⚠ ${flag.text}`));
+    const head = [el("h2", {}, `Site ${name}${row?.region ? `, ${row.region}` : ""}`), flags.length ? el("ul", { class: "plain flags" }, flags) : null];
+    if (!row?.facts) {
+      replace(this.area, head, el("p", {}, row?.error ?? "This site has no record: it is planned to be simulated."));
+      return;
+    }
+    this.record = await this.context.api.get(`traces/${encodeURIComponent(name)}`);
+    if (name !== this.site) return;
+    const [force, depth, loop] = [0, 1, 2].map(() => el("div", {}));
+    this.facts = el("dl", { class: "facts", id: "trace-facts" });
+    this.reset = el("button", { type: "button", id: "trace-reset", onclick: () => this.store({ touch_down_s: null, peak_s: null }) }, "Leave both to limbfit");
+    replace(this.area, head, force, el("div", { class: "pair" }, depth, loop), el("div", { class: "row" }, this.reset), this.facts);
+    this.charts = [
+      new HandledChart(force, this.content("force_N", FORCE, true), 300),
+      new HandledChart(depth, this.content("displacement_mm", DEPTH, true), 240),
+      new HandledChart(loop, this.loop(), 240),
+    ];
+    this.tell();
+  }
+
+  series(key) {
+    const { raw, regularised, facts } = this.record;
+    const lift = key === "displacement_mm" ? facts.touch_down_mm : 0;
+    return [
+      { label: "as recorded", colour: "--muted", width: 1, x: raw.time_s, y: raw[key] },
+      { label: "regularised", colour: "--simulated", width: 2.5, x: regularised.time_s, y: regularised[key].map((value) => value + lift) },
+    ];
+  }
+
+  content(key, axis) {
+    return { label: `${axis.title} against time at site ${this.site}.`, x: TIME, y: axis, series: this.series(key), handles: this.handles() };
+  }
+
+  loop() {
+    const { displacement_mm: x, force_N: y } = this.record.regularised;
+    return { label: `Force against displacement at site ${this.site}.`, x: { ...DEPTH, title: "Displacement from touch-down" }, y: FORCE,
+      series: [{ label: "regularised", colour: "--simulated", width: 2.5, x, y }] };
+  }
+
+  handles() {
+    const { facts, raw } = this.record;
+    const [first, last] = [raw.time_s[0], raw.time_s.at(-1)];
+    const make = (key, label, low, high) => ({ key, label, unit: "s", value: facts[key], low, high, step: Math.max(this.record.step_s, 0.005), colour: "--second",
+      onmove: (value) => this.moved(key, value), ondrop: (value) => this.dropped(key, value) });
+    return [make("touch_down_s", "Touch-down", first, facts.peak_s - 0.05), make("peak_s", "Peak", facts.touch_down_s + 0.05, last)];
+  }
+
+  wanted(key, value) {
+    return { ...this.record.stated, [key]: value };
+  }
+
+  moved(key, value) {
+    this.dragging = true;
+    this.context.say(`${key === "peak_s" ? "Peak" : "Touch-down"} at ${value.toFixed(3)} s`);
+    if (this.waiting) return;
+    this.waiting = setTimeout(async () => {
+      this.waiting = null;
+      if (!this.dragging) return;
+      const { site } = this;
+      try {
+        const seen = await this.context.api.post(`traces/${encodeURIComponent(site)}/preview`, this.wanted(key, this.latest(key)));
+        if (!this.dragging || site !== this.site) return;
+        this.record = { ...seen, stated: this.record.stated };
+        this.redraw();
+      } catch (error) {
+        this.context.say(error.message);
+      }
+    }, PREVIEW_MS);
+    this.last = { key, value };
+  }
+
+  latest(key) {
+    return this.last?.key === key ? this.last.value : this.record.facts[key];
+  }
+
+  async dropped(key, value) {
+    this.dragging = false;
+    clearTimeout(this.waiting);
+    this.waiting = null;
+    await this.store(this.wanted(key, value));
+  }
+
+  async store(times) {
+    try {
+      this.record = await this.context.api.post(`traces/${encodeURIComponent(this.site)}`, times);
+      this.context.say(`Stored in the study file: touch-down ${this.said("touch_down_s")}, peak ${this.said("peak_s")}. The stage traces is stale now.`);
+      this.context.refresh();
+    } catch (error) {
+      this.context.warn(`Not stored: ${error.message}`);
+    }
+    const focus = document.activeElement?.dataset?.key;
+    await this.refresh();
+    if (focus) this.area.querySelector(`[data-key="${focus}"]`)?.focus();
+  }
+
+  said(key) {
+    const value = this.record.stated[key];
+    return value === null ? "as found" : `${value.toFixed(3)} s`;
+  }
+
+  redraw() {
+    this.charts[0].renew(this.series("force_N"));
+    this.charts[1].renew(this.series("displacement_mm"));
+    this.charts[2].renew(this.loop().series);
+    this.tell();
+  }
+
+  tell() {
+    const { facts, stated, samples } = this.record;
+    const by = (key) => (stated[key] === null ? "found by limbfit" : "set by hand");
+    const number = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
+    const rows = [
+      ["Touch-down", `${number(facts.touch_down_s, 3)} s, at ${number(facts.touch_down_mm, 2)} ± ${number(facts.touch_down_uncertainty_mm, 2)} mm of the record (${by("touch_down_s")})`],
+      ["Peak", `${number(facts.peak_s, 3)} s (${by("peak_s")})`],
+      ["Depth from touch-down", `${number(facts.depth_mm, 2)} mm`],
+      ["Largest force", `${number(facts.peak_force_N, 2)} N, noise ${number(facts.noise_N, 3)} N`],
+      ["Speed in, out", `${number(facts.speed_load_mm_s, 2)}, ${number(facts.speed_unload_mm_s, 2)} mm/s`],
+      ["Samples", samples.toLocaleString("en")],
+    ];
+    replace(this.facts, rows.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]));
+    this.reset.disabled = Object.values(stated).every((value) => value === null);
+  }
 }
