@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,19 @@ def test_the_order_of_simulations_changes_nothing(jobs):
     forwards = [simulate(job) for job in jobs]
     backwards = [simulate(job) for job in jobs[::-1]]
     assert_equal(forwards, backwards[::-1])
+
+
+def test_a_first_guess_is_the_job_s_own_and_changes_nothing_but_the_work(jobs):
+    known = simulate(jobs[0])
+    near = replace(jobs[0], parameters=tuple(1.05 * p for p in PARAMETERS[0]))
+    warm = replace(near, start=jobs[0].parameters)
+    after_its_start = simulate(warm)
+    cold = simulate(near)  # now this is the newest simulation from rest, and the start has to be done again
+    without = simulate(warm)
+    assert_equal([after_its_start], [without])
+    assert_equal([simulate(jobs[0])], [known])
+    assert after_its_start.facts["newton_iterations"] < 0.7 * cold.facts["newton_iterations"]
+    assert after_its_start.force_N == pytest.approx(cold.force_N, rel=2e-3, abs=1e-4)
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ FAULTS = {
     "infinite": ("edge_near_mm = 3.0", "edge_near_mm = inf", r"mesh\.edge_near_mm: .*finite"),
     "not a number": ("edge_near_mm = 3.0", "edge_near_mm = nan", r"mesh\.edge_near_mm: "),
     "text for number": ("edge_near_mm = 3.0", 'edge_near_mm = "fine"', r"mesh\.edge_near_mm: .*number"),
-    "wrong choice": ("edge_near_mm = 3.0", 'element = "hex20"', r"mesh\.element: .*'tet4' or 'tet10'"),
+    "wrong choice": ("edge_near_mm = 3.0", 'element = "hex20"', r"mesh\.element: .*'tet10' or 'tet10p0'"),
     "short vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0]", r"sites\.0\.position"),
     "infinite vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0, inf]", r"sites\.0\.position\.2: .*finite"),
     "no name": ('name = "one limb"', "", r"study\.name: .*required"),

@@ -19,7 +19,7 @@ from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from .errors import ProblemError, SurfaceError
-from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, StepControl, solve
+from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, StepControl, System, solve
 from .fields import Animation, write_fields
 from .mesh import Mesh, read_vtu
 from .study import PARAMETERS, IndenterTable, SolverTable, Vector
@@ -70,17 +70,23 @@ class SiteModel:
     indenter_digest: str = ""
     kappa_ratio: float = 100.0
     steps: SolverTable = field(default_factory=SolverTable)
+    element: str = ""  # row of the element table; by default that of the mesh's cell type
 
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """A simulation to be done: parameters (flat over ``tissues``, kPa), the times of the wanted force."""
+    """A simulation to be done: parameters (flat over ``tissues``, kPa), the times of the wanted force.
+
+    ``start``: other parameters, whose simulation from rest gives the first guesses; several times quicker
+    where they are near. Forces then differ within the solver's tolerance, and by nothing else.
+    """
 
     model: SiteModel
     tissues: tuple[str, ...]
     parameters: tuple[float, ...]
     times_s: tuple[float, ...]
     sensitivities: bool = True
+    start: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         indenter=indenter,
         history=History(np.array(model.knots_s), np.array(model.knots_mm)),
         friction=model.indenter.friction,
+        element=model.element,
     )
 
 
@@ -187,40 +194,54 @@ _MARGIN = 0.3  # of the penetration that is allowed: few other tissues then need
 class Prepared:
     """What all simulations of a site share, and nothing that depends on which of them came first.
 
-    ``reference`` is a simulation with reference tissue, without its states: it holds the discretisation.
     ``penalty`` is that of contact; None where the solver is to find it.
     """
 
     problem: Problem
-    reference: Result
+    system: System
     penalty: float | None
 
 
-_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...]], Prepared] = OrderedDict()
+Site = tuple[SiteModel, tuple[str, ...]]  # with the tissues of its parameters
+_prepared: OrderedDict[Site, Prepared] = OrderedDict()
+# The newest simulation from rest of each site, all of its states kept: first guesses of others.
+_rested: OrderedDict[Site, tuple[tuple[float, ...], Result]] = OrderedDict()
 
 
 def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
-    """The site's discretisation and contact penalty.
-
-    A penalty that each simulation found for itself would change in steps with the parameters, and the force
-    by a percent with it; one taken over from the simulation before makes the answer depend on what that was.
-    So it is the one that reference tissue needs at the deepest point; simulations that need more raise it.
-    """
+    """The site's discretisation and contact penalty."""
     known = _prepared.get((model, tissues))
     if known is None:
         problem = build_problem(model, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
-        control, deepest = steps_of(model), problem.history.peak or float(problem.history.times[-1])
-        times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
-        control = replace(control, times=times, penetration=_MARGIN * control.penetration)
-        found = solve(problem, steps=control, store="peak")
+        control = steps_of(model)
+        system = System(problem, control.threads)
         penalty = control.penalty
-        if penalty is None and found.completed and found.states:
-            penalty = found.states[0].penalty
-        known = _prepared[model, tissues] = Prepared(problem, replace(found, states=()), penalty)
+        if penalty is None:
+            penalty = _reference_penalty(problem, control, system)
+        known = _keep(_prepared, (model, tissues), Prepared(problem, system, penalty))
     _prepared.move_to_end((model, tissues))
-    while len(_prepared) > _KEPT:
-        _prepared.popitem(last=False)
     return known
+
+
+def _reference_penalty(problem: Problem, control: StepControl, system: System) -> float | None:
+    """The contact penalty that reference tissue needs at the deepest point; None where it fails.
+
+    A penalty that each simulation found for itself would change in steps with the parameters, and the force
+    by a percent with it; one taken over from the simulation before makes the answer depend on what that was.
+    Simulations that need more raise it.
+    """
+    deepest = problem.history.peak or float(problem.history.times[-1])
+    times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
+    control = replace(control, times=times, penetration=_MARGIN * control.penetration)
+    found = solve(problem, steps=control, store="peak", system=system)
+    return found.states[0].penalty if found.completed and found.states else None
+
+
+def _keep(places: OrderedDict[Site, Any], site: Site, what: Any) -> Any:
+    places[site] = what
+    while len(places) > _KEPT:
+        places.popitem(last=False)
+    return what
 
 
 def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
@@ -229,9 +250,28 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     return solve(
         known.problem.with_materials(materials(parameters, model.kappa_ratio)),
         steps=replace(steps_of(model), penalty=known.penalty),
-        warm_start=known.reference,
+        system=known.system,
         **how,
     )
+
+
+def _solve_from_rest(model: SiteModel, tissues: tuple[str, ...], parameters: tuple[float, ...]) -> Result:
+    """Simulate a site with sensitivities and keep all states, unless this was the newest such simulation."""
+    known = _rested.get((model, tissues))
+    if known is not None and known[0] == parameters:
+        _rested.move_to_end((model, tissues))
+        return known[1]
+    values = to_parameters(np.array(parameters), tissues)
+    found = _solve(model, values, sensitivities=True, store="all")
+    # Sensitivities are most of the states' memory; a first guess needs few digits of them.
+    states = tuple(replace(s, sensitivity=_single(s.sensitivity)) for s in found.states)
+    found = replace(found, states=states)
+    _keep(_rested, (model, tissues), (parameters, found))
+    return found
+
+
+def _single(values: Array | None) -> Any:
+    return None if values is None else values.astype(np.float32)
 
 
 def steps_of(model: SiteModel) -> StepControl:
@@ -246,10 +286,15 @@ def steps_of(model: SiteModel) -> StepControl:
 def simulate(job: SimulationJob) -> Simulation:
     """Simulate a job; a failure is a result with a reason, never an exception.
 
-    The answer depends on the job alone: not on the process, nor on what it simulated before.
+    The answer depends on the job alone: not on the process, nor on what it simulated before. The simulation
+    that a job starts from is done again where this process has not kept it.
     """
     model, parameters = job.model, to_parameters(np.array(job.parameters), job.tissues)
-    result = _solve(model, parameters, sensitivities=job.sensitivities, store="peak")
+    if job.start is None and job.sensitivities:
+        result = _solve_from_rest(model, job.tissues, job.parameters)
+    else:
+        warm = None if job.start is None else _solve_from_rest(model, job.tissues, job.start)
+        result = _solve(model, parameters, sensitivities=job.sensitivities, warm_start=warm, store="peak")
     times = np.array(job.times_s)
     return Simulation(
         site=model.name,
@@ -264,21 +309,37 @@ def simulate(job: SimulationJob) -> Simulation:
 
 
 def simulate_fields(
-    model: SiteModel, parameters: Parameters, file: Path, animation: Path | None = None
+    model: SiteModel,
+    parameters: Parameters,
+    file: Path,
+    animation: Path | None = None,
+    kept: bool = False,
 ) -> Result:
     """Simulate an indentation and store its fields at the deepest point as VTU (see `fields`).
 
     With ``animation`` (a ``.pvd``) the fields of every step are stored too.  A simulation that fails in its
-    first step has no fields at its deepest point, and ``file`` is not written.
+    first step has no fields at its deepest point, and ``file`` is not written.  ``kept``: the fields of the
+    simulation with sensitivities that `simulate` keeps; it is done where this process has not done it.
     """
+    if kept:
+        tissues = tuple(parameters)
+        vector = tuple(map(float, to_vector(parameters, tissues)))
+        result = _solve_from_rest(model, tissues, vector)
+        _write_deepest(result, file)
+        return result
     frames = None
     if animation is not None:
         prepared = _prepare(model, tuple(parameters)).problem
         frames = Animation(prepared.with_materials(materials(parameters, model.kappa_ratio)), animation)
     result = _solve(model, parameters, on_step=None if frames is None else frames.add, store="peak")
-    if result.states:
-        write_fields(result.system, result.problem, result.states[0], file)
+    _write_deepest(result, file)
     return result
+
+
+def _write_deepest(result: Result, file: Path) -> None:
+    if result.states:
+        deepest = max(result.states, key=lambda state: state.displacement)
+        write_fields(result.system, result.problem, deepest, file)
 
 
 def _in_user_units(result: Result, tissues: Sequence[str], times: Array) -> Array:

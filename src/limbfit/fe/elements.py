@@ -147,6 +147,7 @@ ELEMENTS: dict[str, Element] = {
         Element("tet10g8", "tet10", quadratic_simplex, *_TET_8, False, quadratic_simplex, _TRI6),
         Element("tet10v", "tet10", quadratic_simplex, *_TET_8_VERTICES, False, quadratic_simplex, _TRI6),
         Element("tet10p0", "tet10", quadratic_simplex, *_TET_4, True, quadratic_simplex, _TRI6),
+        Element("tet10g8p0", "tet10", quadratic_simplex, *_TET_8, True, quadratic_simplex, _TRI6),
         Element("hex8", "hex8", linear_hexahedron, *_HEX, True, linear_quadrilateral, _QUAD4),
     )
 }

@@ -102,11 +102,16 @@ class Simulation:
     """One run: the system, its materials, and the step that was reached last."""
 
     def __init__(
-        self, problem: Problem, control: StepControl, sensitivities: bool, warm_start: Result | None
+        self,
+        problem: Problem,
+        control: StepControl,
+        sensitivities: bool,
+        warm_start: Result | None,
+        system: System | None,
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
-        self.system = _system(problem, warm_start, control.threads)
+        self.system = _system(problem, warm_start, system, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self.factor = Factor(self.system, self.laws.moduli, control.linear_solver, control.threads)
@@ -208,9 +213,9 @@ class Simulation:
         return found
 
     def _predict(self, t: float, displacement: float) -> Array:
-        warm = self.warm.get(round(t, 9))
-        if warm is not None:
-            return warm.u
+        warm, last = self.warm.get(round(t, 9)), self.warm.get(round(self.states[-1].time, 9))
+        if warm is not None:  # what it missed by in the step before, it will miss by in this one
+            return warm.u if last is None else warm.u + (self.states[-1].u - last.u)
         weights = extrapolation(self.states, displacement)
         return np.asarray(sum(w * state.u for w, state in zip(weights, self.states)))
 
@@ -287,9 +292,10 @@ def extrapolation(states: Sequence[State], displacement: float) -> Array:
     return weights
 
 
-def _system(problem: Problem, warm_start: Result | None, threads: int) -> System:
-    if warm_start is not None and warm_start.system is not None and warm_start.system.fits(problem):
-        return warm_start.system
+def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
+    for known in (system, warm_start.system if warm_start is not None else None):
+        if known is not None and known.fits(problem):
+            return known
     return System(problem, threads)
 
 
@@ -299,7 +305,9 @@ def _warm_states(problem: Problem, warm_start: Result | None) -> dict[float, Sta
         return {}
     if warm_start.states[0].u.shape != problem.mesh.points.shape:
         return {}
-    change = problem.parameters - warm_start.problem.parameters
+    new, old = problem.parameters, warm_start.problem.parameters
+    with np.errstate(all="ignore"):  # moduli act by their ratio
+        change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
     out = {}
     for state in warm_start.states:
         u = state.u if state.sensitivity is None else state.u + state.sensitivity @ change
@@ -312,6 +320,7 @@ def iterate(
     steps: StepControl = StepControl(),
     sensitivities: bool = False,
     warm_start: Result | None = None,
+    system: System | None = None,
 ) -> Iterator[Step]:
     """Accepted steps of a simulation, one by one; ends early where no step converges.
 
@@ -320,7 +329,7 @@ def iterate(
     ProblemError
         Before anything is solved, where the problem is impossible as stated.
     """
-    yield from Simulation(problem, steps, sensitivities, warm_start).run()
+    yield from Simulation(problem, steps, sensitivities, warm_start, system).run()
 
 
 def solve(
@@ -330,6 +339,7 @@ def solve(
     warm_start: Result | None = None,
     on_step: Callable[[Step], None] | None = None,
     store: str = "peak",
+    system: System | None = None,
 ) -> Result:
     """Simulate an indentation.
 
@@ -338,7 +348,8 @@ def solve(
     sensitivities : also the derivative of the force with respect to every material parameter.
     warm_start : an earlier result on the same mesh whose states (``store="all"``) are the first guesses.
     on_step : called with every accepted step.
-    store : which states to keep: ``peak``, ``all`` or ``none``.
+    store : which states to keep: ``peak``, ``all`` (stresses of the deepest only) or ``none``.
+    system : the discretisation of the same mesh, supports and contact faces, where it is known.
 
     Raises
     ------
@@ -347,15 +358,16 @@ def solve(
         on is no error: the result says ``completed = False`` and why.
     """
     started = time.perf_counter()
-    run = Simulation(problem, steps, sensitivities, warm_start)
+    run = Simulation(problem, steps, sensitivities, warm_start, system)
     rows: list[Step] = []
     kept: list[State] = []
     for step in run.run():
         rows.append(replace(step, state=run.states[0]))
-        if store == "all":
-            kept.append(replace(step.state, memory=None))
-        if store == "peak" and (not kept or step.displacement >= kept[0].displacement):
-            kept = [step.state]
+        deepest = all(step.displacement >= state.displacement for state in kept)
+        if deepest:
+            kept = [replace(state, memory=None) for state in kept] if store == "all" else []
+        if store == "all" or (store == "peak" and deepest):
+            kept.append(step.state if deepest else replace(step.state, memory=None))
         if on_step is not None:
             on_step(step)
     return _result(problem, run, rows, kept, sensitivities, time.perf_counter() - started)

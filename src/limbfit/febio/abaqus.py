@@ -23,7 +23,7 @@ from .faceting import Tool, tool_mesh
 from .writing import FRONT, HELD, INDENTER, PATCH, FebSettings, check_exportable
 
 Array = NDArray[np.float64]
-_ELEMENT = {"tet4": "C3D4", "tet10": "C3D10", "tet10g8": "C3D10", "hex8": "C3D8"}
+_ELEMENT = {"tet4": "C3D4", "tet10": "C3D10", "tet10p0": "C3D10H", "tet10g8": "C3D10", "hex8": "C3D8"}
 # Faces of Abaqus' elements, S1 to S6, as corners of the element (from 0).
 _FACES = {
     "tet": ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)),
@@ -78,6 +78,10 @@ def _lines(
     assert system.indenter is not None
     yield f"** limbfit: {' '.join(settings.title.split())}; mm, N, s, MPa; for {program.capitalize()}"
     yield "** volume: (J-1)^2/D in place of kappa/2 (ln J)^2"
+    element = _ELEMENT[problem.formulation.name]
+    if program == "calculix" and element == "C3D10H":
+        element = "C3D10"
+        yield "** element: C3D10 in place of one with constant pressure, which CalculiX has not; stiffer"
     yield "*NODE, NSET=all_nodes"
     reference = np.asarray(system.indenter.centre)
     for i, point in enumerate(np.vstack([mesh.points, tool.points, reference]), 1):
@@ -87,7 +91,7 @@ def _lines(
     for r, name in enumerate(mesh.region_names):
         chosen = np.flatnonzero(mesh.regions == r)
         numbers[chosen] = first + np.arange(len(chosen))
-        yield f"*ELEMENT, TYPE={_ELEMENT[problem.formulation.name]}, ELSET={name}"
+        yield f"*ELEMENT, TYPE={element}, ELSET={name}"
         for number, cell in zip(numbers[chosen], mesh.cells[chosen]):
             yield from _wrapped([int(number), *(cell + 1)])
         first += len(chosen)

@@ -167,6 +167,8 @@ def _formulation(domain: Node, cell_type: str, rule: str) -> str:
     else:  # hex8 with an uncoupled material is three-field by itself; one point makes tet4 both
         natural = {"tet4": ("elastic-solid", "three-field-solid"), "tet10": ("elastic-solid",)}
         known = kind in natural.get(cell_type, ("three-field-solid",))
+        if (cell_type, rule, kind) == ("tet10", "TET10G4", "three-field-solid"):
+            return "tet10p0"
     if not known or (cell_type in ("tet4", "tet10", "hex8") and (cell_type, rule) not in FORMULATIONS):
         raise domain.refuse(f"{cell_type} as {kind or rule!r} is not supported")
     return FORMULATIONS.get((cell_type, rule), "")

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 INDENTER = "indenter"
 PATCH, FRONT, HELD = "contact_patch", "indenter_front", "held"
 # FEBio's names of limbfit's elements; hex8 with an uncoupled material is three-field by itself.
-_QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
+_QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10p0": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
 _FACE = {3: "tri3", 4: "quad4", 6: "tri6"}
 _PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
 MOST_TERMS = 6  # of Ogden and of Prony in FEBio
@@ -204,6 +204,8 @@ def _surface(name: str, faces: NDArray[np.int64]) -> Iterator[str]:
 def _domains(problem: Problem, tool: Tool) -> Iterator[str]:
     rule = _QUADRATURE[problem.formulation.name]
     given = f' elem_type="{rule}"' if rule else ""
+    if problem.formulation.name == "tet10p0":  # one volume ratio and pressure per element
+        given += ' type="three-field-solid"'
     yield "<MeshDomains>"
     for name in problem.mesh.region_names:
         yield f"<SolidDomain name={quoteattr(name)} mat={quoteattr(name)}{given}/>"

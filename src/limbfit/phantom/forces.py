@@ -1,10 +1,9 @@
 """The phantom's true forces: its implicit anatomy, meshed and stepped otherwise than a calibration does.
 
 The mesh comes from the exact surfaces, not from the segmented image, and is finer than the study's; the
-element has twice its quadrature points (FEBio's rule).  One mean dilatation per element (``tet10p0``)
-converges more slowly, from below (docs/mechanics.md): over thin tissue its force is 13 % less on the same
-mesh, which a calibration would put into the skin.  Both elements here err to the stiff side, so a phantom
-tells how well parameters are found, not how far a mesh is from its limit.
+element has twice its quadrature points (FEBio's rule), and like the study's default one mean dilatation
+each: with the pressure as it comes, forces of such meshes are 5 to 20 % too large (docs/convergence.md),
+which a calibration would put into the moduli.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from ..study import IndenterTable
 from .record import Ramp
 from .sites import INDENTER_EDGE_MM, INDENTER_MM
 
-ELEMENT = "tet10g8"
+ELEMENT = "tet10g8p0"
 PENALTY_PER_MM = 300.0  # stated, in the study too: an adaptive one makes forces jump between parameters
 STEPS = StepControl(load_steps=10, unload_steps=8, penalty=PENALTY_PER_MM, penetration=1.0)
 MESHES = {

@@ -119,7 +119,9 @@ def job_digest(job: SimulationJob) -> str:
     model = {key: value for key, value in vars(job.model).items() if key != "mesh"}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
-    return digest(code_digest(ROOMS), model, job.tissues, job.parameters, job.times_s, job.sensitivities)
+    return digest(
+        code_digest(ROOMS), model, job.tissues, job.parameters, job.times_s, job.sensitivities, job.start
+    )
 
 
 def site_model(
@@ -143,6 +145,7 @@ def site_model(
         indenter_digest="" if file is None else file_digest(file),
         kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
+        element=study.mesh.element,
     )
 
 
@@ -163,3 +166,16 @@ def experiment_cache(context: Context, folder: Path) -> SimulationCache:
     """Simulations of the experiment in ``folder``; all others of the study count as done."""
     others = sorted(place for place in context.store.folder.glob(f"*/{RUNS}") if place.parent != folder)
     return SimulationCache(folder / RUNS, also=others)
+
+
+def newest_simulations(folder: Path, sites: Sequence[str]) -> dict[str, Simulation]:
+    """The last kept simulation of each of the sites, of those that have one, while a stage goes on."""
+    found: dict[str, Simulation] = {}
+    files = [(file.stat().st_mtime_ns, file) for file in folder.glob("*.npz")]
+    for _, file in sorted(files, reverse=True):
+        if len(found) == len(sites):
+            break
+        simulation = _load(file)
+        if simulation.site in sites:
+            found.setdefault(simulation.site, simulation)
+    return found

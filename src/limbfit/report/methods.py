@@ -159,7 +159,11 @@ def _meshes(store: Store) -> str:
 
 
 def _element(name: object) -> str:
-    words = {"tet4": "linear tetrahedra (tet4)", "tet10": "quadratic tetrahedra (tet10)"}
+    words = {
+        "tet4": "linear tetrahedra (tet4)",
+        "tet10": "quadratic tetrahedra (tet10)",
+        "tet10p0": "quadratic tetrahedra with constant pressure (tet10p0)",
+    }
     return words.get(str(name), str(name))
 
 

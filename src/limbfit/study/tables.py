@@ -182,10 +182,11 @@ class CoarseMeshTable(Table):
 class MeshTable(Table):
     """The mesh of each site: element and edge lengths near the indenter and far from it.
 
+    ``element``: linear tetrahedra, or quadratic ones with the pressure as it comes or constant in each.
     With ``coarse``, parameters are searched on coarse meshes, whose forces these meshes correct.
     """
 
-    element: Literal["tet4", "tet10"] = "tet10"
+    element: Literal["tet4", "tet10", "tet10p0"] = "tet10p0"
     edge_near_mm: Positive = 3.5
     edge_far_mm: Positive = 12.0
     near_radius_mm: Positive = 16.0
@@ -194,6 +195,11 @@ class MeshTable(Table):
     engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
     coarse: CoarseMeshTable | None = None
+
+    @property
+    def cell_type(self) -> Literal["tet4", "tet10"]:
+        """The cells of the mesh, whatever is solved on them."""
+        return "tet4" if self.element == "tet4" else "tet10"
 
 
 class IndenterTable(Table):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from ...identify.objective import Measured, SiteResponse
 from ...identify.parameters import search_space, shared
 from ...identify.sources import Gain
 from ...identify.uncertainty import Uncertainty, estimate_uncertainty
-from ...indentation import to_vector
+from ...indentation import Parameters, to_vector
 from ..context import Context
 from ..simulations import experiment_cache
 from ..stages.calibrate import groupings, stage_titles, unknowns
@@ -37,8 +37,12 @@ NAME = "uncertainty"
 class FittedSites:
     """The fitted sites, simulated with derivatives; brought to the fine meshes' forces where those exist."""
 
-    def __init__(self, context: Context, folder: Path, best: Array) -> None:
+    def __init__(
+        self, context: Context, folder: Path, best: Array, earlier: Mapping[tuple[float, ...], Array | None]
+    ) -> None:
+        """``earlier``: parameters that the calibration simulated, and where it started them from."""
         study = context.study
+        self.best, self.earlier = best, earlier
         coarse = study.mesh.coarse is not None
         self.context, self.cache = context, experiment_cache(context, folder)
         self.records = [site_record(context, site) for site in study.fitted]
@@ -51,7 +55,9 @@ class FittedSites:
 
     def simulate(self, points: Sequence[Array]) -> list[list[SiteResponse]]:
         """Responses of all sites at several parameters (p,)."""
-        jobs = [record.job(point) for point in points for record in self.searched]
+        jobs = [
+            record.job(point, start=self._first_guess(point)) for point in points for record in self.searched
+        ]
         found: list[SiteResponse] = []
         for simulation in self.cache.run(jobs, self.context.executor):
             jacobian = simulation.jacobian
@@ -60,6 +66,12 @@ class FittedSites:
             self.context.tell(NAME, len(found), len(jobs), f"site {simulation.site}")
         n = len(self.searched)
         return [self._corrected(found[i : i + n]) for i in range(0, len(found), n)]
+
+    def _first_guess(self, point: Array) -> Array | None:
+        """Where a simulation starts from: as in the calibration, or from the answer; None: from rest."""
+        if np.array_equal(point, self.best):
+            return None
+        return self.earlier.get(tuple(point.tolist()), self.best)
 
     def _anchor(self, best: Array) -> Anchor:
         jobs = [record.job(best) for record in self.searched]
@@ -84,7 +96,8 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     calibration = context.stored("calibrate", "calibration.json")
     best = to_vector(calibration["stages"][-1]["parameters"], study.tissues)
-    sites = FittedSites(context, folder, best)
+    earlier = _earlier_points(context, calibration)
+    sites = FittedSites(context, folder, best, earlier)
     known = _linearised(context, sites, best)
     table, grouping = study.uncertainty, groupings(study)[-1]
     space = search_space(unknowns(study), grouping)
@@ -95,7 +108,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         unknowns(study),
         space,
         known,
-        _earlier_points(context, calibration),
+        [np.array(point) for point in sorted(earlier)],
         settings,
         tell=lambda text: context.tell(NAME, 0, 0, text),
     )
@@ -121,14 +134,17 @@ def _linearised(context: Context, sites: FittedSites, best: Array) -> Uncertaint
     return estimate_uncertainty(best, responses, sites.measured, unknowns(study), noise, groupings(study)[-1])
 
 
-def _earlier_points(context: Context, calibration: dict[str, Any]) -> list[Array]:
-    """Parameters of the calibration's accepted iterates that came near the records."""
+def _earlier_points(context: Context, calibration: dict[str, Any]) -> dict[tuple[float, ...], Array | None]:
+    """Parameters of the calibration's iterates that came near the records, with their first guesses."""
     tissues = context.study.tissues
+
+    def vector(parameters: Parameters | None) -> Array | None:
+        return None if parameters is None else to_vector(parameters, tissues)
+
     iterates = [iterate for stage in calibration["stages"] for iterate in stage["iterations"]]
     least = min(iterate["error_percent"] for iterate in iterates)
     near = [i for i in iterates if i["error_percent"] <= _NEAR * least + 3.0]
-    points = {tuple(to_vector(i["parameters"], tissues)) for i in near}
-    return [np.array(point) for point in sorted(points)]
+    return {tuple(to_vector(i["parameters"], tissues).tolist()): vector(i["first_guess"]) for i in near}
 
 
 def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evidence:

@@ -16,7 +16,7 @@ from ...identify.multistart import Multistart, describe, multistart
 from ...identify.objective import Measured, SiteResponse
 from ...identify.parameters import Grouping, Prior, Unknowns, constrained, two_stages
 from ...identify.uncertainty import Uncertainty, estimate_uncertainty
-from ...indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
+from ...indentation import Parameters, Simulation, SimulationJob, flat_names, to_parameters, to_vector
 from ...study import Site, Study
 from ..context import Context
 from ..simulations import SimulationCache
@@ -26,6 +26,7 @@ from .record_noise import site_noise
 from .traces import site_record
 
 Array = NDArray[np.float64]
+NEAR = 0.7  # in the logarithms of parameters: as far as another simulation's states are good first guesses
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -52,6 +53,8 @@ class Laboratory:
             self.searched = [site_record(context, site, coarse=True) for site in sites]
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
+        self._rested: Array | None = None
+        self._starts: dict[bytes, Array | None] = {}
 
     @property
     def measured(self) -> list[Measured]:
@@ -60,8 +63,30 @@ class Laboratory:
     def search(self, parameters: Array) -> list[SiteResponse]:
         """Force and derivatives where parameters are searched."""
         self.evaluations += 1
-        jobs = [record.job(parameters) for record in self.searched]
+        start = self.first_guess(parameters)
+        jobs = [record.job(parameters, start=start) for record in self.searched]
         return self._run(jobs, f"evaluation {self.evaluations}")
+
+    def first_guess(self, parameters: Array) -> Array | None:
+        """Parameters simulated from rest near these; None where these are to be simulated so themselves.
+
+        It follows from the parameters asked for before: a run taken up again asks for the same ones.
+        """
+        key = parameters.tobytes()
+        if key not in self._starts:
+            rested = self._rested
+            if rested is not None and np.max(np.abs(np.log(parameters / rested))) > NEAR:
+                rested = None
+            if rested is None:
+                self._rested = parameters
+            self._starts[key] = rested
+        return self._starts[key]
+
+    def answer(self, parameters: Array) -> list[SiteResponse]:
+        """The forces of an answer, from rest as all that follows takes them; ``warnings`` are then theirs."""
+        if self.searched is not self.records:
+            return self.check(parameters)
+        return self._run([record.job(parameters) for record in self.records], "the answer, from rest")
 
     def check(self, parameters: Array) -> list[SiteResponse]:
         """Force on the study's own meshes; what failed before is tried again."""
@@ -151,9 +176,8 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         found.parameters, found.responses, laboratory.measured, unknowns(study), noise, stages[-1]
     )
     rounds = rounds_of[id(found)]
-    # The forces of the answer once more, from what is kept, for what is doubtful about them.
-    (laboratory.check if rounds else laboratory.search)(found.parameters)
-    content = _calibration_record(context, found, known, laboratory.cache)
+    laboratory.answer(found.parameters)
+    content = _calibration_record(context, found, known, laboratory)
     content |= {
         "corrections": [_round_record(one, found.sites, study.tissues) for one in rounds],
         "multistart": _multistart_record(tried, study.tissues) if table.starts > 1 else None,
@@ -211,14 +235,16 @@ def _describe(state: State, tissues: Sequence[str]) -> str:
 
 
 def _calibration_record(
-    context: Context, found: Calibration, known: Uncertainty, cache: SimulationCache
+    context: Context, found: Calibration, known: Uncertainty, laboratory: Laboratory
 ) -> dict[str, Any]:
     """What ``calibration.json`` holds."""
-    study, tissues = context.study, context.study.tissues
+    study, tissues, cache = context.study, context.study.tissues, laboratory.cache
     bounds = unknowns(study)
     example = cache.example()
     return {
-        "stages": [_stage_record(found, i, bounds.start, tissues) for i in range(len(found.stages))],
+        "stages": [
+            _stage_record(found, i, bounds.start, tissues, laboratory) for i in range(len(found.stages))
+        ],
         "bounds": {
             "lower": to_parameters(bounds.lower, tissues),
             "upper": to_parameters(bounds.upper, tissues),
@@ -232,11 +258,18 @@ def _calibration_record(
     }
 
 
-def _stage_record(found: Calibration, number: int, start: Array, tissues: Sequence[str]) -> dict[str, Any]:
+def _stage_record(
+    found: Calibration, number: int, start: Array, tissues: Sequence[str], laboratory: Laboratory
+) -> dict[str, Any]:
     """One stage: from ``start`` (the first) or the end of the stage before to its own end."""
     stage = found.stages[number]
     before = np.array(found.stages[number - 1].parameters) if number else start
     iterates = [iterate for iterate in found.history if iterate.stage == number]
+
+    def first_guess(parameters: Sequence[float]) -> Parameters | None:
+        rested = laboratory.first_guess(np.array(parameters))
+        return None if rested is None else to_parameters(rested, tissues)
+
     return {
         "name": stage_titles(tissues)[number],
         "start": to_parameters(before, tissues),
@@ -249,6 +282,7 @@ def _stage_record(found: Calibration, number: int, start: Array, tissues: Sequen
             {
                 "iteration": i,
                 "parameters": to_parameters(np.array(iterate.parameters), tissues),
+                "first_guess": first_guess(iterate.parameters),
                 "cost": iterate.cost,
                 "error_percent": float(np.mean(iterate.errors_percent)),
                 "error_percent_by_site": dict(zip(found.sites, iterate.errors_percent, strict=True)),

@@ -236,7 +236,7 @@ def mesh_settings(study: Study) -> MeshSettings:
     """How the site meshes of a study are made."""
     table, geometry = study.mesh, study.geometry
     return MeshSettings(
-        element=table.element,
+        element=table.cell_type,
         edge_near_mm=table.edge_near_mm,
         edge_far_mm=table.edge_far_mm,
         near_radius_mm=table.near_radius_mm,

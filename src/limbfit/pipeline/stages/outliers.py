@@ -45,7 +45,7 @@ def outlier_record(
     def simulate(parameters: Array) -> list[SiteResponse]:
         if np.array_equal(parameters, best):
             return known
-        return _run(context, cache, [record.job(parameters) for record in searched])
+        return _run(context, cache, [record.job(parameters, start=best) for record in searched])
 
     def exactly(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
         jobs = [_driven_by(searched[a], searched[b], parameters) for a, b in ((i, j), (j, i))]

@@ -75,10 +75,11 @@ def _jobs(
     """Every record with all materials, then with one (unless None), then on coarse meshes where there are.
 
     With coarse meshes derivatives are theirs, and so is the one material's force at held-out sites; at the
-    fitted ones the calibration has simulated it already.
+    fitted ones the calibration has simulated it already. Without, one material's simulation starts from that
+    with all, which has just been done.
     """
     if context.study.mesh.coarse is None:
-        simple = [] if one is None else [r.job(one, sensitivities=r.site.fitted) for r in records]
+        simple = [] if one is None else [r.job(one, sensitivities=False, start=best) for r in records]
         return [record.job(best) for record in records] + simple
     coarse = [site_record(context, record.site, coarse=True) for record in records]
     jobs = [record.job(best, sensitivities=False) for record in records]
@@ -104,15 +105,16 @@ def _fine_force(simple: Simulation, fine: Simulation, coarse: Simulation) -> Sim
 
 @dataclass(frozen=True)
 class FieldJob:
-    """Fields at the deepest point of a site, to be computed and stored by a worker."""
+    """Fields at the deepest point of a site, to be computed and stored by a worker; see `simulate_fields`."""
 
     model: SiteModel
     parameters: Parameters
     file: Path
+    kept: bool
 
 
 def store_fields(job: FieldJob) -> str:
-    simulate_fields(job.model, job.parameters, job.file)
+    simulate_fields(job.model, job.parameters, job.file, kept=job.kept)
     return job.model.name
 
 
@@ -120,7 +122,8 @@ def _write_fields(
     context: Context, folder: Path, records: Sequence[SiteRecord], vector: Array, before: int
 ) -> None:
     parameters = to_parameters(vector, context.study.tissues)
-    jobs = [FieldJob(record.model, parameters, folder / f"{record.site.name}.vtu") for record in records]
+    kept = context.study.mesh.coarse is None  # then a simulation with derivatives was on this mesh
+    jobs = [FieldJob(r.model, parameters, folder / f"{r.site.name}.vtu", kept) for r in records]
     missing = [job for job in jobs if not job.file.is_file()]
     names = [job.model.name for job in missing]
     for i, name in enumerate(context.executor.map(store_fields, missing, keys=names)):

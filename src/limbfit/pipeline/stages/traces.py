@@ -95,9 +95,11 @@ class SiteRecord:
     displacement_mm: Array
     force_N: Array
 
-    def job(self, parameters: Array, sensitivities: bool = True) -> SimulationJob:
+    def job(self, parameters: Array, sensitivities: bool = True, start: Array | None = None) -> SimulationJob:
+        """The simulation with these parameters; ``start``: those whose simulation gives first guesses."""
         values, times = tuple(map(float, parameters)), tuple(map(float, self.times_s))
-        return SimulationJob(self.model, self.tissues, values, times, sensitivities)
+        first = None if start is None else tuple(map(float, start))
+        return SimulationJob(self.model, self.tissues, values, times, sensitivities, first)
 
 
 def site_record(context: Context, site: Site, coarse: bool = False) -> SiteRecord:
