@@ -135,6 +135,29 @@ def test_a_fine_simulation_that_always_fails_is_told():
     assert "the fine simulation fails: s2: folded" in found.reason
 
 
+def test_where_the_coarse_model_answers_too_weakly_the_best_corrected_iterate_is_the_answer():
+    """A coarse model with a third of the fine one's slope sends the search three times too far."""
+    weak = 1 / 3
+
+    def coarse(parameters):
+        # The same forces at the start, from which every change of a parameter has a third of its effect.
+        damped = PAPER.start * (parameters / PAPER.start) ** weak
+        slopes = weak * damped / parameters
+        return [SiteResponse(r.force_N, r.jacobian * slopes) for r in simulate(damped)]
+
+    data, fine = records(0.03), []
+    found = calibrate_corrected(coarse, counting(plain, fine), data, PAPER)
+
+    def cost(parameters):
+        forces = [response.force_N for response in plain(np.array(parameters))]
+        parts = [np.mean(((f - d.force_N) / d.force_N.max()) ** 2) for f, d in zip(forces, data, strict=True)]
+        return float(np.sum(parts))
+
+    last = [one for one in found.rounds if one.stage == 1]
+    assert cost(found.calibration.parameters) == pytest.approx(min(cost(one.parameters) for one in last))
+    assert cost(found.calibration.parameters) < 0.2 * cost(found.calibration.stages[0].parameters)
+
+
 def test_corrections_that_cannot_settle_are_not_called_converged():
     rng = np.random.default_rng(0)
 

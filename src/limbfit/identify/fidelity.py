@@ -145,6 +145,9 @@ def calibrate_corrected(
 
     Notes
     -----
+    An optimum whose fine forces fit worse than those of a round before went too far: the point half-way (in
+    logarithms) is corrected too, and the best of a stage's corrected iterates is its answer.
+
     Nothing is stored between calls: given simulations that remember what they computed, a run taken up again
     repeats the interrupted one. Where a fine simulation fails, the correction before it is kept, and the
     stage has not converged.
@@ -168,6 +171,19 @@ def calibrate_corrected(
     for _ in run.stages:
         run.next_stage()
     return run.result()
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """A corrected iterate of a stage, its cost that of the fine forces, and the model as it was there."""
+
+    state: State
+    iterate: Iterate
+    anchor: Anchor
+
+    @property
+    def cost(self) -> float:
+        return self.iterate.cost
 
 
 @dataclass
@@ -200,16 +216,24 @@ class _Outer:
         before = 0 if self.state is None else self.state.evaluations
         last = len(self.history)
         settled, is_last = False, stage == len(self.stages) - 1
+        best: _Standing | None = None
         allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSE)
         for number in range(self.fidelity.rounds):
             inner = self._inner(stage, _LOOSE if number == 0 or not is_last else 1.0)
             reached = self._correct(stage)
+            settled = not reached.reason and max(reached.expected_percent) <= allowed
+            if best is not None and not reached.reason and not settled and self._cost() > best.cost:
+                self._go_half_way_back(stage, best)
+                reached = self._correct(stage)
             if reached.reason:
                 reason = f"the fine simulation fails: {reached.reason}"
                 break
-            if max(reached.expected_percent) <= allowed:
-                settled = True
+            if best is None or self._cost() < best.cost:
+                best = self._standing()
+            if settled:
                 break
+        if best is not None and best.cost < self._cost():
+            self._return_to(best)
         assert self.state is not None
         end, converged = self.history[-1], inner.converged and settled
         result = replace(
@@ -245,8 +269,31 @@ class _Outer:
         self.history += found.history[len(() if start is None else start.history) :]
         return found.stages[stage]
 
+    def _cost(self) -> float:
+        return self.history[-1].cost
+
+    def _standing(self) -> _Standing:
+        assert self.state is not None
+        assert self.model.anchor is not None
+        return _Standing(self.state, self.history[-1], self.model.anchor)
+
+    def _return_to(self, best: _Standing) -> None:
+        assert self.state is not None
+        self.model.anchor = best.anchor
+        here = replace(best.iterate, evaluations=self.state.evaluations)
+        self.history = (*self.history, here)
+        self.state = replace(best.state, history=(here,))
+
+    def _go_half_way_back(self, stage: int, best: _Standing) -> None:
+        assert self.state is not None
+        z = 0.5 * (np.array(self.state.z) + np.array(best.state.z))
+        parameters = search_space(self.unknowns, self.stages[stage]).expand(z)
+        here = replace(self.history[-1], parameters=tuple(parameters.tolist()))
+        self.history = (*self.history[:-1], here)
+        self.state = replace(self.state, z=tuple(z.tolist()), history=(here,))
+
     def _correct(self, stage: int) -> Round:
-        """Anchor the model at the optimum, and take the iterate there as the fine forces see it."""
+        """Anchor the model at an optimum, and take the iterate there as the fine forces see it."""
         assert self.state is not None
         found = self._anchor(stage, np.array(self.history[-1].parameters))
         if not found.reason:
