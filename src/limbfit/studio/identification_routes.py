@@ -1,7 +1,164 @@
-"""The routes of the view Identification."""
+"""The view Identification: runs started and stopped, how far they are, how the search goes, what came out."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict
+
+from ..pipeline.simulations import newest_simulations
+from ..pipeline.stages.traces import read_curves
+from ..study import PARAMETERS
+from .folder import StudyFolder
+from .processes import running, start_run, starting, stop_run
+from .study_routes import Folder, stages_of_folder
 
 router = APIRouter(prefix="/api/identification")
+LAST_LINES = 40  # of the log
+LOGS_SEARCHED = 5  # for the iterates of a search that was stopped
+_ENDS = {"end": "ended", "failed": "failed", "interrupted": "stopped"}
+
+
+class Wanted(BaseModel):
+    """What to run: up to a stage, and stages that are done anew whether they are done or not."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    until: str | None = None
+    start: str | None = None
+    force: list[str] = []
+
+
+@router.get("")
+def get_identification(folder: Folder) -> dict[str, Any]:
+    """Stages, the run that goes on or the last one, the iterates of the search, and its answer."""
+    study = folder.load()
+    stages = stages_of_folder(folder)
+    logs = sorted((folder.results / "log").glob("*.jsonl"))
+    done = _answer(folder)
+    run = running(folder)
+    state = next(row for row in stages if row["stage"] == "calibrate")
+    return {
+        "stages": stages,
+        "run": run,
+        "starting": starting(folder) if run is None else None,
+        "last": _last(logs[-1], run is not None) if logs else None,
+        "iterates": _iterates(folder, logs, state["state"], done),
+        "parameters": list(PARAMETERS),
+        "tissues": list(study.tissues),
+        "sites": [{"site": site.name, "fitted": site.fitted} for site in study.sites if site.trace],
+        "answer": done and {**done, "state": state["state"]},
+    }
+
+
+@router.get("/curves/{name}")
+def get_curves(folder: Folder, name: str) -> dict[str, Any]:
+    """A site's measured force, and the simulated ones: of the prediction, or the newest while it is searched.
+
+    Time in s from touch-down, displacement in mm, force in N.
+    """
+    site = folder.load().site(name)
+    states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
+    live = _newest(folder, site.name) if states["calibrate"] != "done" else None
+    stored = folder.results / "predict" / f"{site.name}.csv"
+    measured = folder.results / "traces" / f"{site.name}.csv"
+    if live is not None and measured.is_file():
+        curves = {key: values.tolist() for key, values in read_curves(measured).items()}
+        curves["force_measured_N"] = curves.pop("force_N")
+        return {"site": site.name, "of": "the newest simulation of the search", **curves, **live}
+    if stored.is_file():
+        of = "the prediction" if states["predict"] == "done" else "the last prediction, which is stale"
+        return {"site": site.name, "of": of, **{k: v.tolist() for k, v in read_curves(stored).items()}}
+    raise FileNotFoundError(f"predict/{site.name}.csv")
+
+
+@router.post("/start")
+def post_start(folder: Folder, wanted: Wanted) -> dict[str, Any]:
+    """Start or resume: ``limbfit run`` with these options, as a process of its own."""
+    return start_run(folder, wanted.until, wanted.start, wanted.force)
+
+
+@router.post("/stop")
+def post_stop(folder: Folder) -> dict[str, Any]:
+    """Stop the run; what it has finished is kept, and another run goes on from there."""
+    return stop_run(folder)
+
+
+def _answer(folder: StudyFolder) -> dict[str, Any] | None:
+    if not (folder.results / "calibrate" / "calibration.json").is_file():
+        return None
+    found = folder.store.read("calibrate", "calibration.json")
+    known, last = found["uncertainty"], found["stages"][-1]
+    keys = ("name", "cost", "evaluations", "converged", "reason", "parameters")
+    return {
+        "stages": [{key: stage[key] for key in keys} for stage in found["stages"]],
+        "parameters": last["parameters"],
+        "warnings": found["warnings"],
+        "iterates": [
+            {
+                "of": stage["name"],
+                **{key: row[key] for key in ("parameters", "cost", "error_percent", "error_percent_by_site")},
+            }
+            for stage in found["stages"]
+            for row in stage["iterations"]
+        ],
+        **{key: known[key] for key in ("intervals_95", "correlation", "verdict", "at_bound", "combinations")},
+    }
+
+
+def _iterates(
+    folder: StudyFolder, logs: list[Path], state: str, done: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Iterates of the search that goes on or was stopped; else of the stored answer."""
+    if state != "done":
+        finished = (folder.store.stamp("calibrate") or {}).get("finished", "")
+        for log in reversed(logs[-LOGS_SEARCHED:]):
+            rows = [row for row in _events(log) if row["event"] == "fit" and row.get("stage") == "calibrate"]
+            facts = [row["facts"] for row in rows if row.get("facts") and row["time"] > finished]
+            if facts:
+                return {"of": "log", "rows": facts}
+    return {"of": "answer" if done else "nothing", "rows": done.pop("iterates") if done else []}
+
+
+def _last(log: Path, is_running: bool) -> dict[str, Any]:
+    """The newest log: what it is of, how it ended, its newest progress and lines."""
+    events = _events(log)
+    progress = [row for row in events if row["event"] in ("progress", "fit")]
+    end = _ENDS.get(events[-1]["event"]) if events else None
+    if end is None:
+        end = "running" if is_running else "ended without a word: it was killed, or memory ran out"
+    keys = ("stage", "done", "total", "text")
+    return {
+        "what": events[0].get("what") if events else None,
+        "state": end,
+        "error": events[-1].get("text") if end in ("failed",) else None,
+        "began": events[0]["time"] if events else None,
+        "now": {key: progress[-1].get(key) for key in keys} if progress else None,
+        "lines": [
+            {"seconds": row["seconds"], **{k: row.get(k) for k in keys}} for row in progress[-LAST_LINES:]
+        ],
+    }
+
+
+def _events(log: Path) -> list[dict[str, Any]]:
+    """The events of a log; the last line may be half written."""
+    events = []
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict) and isinstance(row.get("event"), str):
+            events.append(row)
+    return events
+
+
+def _newest(folder: StudyFolder, site: str) -> dict[str, Any] | None:
+    for runs in sorted(folder.results.glob(".work-calibrate-*/runs")):
+        found = newest_simulations(runs, (site,)).get(site)
+        if found is not None and found.completed:
+            return {"force_simulated_N": found.force_N.tolist()}
+    return None

@@ -52,6 +52,20 @@ def _is_held(file: Path) -> bool:
     return False
 
 
+def starting(folder: StudyFolder) -> int | None:
+    """The process that was started here for a run and does not hold the study yet; None where none is."""
+    wanted = _command(folder)
+    for process in psutil.process_iter(["cmdline", "status"]):
+        words = process.info["cmdline"] or []
+        if words[1 : len(wanted)] == wanted[1:] and process.info["status"] != psutil.STATUS_ZOMBIE:
+            return process.pid
+    return None
+
+
+def _command(folder: StudyFolder) -> list[str]:
+    return [sys.executable, "-m", "limbfit", "run", str(folder.file.resolve())]
+
+
 def start_run(
     folder: StudyFolder, until: str | None = None, start: str | None = None, force: Sequence[str] = ()
 ) -> dict[str, Any]:
@@ -64,17 +78,18 @@ def start_run(
     RunError
         Where a run holds the study.
     """
-    study = folder.load()
+    folder.load()
     holder = running(folder)
-    if holder is not None:
-        raise RunError(f"process {holder['process']} is running this study; stop it first, or wait for it")
+    busy = starting(folder) if holder is None else holder["process"]
+    if busy is not None:
+        raise RunError(f"process {busy} is running this study; stop it first, or wait for it")
     for name in (until, start, *force):
         if name is not None and name not in STAGE_NAMES:
             raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
     options = [*(["--until", until] if until else []), *(["--from", start] if start else [])]
     options += [word for name in force for word in ("--force", name)]
     process = subprocess.Popen(
-        [sys.executable, "-m", "limbfit", "run", str(study.file.resolve()), *options],
+        [*_command(folder), *options],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -94,6 +109,8 @@ def stop_run(folder: StudyFolder) -> dict[str, Any]:
         Where no run holds the study, or it is no ``limbfit`` command.
     """
     holder = running(folder)
+    if holder is None and (early := starting(folder)) is not None:
+        holder = {"process": early}
     if holder is None:
         raise RunError("no run holds this study: there is nothing to stop")
     try:
