@@ -8,13 +8,10 @@ stable, too.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from .system import System
+from .system import System
 
 Array = NDArray[np.float64]
 _CELLS = 2000  # at a time

@@ -94,8 +94,11 @@ def _with_contact(
 def _of_descent(factor: Factor, data: Array, b: Array, blocks: Array, tolerance: float) -> Solution:
     """Where an old factor met negative curvature: the solution of a new one, stiffened where need be."""
     factor.factorise(data, blocks)
-    found = Solution(b, False, False) if factor.shifted else factor.solve(data, b, None, tolerance)
-    return found if found.convex else Solution(factor.apply(b), False, False)
+    if not factor.shifted:
+        found = factor.solve(data, b, None, tolerance)
+        if found.convex:
+            return found
+    return Solution(factor.apply(b), False, False)
 
 
 def _closed(touch: Touch, moved: Array) -> Bools:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import emcee
 import numpy as np
 from numpy.typing import NDArray
 
 from .likelihood import FACTORS, Likelihood
+
+if TYPE_CHECKING:
+    import emcee
 
 Array = NDArray[np.float64]
 
@@ -98,6 +100,8 @@ def sample_posterior(
         found = -0.5 * likelihood.minus_2_log(z, factor)
         return np.where((factor > FACTORS[0]) & (factor < FACTORS[1]), found, -np.inf)
 
+    import emcee  # a third of a second that only this function is worth
+
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
     sampler = emcee.EnsembleSampler(walkers, k, log_probability, vectorize=True, moves=moves)
     seeded = emcee.State(first, random_state=np.random.RandomState(seed).get_state())
@@ -108,7 +112,9 @@ def sample_posterior(
 def _told(sampler: emcee.EnsembleSampler, likelihood: Likelihood, k: int, steps: int) -> Posterior:
     dropped = steps // 4
     chain = sampler.get_chain(discard=dropped)
-    times = emcee.autocorr.integrated_time(chain, tol=0)
+    from emcee.autocorr import integrated_time
+
+    times = integrated_time(chain, tol=0)
     longest = float(np.nanmax(times))
     flat = chain.reshape(-1, chain.shape[2])
     kept = flat[np.linspace(0, len(flat) - 1, min(_KEPT, len(flat))).astype(int)]
