@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 
 import numpy as np
 import pytest
 
+from conftest import COARSE
 from limbfit.errors import InputError, TraceError
 from limbfit.execution import THREAD_VARIABLES, DaskExecutor, Limits, SerialExecutor
+from limbfit.pipeline import run_study
+from limbfit.study import load_study
 from test_execution import die, nap, refuse, solve, threads, told
 
 distributed = pytest.importorskip("distributed")
@@ -82,3 +88,46 @@ def test_a_scheduler_or_queue_that_is_not_there_is_one_clear_line():
         DaskExecutor.queued("slurmy", 2)
     with pytest.raises(InputError, match="--scheduler: no Dask scheduler answers"):
         DaskExecutor.at("nonsense://127.0.0.1:1")
+
+
+SITES = """[[sites]]
+name = "{}"
+fitted = true
+trace = "1.csv"
+position = {}
+"""
+
+
+@pytest.mark.slow
+def test_a_study_on_a_cluster_that_loses_a_worker_every_twenty_seconds_has_the_same_bits(study, tmp_path):
+    """Three workers, the study through ``--scheduler``; beside it the same study in one process."""
+    file = study / "study.toml"
+    more = SITES.format("3", [-40.0, 0.0, 60.0]) + SITES.format("4", [0.0, -40.0, 60.0])
+    file.write_text(file.read_text() + more + COARSE.replace("tet4", "tet10"))
+    alone = shutil.copytree(study, tmp_path / "alone")
+    run_study(load_study(alone), until="predict", listener=lambda event: None)
+    run_study(load_study(study), until="mesh", listener=lambda event: None)
+    lost: list[int] = []
+    with distributed.LocalCluster(3, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+        run = subprocess.Popen(
+            [sys.executable, "-m", "limbfit", "run", str(study), "--scheduler", cluster.scheduler_address],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        with distributed.Client(cluster, set_as_default=False) as client:
+            while True:
+                try:
+                    _, err = run.communicate(timeout=20.0)
+                    break
+                except subprocess.TimeoutExpired:
+                    workers = client.run(lambda dask_worker: (os.getpid(), len(dask_worker.state.executing)))
+                    busy = [pid for pid, jobs in workers.values() if jobs]
+                    if busy:
+                        os.kill(busy[0], signal.SIGKILL)
+                        lost.append(busy[0])
+    assert run.returncode == 0, err
+    print(f"workers killed in the middle of a job: {len(lost)}")
+    assert len(lost) > 1
+    for stage, name in (("calibrate", "calibration.json"), *(("predict", f"{i}.csv") for i in (1, 2, 3, 4))):
+        ours, theirs = (folder / "results" / stage / name for folder in (study, alone))
+        assert ours.read_bytes() == theirs.read_bytes(), name

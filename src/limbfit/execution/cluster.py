@@ -7,11 +7,14 @@ ended, as a thread of Dask's cannot.
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Self
 
@@ -29,7 +32,10 @@ QUEUES = {
 }
 LOCAL = "local"
 INSTALL = "pip install 'limbfit[dask]'"
+_GONE = "the Dask scheduler is gone; run again: finished work is kept"
 _CONNECT_S = 20.0
+_AHEAD = 2  # jobs at the scheduler for every worker: one at work, one that waits
+_LOOK_S = 1.0  # between two looks at which workers there are
 _QUEUED_GB = 4.0  # asked of the batch system for a worker where the study sets no limit
 
 
@@ -128,7 +134,10 @@ class DaskExecutor:
         return max(len(self._addresses()), self._asked, 1)
 
     def _addresses(self) -> list[str]:
-        return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
+        try:
+            return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
+        except OSError as error:
+            raise RunError(_GONE) from error
 
     def map(
         self,
@@ -142,26 +151,45 @@ class DaskExecutor:
     def _answers(
         self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None
     ) -> Iterator[Any]:
-        name = f"{function.__name__}-{uuid.uuid4().hex}"
-        futures = []
+        """Answers in order, with no more jobs at the scheduler than keep its workers busy.
+
+        It blames a dead worker's jobs for the death, also those that only waited there: of a long queue, jobs
+        would be given up that were never begun.
+        """
+        name, contained = f"{function.__name__}-{uuid.uuid4().hex}", lost is not None
+        futures: dict[int, Any] = {}  # whose answers were not given yet
+        ended: SimpleQueue[None] = SimpleQueue()
+        submitted, looked, present = 0, -math.inf, list[str]()
         try:
-            present = self._addresses()
-            for i, (job, key) in enumerate(zip(jobs, keys, strict=True)):
-                place = self._place(key, present)
-                futures.append(
-                    self._client.submit(
-                        _guarded, function, job, self.limits, lost is not None,
-                        key=f"{name}-{i}", pure=False,
-                        workers=place, allow_other_workers=place is not None,
-                    )
-                )  # fmt: skip
             for i, job in enumerate(jobs):
-                answer = self._result(futures[i], lost is not None)
-                futures[i].release()
+                while True:
+                    under_way = sum(not future.done() for future in futures.values())
+                    if time.monotonic() > looked + _LOOK_S:
+                        present, looked = self._addresses(), time.monotonic()
+                    room = _AHEAD * max(len(present), self._asked, 1) - under_way
+                    for j in range(submitted, min(submitted + room, len(jobs))):
+                        futures[j] = self._submit(
+                            f"{name}-{j}", function, jobs[j], contained, self._place(keys[j], present)
+                        )
+                        futures[j].add_done_callback(lambda _: ended.put(None))
+                        submitted = j + 1
+                    if futures[i].done():
+                        break
+                    with suppress(Empty):
+                        ended.get(timeout=_LOOK_S)
+                answer = self._result(futures.pop(i), contained)
                 yield lost(job, answer.reason) if isinstance(answer, _Lost) and lost else answer
         finally:
             with suppress(Exception):  # the scheduler may be gone
-                self._client.cancel([future for future in futures if not future.done()])
+                self._client.cancel([future for future in futures.values() if not future.done()])
+
+    def _submit(
+        self, name: str, function: Callable, job: Any, contained: bool, place: list[str] | None
+    ) -> Any:
+        return self._client.submit(
+            _guarded, function, job, self.limits, contained,
+            key=name, pure=False, workers=place, allow_other_workers=place is not None,
+        )  # fmt: skip
 
     def _place(self, key: str | None, present: list[str]) -> list[str] | None:
         """Where jobs of a key went before, if that worker lives; else the next worker in turn."""
@@ -180,7 +208,7 @@ class DaskExecutor:
                 return _Lost("every Dask worker that tried it died: out of memory, killed or crashed")
             raise RunError(f"every Dask worker that tried a job died: {error}") from error
         except (distributed.CancelledError, distributed.comm.CommClosedError) as error:
-            raise RunError("the Dask scheduler is gone; run again: finished work is kept") from error
+            raise RunError(_GONE) from error
 
     def __enter__(self) -> Self:
         return self
