@@ -56,7 +56,7 @@ class StepControl:
     times: tuple[float, ...] | None = None
     tolerance: float = 3e-5
     max_iterations: int = 60
-    most_iterations: int = 1500
+    most_iterations: int = 600
     max_cuts: int = 8
     penetration: float = 0.01
     penalty: float | None = None

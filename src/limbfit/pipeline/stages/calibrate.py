@@ -26,7 +26,7 @@ from .record_noise import site_noise
 from .traces import site_record
 
 Array = NDArray[np.float64]
-NEAR = 0.7  # in the logarithms of parameters: as far as another simulation's states are good first guesses
+NEAR = 1.5  # in logarithms of parameters: as far as another simulation's states save work as first guesses
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
