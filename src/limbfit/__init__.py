@@ -13,6 +13,9 @@ Everything the command line does is one call away:
 ``limbfit reproduce``     ``reproduce_study(run_json, folder, tolerance=1e-6, listener=print)``
 ``limbfit doctor``        ``diagnose(folder)``
 ``limbfit surfaces``      ``show_stage(load_study(path), "surfaces", listener=print)``
+``limbfit acquire``       ``acquire_site(load_study(path, recorded=False), site, address="tcp://..")``
+``limbfit recording``     ``judge_recording(file)``
+``limbfit virtual-fitsocket``  ``serve_fitsocket(virtual_fitsocket(load_study(path)), serving, tell=print)``
 ``limbfit simulate``      ``simulate_site(load_study(path), site, parameters=None, listener=print)``
 ``limbfit export``        ``export_study(load_study(path), "feb", site=None, listener=print)``
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
@@ -39,6 +42,11 @@ _HOME = {
     "Study": "study",
     "load_study": "study",
     "Progress": "pipeline",
+    "acquire_site": "pipeline",
+    "judge_recording": "pipeline",
+    "serve_fitsocket": "pipeline",
+    "virtual_fitsocket": "pipeline",
+    "waiting_sites": "pipeline",
     "bench_calibrate": "pipeline",
     "bench_febio_parity": "bench",
     "bench_forward": "bench",

@@ -7,3 +7,39 @@ of the device are us of its own clock.
 
 Nothing here knows a study, a mesh or a solver: `limbfit.pipeline` puts them together.
 """
+
+from .device import Device, LineDevice
+from .events import Event
+from .links import DEFAULT_ADDRESS, DEFAULT_PORT, connect
+from .operator import Keyboard, Nobody
+from .quality import Ramp, Verdict, judge, ramps
+from .recording import Recorder, Recording, read_recording
+from .session import Ending, Listener, LiveTold, PhaseTold, Session, Told, prioritise, run_session
+from .settings import Settings
+
+__all__ = [
+    "DEFAULT_ADDRESS",
+    "DEFAULT_PORT",
+    "Device",
+    "Ending",
+    "Event",
+    "Keyboard",
+    "LineDevice",
+    "Listener",
+    "LiveTold",
+    "Nobody",
+    "PhaseTold",
+    "Ramp",
+    "Recorder",
+    "Recording",
+    "Session",
+    "Settings",
+    "Told",
+    "Verdict",
+    "connect",
+    "judge",
+    "prioritise",
+    "ramps",
+    "read_recording",
+    "run_session",
+]

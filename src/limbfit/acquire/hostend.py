@@ -29,6 +29,7 @@ from .messages import (
 from .wire import DEVICE_LINE, VERSION, Decoder, Encoder, Refusals, salt_of
 
 AGAIN_S = 0.006  # a command is answered at once: after so long it is sent again
+PACED_AGAIN_S = 0.5  # where the device's clock, which runs ahead of its ears, is the one that counts
 ATTEMPTS = 6
 
 
@@ -48,6 +49,7 @@ class HostEnd:
         self._encoder = Encoder(first=0)
         self._decoder = Decoder(DEVICE_LINE, last=-1)
         self._pending: dict[int, _Pending] = {}
+        self._patience_s = AGAIN_S
 
     @property
     def refused(self) -> Refusals:
@@ -75,6 +77,7 @@ class HostEnd:
             self._encoder = Encoder(salt)
             self._decoder.restart(salt)
             self.identity = report
+            self._patience_s = PACED_AGAIN_S if report.clock == "paced" else AGAIN_S
             return report
         return None
 
@@ -84,7 +87,7 @@ class HostEnd:
         if isinstance(command, (Beat, Bye)):
             return line
         self._replace(command)
-        self._pending[number] = _Pending(command, now + AGAIN_S)
+        self._pending[number] = _Pending(command, now + self._patience_s)
         return line
 
     def _replace(self, command: Command) -> None:
@@ -125,7 +128,7 @@ class HostEnd:
                 reason = "the device does not answer commands"
                 continue
             fresh, line = self._encoder.encode(command_body(waiting.command))
-            self._pending[fresh] = _Pending(waiting.command, now + AGAIN_S, waiting.attempts + 1)
+            self._pending[fresh] = _Pending(waiting.command, now + self._patience_s, waiting.attempts + 1)
             lines += line
         return lines, reason
 

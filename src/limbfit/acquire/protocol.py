@@ -254,8 +254,8 @@ class Protocol:
             self._touching = sample.position_um[pin - 1]
         if not self._rests(sample, now, (pin,)):
             return None
-        if self._felt(sample) >= micro(self.settings.touch_N) // 2 and touches:
-            self.touch_um = sample.position_um[pin - 1]
+        if self._felt(sample) >= micro(self.settings.touch_N) // 2 and self._touching is not None:
+            self.touch_um = self._touching
             self.start_um = max(self.touch_um - micro(self.settings.start_gap_mm), 0)
             self.guard.set_depth(pin, self._deepest())
             return Outcome.TOUCHED

@@ -16,6 +16,7 @@ FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and s
 FROZEN_SAMPLES = 8
 SPEED_WINDOW_US = 10_000
 SPEED_MARGIN = 1.25  # of a measured speed over a limit: encoder noise, and the corner of a ramp
+POSITION_MARGIN_UM = 100  # of a measured position over a limit: noise, and what braking takes
 LOST_CLAMP_MN = 500  # a clamping pin that pushes less has lost the limb
 CLAMP_JUMP_MN = 3000  # and so has one whose force changes by more, within the time below
 CLAMP_JUMP_US = 200_000
@@ -63,6 +64,7 @@ class Guard:
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
+        self._least_mN = min(*limits.force_mN, limits.range_mN - 1)
         self._past: deque[Sample] = deque()
         self._last: tuple[int, ...] = ()
         self._alike = [0] * PINS
@@ -76,6 +78,18 @@ class Guard:
 
     def check(self, sample: Sample) -> Violation | None:
         """The first limit that the sample passes."""
+        most = self.limits
+        # The common case at once; which pin it is matters only where one is over.
+        strong = max(sample.force_mN) > self._least_mN or min(sample.force_mN) <= -most.range_mN
+        if strong and (wrong := self._forced(sample)):
+            return wrong
+        for pin, (position, far) in enumerate(zip(sample.position_um, most.position_um, strict=True), 1):
+            if position > far + POSITION_MARGIN_UM:
+                text = f"pin {pin}: {position / 1000:.2f} mm is over the limit of {far / 1000:.2f} mm"
+                return Violation("depth", pin, text)
+        return self._too_fast(sample) or self._frozen(sample)
+
+    def _forced(self, sample: Sample) -> Violation | None:
         limits = self.limits
         for pin, (force, most) in enumerate(zip(sample.force_mN, limits.force_mN, strict=True), 1):
             if abs(force) >= limits.range_mN:
@@ -83,11 +97,7 @@ class Guard:
             if force > most:
                 text = f"pin {pin}: {force / 1000:.2f} N is over the limit of {most / 1000:g} N"
                 return Violation("force", pin, text)
-        for pin, (position, most) in enumerate(zip(sample.position_um, limits.position_um, strict=True), 1):
-            if position > most + 100:
-                text = f"pin {pin}: {position / 1000:.2f} mm is over the limit of {most / 1000:.2f} mm"
-                return Violation("depth", pin, text)
-        return self._too_fast(sample) or self._frozen(sample)
+        return None
 
     def _too_fast(self, sample: Sample) -> Violation | None:
         past = self._past

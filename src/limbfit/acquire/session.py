@@ -8,6 +8,7 @@ way round, not only whether something arrives.
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -216,6 +217,8 @@ class Session:
         protocol = self.protocol
         phase = str(protocol.phase)
         facts: dict[str, Any] = {"phase": phase, "cycle": protocol.cycle}
+        places = {"touch_um": protocol.touch_um, "start_um": protocol.start_um, "depth_um": protocol.depth_um}
+        facts |= {name: place for name, place in places.items() if place}
         if protocol.reason:
             facts["reason"] = protocol.reason
         self._record("phase", now, **facts)
@@ -260,6 +263,15 @@ class _Wire:
             return False
         self.session.lost(str(error), self.now)
         return True
+
+
+def prioritise() -> str:
+    """Ask for this thread to run as soon as it can; ``real-time`` where that is allowed, else ``normal``."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except (AttributeError, OSError):
+        return "normal"
+    return "real-time"
 
 
 def run_session(session: Session, operator: SimpleQueue[Event]) -> Ending:

@@ -11,7 +11,7 @@ import typer
 
 from .. import __version__
 from ..errors import InputError, LimbfitError
-from . import bench, commands, experiments, febio, geometry, runs, studio, trust
+from . import acquire, bench, commands, experiments, febio, geometry, runs, studio, trust
 from .console import INTERRUPTED, STDOUT, fail, prompt_interrupt
 
 app = typer.Typer(
@@ -37,6 +37,7 @@ _PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS}
 _VERBS: tuple[Callable[..., None], ...] = (
     *(*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS),
     *runs.VERBS,
+    *acquire.VERBS,
     *studio.VERBS,
 )
 for verb in _VERBS:

@@ -9,6 +9,11 @@ from typing import Any
 from .context import Listener, Progress
 
 _HOME = {
+    "acquire_site": "acquire",
+    "judge_recording": "acquire",
+    "serve_fitsocket": "acquire",
+    "virtual_fitsocket": "acquire",
+    "waiting_sites": "acquire",
     "STAGE_NAMES": "run",
     "bench_calibrate": "calibration_bench",
     "check_study": "check",

@@ -13,8 +13,12 @@ from ..errors import StudyError
 from .whole import Study
 
 
-def load_study(path: str | Path) -> Study:
+def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     """Read and check a study; ``path`` is the file or its folder.
+
+    Parameters
+    ----------
+    recorded : the records of the sites must exist; not where they are to be made.
 
     Raises
     ------
@@ -36,7 +40,7 @@ def load_study(path: str | Path) -> Study:
         study = Study(**content, file=file, notes=notes)
     except ValidationError as error:
         raise _study_error(error, file) from None
-    _check_paths(study)
+    _check_paths(study, recorded)
     return study
 
 
@@ -86,8 +90,10 @@ def _study_error(error: ValidationError, file: Path) -> StudyError:
     return StudyError(what + (f" (and {more} more)" if more else ""), file=file, place=place, remedy=remedy)
 
 
-def _check_paths(study: Study) -> None:
+def _check_paths(study: Study, recorded: bool) -> None:
     """Every input that the study names must exist before anything runs."""
     for place, path in study.inputs.items():
+        if not recorded and place.startswith("sites."):
+            continue
         if not study.path(path).exists():
             raise StudyError(f"{path} does not exist", file=study.file, place=place)

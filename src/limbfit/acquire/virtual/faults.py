@@ -82,7 +82,11 @@ class FaultClock:
 
     def on(self, kind: str) -> list[Fault]:
         """The faults of a kind that are on."""
-        return [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
+        return (
+            [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
+            if self.faults
+            else []
+        )
 
     def share(self, fault: Fault) -> float:
         """How much of a fault's time has passed, 0 to 1."""

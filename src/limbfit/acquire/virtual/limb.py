@@ -17,6 +17,8 @@ STIFFER = (1.0, 2.0)  # places under the clamping pins, times the mean site
 COUPLING = 0.02  # of the test pin's force, felt by the pins across
 BULGE = 0.08  # of the test pin's depth, towards its neighbours
 ANGLES = 2 * np.pi * np.arange(PINS) / PINS
+_DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
+_ROWS = np.arange(PINS)
 
 
 class Limb:
@@ -28,9 +30,14 @@ class Limb:
     force_N : (14,) what each pin feels in truth.
     """
 
-    def __init__(self, sites: Mapping[str, Surrogate], random: np.random.Generator) -> None:
+    def __init__(
+        self,
+        sites: Mapping[str, Surrogate],
+        random: np.random.Generator,
+        gap_mm: tuple[float, float] = GAP_MM,
+    ) -> None:
         self.sites = dict(sites)
-        self._gap = random.uniform(*GAP_MM, PINS)
+        self._gap = random.uniform(*gap_mm, PINS)
         self._stiffer = random.uniform(*STIFFER, PINS)
         mean = np.mean([s.values for s in sites.values()], axis=0)
         depth = float(np.mean([s.depth_mm for s in sites.values()]))
@@ -39,7 +46,7 @@ class Limb:
         self._shift = np.zeros(2)
         self._levels = np.zeros((PINS, 1 + TAUS_S.size))
         self._kept = np.zeros((PINS, TAUS_S.size))
-        self._test = 0
+        self._set_test(0)
         self.force_N = np.zeros(PINS)
         self.gap_mm = self._gap.copy()
         self.set_time_step(0.001)
@@ -53,10 +60,15 @@ class Limb:
         if site not in self.sites:
             return False
         found = self.sites[site]
-        self._test = pin - 1
+        self._set_test(pin - 1)
         self._values[self._test], self._step[self._test] = found.values, found.step_mm
         self._levels[self._test] = self._kept[self._test] = 0.0
         return True
+
+    def _set_test(self, k: int) -> None:
+        self._test = k
+        self._across = COUPLING * np.maximum(-np.cos(ANGLES - ANGLES[k]), 0.0)
+        self._beside = BULGE * np.isin(_ROWS, [(k - 1) % PINS, (k + 1) % PINS])
 
     def shift(self, towards: int, length_mm: float) -> None:
         """Move the whole limb towards a pin."""
@@ -65,18 +77,14 @@ class Limb:
 
     def step(self, head_mm: Array) -> None:
         """One time step, at whose end the heads are here."""
-        near = self._shift @ np.stack([np.cos(ANGLES), np.sin(ANGLES)])
+        near = self._shift @ _DIRECTIONS
         depth = np.maximum(head_mm - self._gap + near, 0.0)
         place = np.minimum((depth / self._step).astype(np.intp), PIECES - 1)
-        rows = np.arange(PINS)
-        low, high = self._values[rows, :, place], self._values[rows, :, place + 1]
+        low, high = self._values[_ROWS, :, place], self._values[_ROWS, :, place + 1]
         levels = low + (high - low) * (depth / self._step - place)[:, None]
         self._kept = self._fade * self._kept + (levels - self._levels)[:, 1:] * self._gain
         self._levels = levels
         force = np.maximum(levels[:, 0] + self._kept.sum(axis=1), 0.0)
         force[depth == 0] = 0.0
-        across = np.maximum(-np.cos(ANGLES - ANGLES[self._test]), 0.0)
-        self.force_N = force + np.where(force > 0, COUPLING * force[self._test] * across, 0.0)
-        bulge = np.zeros(PINS)
-        bulge[[self._test - 1, (self._test + 1) % PINS]] = BULGE * depth[self._test]
-        self.gap_mm = self._gap - near - bulge
+        self.force_N = force + (force > 0) * (force[self._test] * self._across)
+        self.gap_mm = self._gap - near - depth[self._test] * self._beside

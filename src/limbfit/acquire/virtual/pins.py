@@ -58,7 +58,7 @@ class Motors:
         reach = np.sqrt(2 * braking * np.abs(way))
         wanted = np.where(self.driving, np.sign(way) * np.minimum(self._speed, reach), 0.0)
         change = braking * self.step_s
-        self.speed_mm_s += np.clip(wanted - self.speed_mm_s, -change, change)
+        self.speed_mm_s += np.minimum(np.maximum(wanted - self.speed_mm_s, -change), change)
         if not powered:
             self.speed_mm_s[:] = 0.0
         for k in jammed:
@@ -67,11 +67,12 @@ class Motors:
         arrives = self.driving & (np.abs(way) <= np.maximum(np.abs(moved), NEAR_MM)) & (moved * way >= 0)
         if not powered:
             arrives[:] = False
-        self.position_mm = np.where(arrives, self._target, self.position_mm + moved)
-        self.position_mm = np.clip(self.position_mm, 0.0, STROKE_MM)
+        reached = np.where(arrives, self._target, self.position_mm + moved)
+        self.position_mm = np.minimum(np.maximum(reached, 0.0), STROKE_MM)
         self.speed_mm_s[arrives] = 0.0
         self.driving &= ~arrives
-        self.head_mm = np.clip(self.head_mm, self.position_mm - PLAY_MM / 2, self.position_mm + PLAY_MM / 2)
+        lowest, highest = self.position_mm - PLAY_MM / 2, self.position_mm + PLAY_MM / 2
+        self.head_mm = np.minimum(np.maximum(self.head_mm, lowest), highest)
 
     def lags(self) -> NDArray[np.bool_]:
         """Driven, far from the target, and standing."""
@@ -95,6 +96,7 @@ class Sensors:
         self._zero = random.normal(0, 40, PINS)
         self._walk = self._drift_mN * np.sqrt(step_s)
         self._frozen: dict[int, int] = {}
+        self._noises: list[Array] = []
 
     def read(
         self,
@@ -106,18 +108,20 @@ class Sensors:
         full: Collection[int],
     ) -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
         """Positions, forces, capacitances; ``dead`` and ``full`` (saturated) force sensors by index."""
-        noise = self._random.standard_normal((4, PINS))
+        if not self._noises:
+            self._noises = list(self._random.standard_normal((500, 4, PINS)))
+        noise = self._noises.pop()
         self._zero += self._walk * noise[0]
         raw = 1000 * force_N + self._zero + self._force_noise_mN * noise[1]
-        quantised = np.round(raw / self._force_step_mN) * self._force_step_mN
-        force = np.clip(quantised, -self.range_mN, self.range_mN).astype(int).tolist()
+        quantised = np.rint(raw / self._force_step_mN) * self._force_step_mN
+        force = np.minimum(np.maximum(quantised, -self.range_mN), self.range_mN).astype(int).tolist()
         for k in full:
             force[k] = self.range_mN
         for k in dead:
             force[k] = self._frozen.setdefault(k, force[k])
         for k in [k for k in self._frozen if k not in dead]:
             del self._frozen[k]
-        position = np.round(1000 * position_mm + self._encoder_noise_um * noise[2]).astype(int).tolist()
+        position = np.rint(1000 * position_mm + self._encoder_noise_um * noise[2]).astype(int).tolist()
         air = np.maximum(gap_mm - head_mm, 0.0) + self._film_mm
         seen = self._area / air + 50 * force_N + self._capacitance_noise_fF * noise[3]
-        return tuple(position), tuple(force), tuple(np.round(seen).astype(int).tolist())
+        return tuple(position), tuple(force), tuple(np.rint(seen).astype(int).tolist())

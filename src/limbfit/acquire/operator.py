@@ -1,0 +1,78 @@
+"""The operator: a key that is held, seen through a terminal; or nobody."""
+
+from __future__ import annotations
+
+from queue import SimpleQueue
+
+from .events import Abort, Confirm, Event, KeyDown, KeyUp
+from .phases import Phase
+from .session import PhaseTold, Told
+
+FIRST_REPEAT_S = 0.75  # a keyboard waits before a held key repeats
+
+
+class HeldKey:
+    """A terminal tells of no release: a key that is held repeats, one that is released does not.
+
+    The key counts as held from its second character on, so that a touch moves nothing, and as released once
+    ``gap_s`` has passed without another.
+    """
+
+    def __init__(self, gap_s: float) -> None:
+        self.gap_s = gap_s
+        self.is_held = False
+        self._last: float | None = None
+
+    def pressed(self, now: float) -> Event | None:
+        before, self._last = self._last, now
+        if not self.is_held and before is not None and now - before <= FIRST_REPEAT_S:
+            self.is_held = True
+            return KeyDown()
+        return None
+
+    def passed(self, now: float) -> Event | None:
+        """To be asked often: the release, once."""
+        if self._last is None:
+            return None
+        if self.is_held and now - self._last > self.gap_s:
+            self.is_held, self._last = False, None
+            return KeyUp()
+        return None
+
+
+class Keyboard:
+    """Characters of a terminal to events: Enter confirms, the space bar is the key, anything else stops."""
+
+    def __init__(self, gap_s: float) -> None:
+        self.key = HeldKey(gap_s)
+
+    def typed(self, characters: bytes, now: float) -> list[Event]:
+        found: list[Event] = []
+        for one in characters:
+            if one in b"\r\n":
+                found.append(Confirm())
+            elif one == 0x20:
+                if event := self.key.pressed(now):
+                    found.append(event)
+            else:
+                found.append(Abort("the operator stopped it by a key"))
+        return found
+
+    def passed(self, now: float) -> list[Event]:
+        event = self.key.passed(now)
+        return [event] if event else []
+
+
+class Nobody:
+    """No operator: the limb counts as in place, and the key as held until the search ends by itself."""
+
+    def __init__(self, events: SimpleQueue[Event]) -> None:
+        self.events = events
+
+    def __call__(self, told: Told) -> None:
+        if not isinstance(told, PhaseTold):
+            return
+        if told.phase == Phase.POSITION:
+            self.events.put(Confirm())
+        elif told.phase == Phase.READY:
+            self.events.put(KeyDown())

@@ -1,0 +1,186 @@
+"""Both ends in one process: the real session and the real device code on one injected clock, no wire.
+
+What must never happen is checked on every millisecond of the device (`Bench.millisecond`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp
+from limbfit.acquire.hostend import HostEnd
+from limbfit.acquire.phases import Phase
+from limbfit.acquire.session import Session
+from limbfit.acquire.settings import Settings
+from limbfit.acquire.virtual import Fault, Limb, VirtualFitSocket, fit_surrogate
+from limbfit.acquire.virtual.pins import BRAKING
+from limbfit.study.acquisition import AcquireTable
+
+FAST = {
+    "clamp_speed_mm_s": 8.0,
+    "approach_speed_mm_s": 4.0,
+    "settle_s": 0.1,
+    "pause_s": 0.1,
+    "ramp_speed_mm_s": 6.0,
+    "retract_speed_mm_s": 50.0,
+    "search_depth_mm": 6.0,
+    "clamp_tolerance_N": 6.0,
+    "time_limit_s": 5.0,
+    "operator_limit_s": 1.0,
+}
+SENSOR_MN = 250  # zero, drift and noise: a force is known to the device no better
+OVER_MS = 20
+
+
+def settings(**changes: float) -> Settings:
+    return Settings(**AcquireTable(**(FAST | changes)).model_dump())
+
+
+def indentation(depth: float = 5.0, peak: float = 6.0, speed: float = 0.96, power: float = 1.8):
+    """A made-up simulation: times, displacements and forces of a quasi-linear tissue, in and out."""
+    half = depth / speed
+    fine = np.linspace(0, 2 * half, 4001)
+    elastic = ((depth - np.abs(fine - half) * speed) / depth).clip(0) ** power
+    fade = np.exp(-(fine[1] - fine[0]) / 0.7)
+    kept = np.zeros_like(fine)
+    for k in range(1, fine.size):
+        kept[k] = fade * (kept[k - 1] + elastic[k] - elastic[k - 1])
+    force = np.maximum(elastic + 1.5 * kept, 0)
+    time = np.linspace(0, 2 * half, 81)
+    return time, depth - np.abs(time - half) * speed, np.interp(time, fine, peak * force / force.max())
+
+
+SURROGATE = fit_surrogate(*indentation())
+
+
+def device(seed: int = 0, faults: tuple[Fault, ...] = (), gap_mm=(3.5, 5.0)) -> VirtualFitSocket:
+    limb = Limb({"1": SURROGATE}, np.random.default_rng(seed), gap_mm)
+    return VirtualFitSocket(limb, seed=seed, faults=faults)
+
+
+class Direct:
+    """The device as a session sees it, with bytes handed over instead of sent."""
+
+    def __init__(self, device: VirtualFitSocket) -> None:
+        self.far, self.end = device, HostEnd()
+        self.inbox = b""
+        self.sent: list[bytes] = []
+        self.identity = self.end.greet(device.feed(self.end.hello()))
+        assert self.identity is not None
+
+    @property
+    def refused(self):
+        return self.end.refused
+
+    def send(self, command, now: float) -> None:
+        self._give(self.end.send(command, now))
+
+    def again(self, now: float) -> str:
+        lines, reason = self.end.again(now)
+        if lines:
+            self._give(lines)
+        return reason
+
+    def receive(self, timeout_s: float = 0.0):
+        data, self.inbox = self.inbox, b""
+        return self.end.feed(data)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def _give(self, lines: bytes) -> None:
+        self.sent.append(lines)
+        self.inbox += self.far.feed(lines)
+
+
+class Bench:
+    """A session and a device on a clock of milliseconds; `depth_mm` is where the operator lets the key go."""
+
+    def __init__(
+        self, seed: int = 0, faults: tuple[Fault, ...] = (), depth_mm: float = 3.0, **changes
+    ) -> None:
+        self.settings = settings(**changes)
+        self.device = device(seed, faults)
+        self.wire = Direct(self.device)
+        self.told: list = []
+        self.session = Session(self.settings, self.wire, site="1", listener=self.told.append)
+        self.depth_mm, self.ms = depth_mm, 0
+        self._over = np.zeros(PINS, dtype=int)
+        self._stopped: tuple[int, np.ndarray] | None = None
+        limit = np.full(PINS, self.settings.clamp_limit_N)
+        limit[self.settings.pin - 1] = self.settings.force_limit_N
+        self._limit_N = limit + SENSOR_MN / 1000
+        self.session.begin(0.0)
+        self.session.handle(Confirm(), 0.0)
+
+    @property
+    def now(self) -> float:
+        return self.ms / 1000
+
+    @property
+    def phase(self) -> Phase:
+        return self.session.protocol.phase
+
+    def millisecond(self, *, host: bool = True, device: bool = True) -> None:
+        """A millisecond passes; an end that hangs does nothing in it."""
+        self.ms += 1
+        if device:
+            self.wire.inbox += self.device.step()
+            self._check()
+        if host:
+            reports = self.wire.receive()
+            if reports:
+                self.session.reports(reports, self.now)
+            self.session.tick(self.now)
+
+    def operate(self) -> None:
+        """What the operator does by himself: holds the key when it is time, and lets it go at the depth."""
+        protocol = self.session.protocol
+        if protocol.phase is Phase.READY:
+            self.session.handle(KeyDown(), self.now)
+        elif protocol.phase is Phase.SEARCH and protocol.depth_um - protocol.touch_um > 1000 * self.depth_mm:
+            self.session.handle(KeyUp(), self.now)
+
+    def until(self, phase: Phase | None = None, most_ms: int = 60_000) -> None:
+        """Run to a phase, or to the end."""
+        while not self.session.protocol.is_over and self.phase is not phase and self.ms < most_ms:
+            self.millisecond()
+            if self.phase is not phase:
+                self.operate()
+
+    def settle(self, most_ms: int = 25_000) -> None:
+        """Let both ends come to their end: the session over, the device home or given up."""
+        end = self.ms + most_ms
+        while self.ms < end and not (
+            self.session.protocol.is_over and (self.device.is_home or self.has_given_up)
+        ):
+            self.millisecond()
+
+    @property
+    def has_given_up(self) -> bool:
+        return self.device._given_up
+
+    def _check(self) -> None:
+        motors, faults = self.device.motors, self.device.faults
+        if self.device.stopped:
+            if self._stopped is None:
+                self._stopped = self.ms, np.maximum(motors.speed_mm_s, 0).copy()
+            at, speed = self._stopped
+            allowed = np.maximum(speed - BRAKING * (self.ms - at) / 1000, 0) + 1e-9
+            assert (motors.speed_mm_s <= allowed).all(), "motion towards the limb with a stop active"
+        jammed = {fault.pin - 1 for fault in faults.on("stuck")}
+        free = np.array([k not in jammed for k in range(PINS)]) & (not faults.on("power"))
+        over = self.device.limb.force_N > self._limit_N
+        self._over = np.where(over & free, self._over + 1, 0)
+        assert self._over.max() <= OVER_MS, f"over the limit of force for {self._over.max()} ms"
+
+    def check_end(self) -> None:
+        """Retracted, or reported as out of reach; a stop has a reason."""
+        assert self.session.protocol.is_over, f"still in {self.phase}"
+        if self.phase in (Phase.DONE, Phase.STOPPED):
+            assert self.device.is_home
+        else:
+            assert self.phase is Phase.UNREACHABLE
+            assert self.device.is_home or self.has_given_up
+        if self.phase is not Phase.DONE:
+            assert self.session.protocol.reason
