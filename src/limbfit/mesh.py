@@ -323,7 +323,7 @@ def read_vtu(path: str | Path) -> Mesh:
 
     A foreign file without regions becomes one region named ``all``.
     """
-    grid = _read(Path(path))
+    grid = read_grid(Path(path))
     kinds = np.unique(vtk_to_numpy(grid.GetCellTypesArray()))
     named = {number: name for name, number in VTK_CELL.items()}
     if len(kinds) != 1 or int(kinds[0]) not in named:
@@ -346,7 +346,14 @@ def read_vtu(path: str | Path) -> Mesh:
     )
 
 
-def _read(path: Path) -> vtkUnstructuredGrid:
+def read_grid(path: Path) -> vtkUnstructuredGrid:
+    """A VTU file as VTK's own grid, with all its fields.
+
+    Raises
+    ------
+    ProblemError
+        When there is no such file, or it holds no cells.
+    """
     if not path.is_file():
         raise ProblemError("no such mesh", file=path)
     reader = vtkXMLUnstructuredGridReader()

@@ -48,6 +48,12 @@ export class Chart {
     this.draw();
   }
 
+  /** New curves of the same kind: what is enlarged and read stays. */
+  move(content) {
+    this.content = content;
+    this.draw();
+  }
+
   resize() {
     const width = this.plot.clientWidth;
     if (this.chart && width && width !== this.chart.width) this.chart.setSize({ width, height: this.height });

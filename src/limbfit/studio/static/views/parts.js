@@ -79,6 +79,7 @@ export function cutPanel(changed, look, { whole = true } = {}) {
   }
 
   return {
+    turn,
     part: el("div", {}, el("label", { class: "row" }, on, "cut by a plane"), details),
     set(points, frame, site) {
       Object.assign(state, { points, frame, site });

@@ -1,0 +1,158 @@
+"""Stored fields of simulations as arrays to play: which there are, their mesh, and one moment of one."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from vtkmodules.util.numpy_support import vtk_to_numpy
+
+from ..errors import InputError
+from ..mesh import read_grid, read_vtu
+from ..pipeline.stages.traces import read_curves
+from ..pipeline.store import read_json
+from ..web.arrays import pack
+from ..web.shapes import volume_of
+from .folder import StudyFolder
+
+_FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
+
+
+@dataclass(frozen=True)
+class Field:
+    """A quantity that is stored: its array on cells or points, and which component; None is the length."""
+
+    title: str
+    unit: str
+    array: str
+    on_cells: bool = True
+    component: int | None = 0
+
+
+FIELDS = {
+    "displacement": Field("displacement", "mm", "displacement_mm", False, None),
+    "von_mises": Field("von Mises stress", "kPa", "von_mises_kPa"),
+    **{
+        f"cauchy_{name}": Field(f"Cauchy stress {name}", "kPa", "cauchy_kPa", True, i)
+        for i, name in enumerate(("xx", "yy", "zz", "xy", "yz", "zx"))
+    },
+    "largest_stretch": Field("largest principal stretch", "–", "largest_stretch"),
+    "middle_stretch": Field("middle principal stretch", "–", "middle_stretch"),
+    "smallest_stretch": Field("smallest principal stretch", "–", "smallest_stretch"),
+    "J": Field("volume ratio J", "–", "J"),
+    "contact_pressure": Field("contact pressure", "kPa", "contact_pressure_kPa", False),
+    "energy_density": Field("strain energy density", "kPa", "energy_density_kPa"),
+}
+
+
+def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
+    """What can be shown of a site: every step of a simulation, or the deepest point of the prediction.
+
+    Each has ``source``, ``title``, ``times_s`` and ``parameters_from``.
+    """
+    found = []
+    moments = _moments(folder, site)
+    if moments:
+        summary = folder.results / "simulate" / f"{site}.json"
+        origin = read_json(summary).get("parameters_from") if summary.is_file() else None
+        found.append(
+            {
+                "source": "simulate",
+                "title": "every step of the simulation",
+                "times_s": [time for time, _ in moments],
+                "parameters_from": origin,
+            }
+        )
+    if (folder.results / "predict" / f"{site}.vtu").is_file():
+        peak = {
+            "source": "predict",
+            "title": "the deepest point, as predicted",
+            "parameters_from": "identified",
+        }
+        found.append(peak | {"times_s": [_peak_time(folder, site)]})
+    return found
+
+
+def _moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
+    """Times and files of a stored animation that are there."""
+    collection = folder.results / "simulate" / f"{site}.pvd"
+    if not collection.is_file():
+        return []
+    named = _FRAME.findall(collection.read_text(encoding="utf-8"))
+    files = [(float(time), collection.with_suffix("") / name) for time, name in named]
+    return [(time, file) for time, file in files if file.is_file()]
+
+
+def _peak_time(folder: StudyFolder, site: str) -> float:
+    columns = read_curves(folder.artefact("predict", f"{site}.csv"))
+    return float(columns["time_s"][np.argmax(columns["displacement_mm"])])
+
+
+def _file(folder: StudyFolder, source: str, site: str, moment: int) -> Path:
+    if source == "predict":
+        return folder.artefact("predict", f"{site}.vtu")
+    if source != "simulate":
+        raise InputError("fields are those of simulate or predict")
+    folder.artefact("simulate", f"{site}.pvd")  # a plain name, inside the study
+    moments = _moments(folder, site)
+    if not 0 <= moment < len(moments):
+        raise FileNotFoundError(f"moment {moment} of site {site}")
+    return folder.artefact("simulate", site, moments[moment][1].name)
+
+
+def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
+    """The mesh that the fields of a site stand on: arrays of `Volume`; facts: names of regions, fields."""
+    file = _file(folder, source, site, 0)
+    mesh = read_vtu(file)
+    arrays = _arrays(file)
+    fields = [
+        {"name": name, "title": field.title, "unit": field.unit}
+        for name, field in FIELDS.items()
+        if field.array in arrays
+    ]
+    facts = {"regions": list(mesh.region_names), "fields": fields, "cells": len(mesh.cells)}
+    return pack(volume_of(mesh).arrays(), facts)
+
+
+def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> bytes:
+    """``moved`` (n, 3) of the drawn nodes in mm, and ``values`` of a field on cells or drawn nodes.
+
+    Raises
+    ------
+    InputError
+        For an unknown field, or one that is not stored.
+    FileNotFoundError
+        For a moment that is not there.
+    """
+    field = FIELDS.get(name)
+    file = _file(folder, source, site, moment)
+    arrays = _arrays(file)
+    if field is None or field.array not in arrays:
+        raise InputError("no such field is stored", remedy="fields are " + ", ".join(FIELDS))
+    nodes = np.unique(arrays["cells"][:, :4])
+    values = arrays[field.array]
+    if values.ndim == 2:
+        values = np.linalg.norm(values, axis=1) if field.component is None else values[:, field.component]
+    return pack(
+        {
+            "moved": arrays["displacement_mm"][nodes].astype(np.float32),
+            "values": (values if field.on_cells else values[nodes]).astype(np.float32),
+        },
+        {"on": "cells" if field.on_cells else "nodes"},
+    )
+
+
+def _arrays(file: Path) -> dict[str, NDArray[Any]]:
+    """The point and cell arrays of a VTU file, and its ``cells`` (m, k)."""
+    grid = read_grid(file)
+    found = {}
+    for data in (grid.GetPointData(), grid.GetCellData()):
+        for i in range(data.GetNumberOfArrays()):
+            found[data.GetArrayName(i)] = vtk_to_numpy(data.GetArray(i))
+    connectivity = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
+    found["cells"] = connectivity.reshape(grid.GetNumberOfCells(), -1)
+    return found

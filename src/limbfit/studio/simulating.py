@@ -1,0 +1,97 @@
+"""Simulations of one site as processes of their own: started, found again after a restart, and stopped.
+
+Such a process is ``limbfit simulate STUDY --animation --site NAME``. It is found by its command line, and
+what it has reached by the files that it writes after every step.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import psutil
+
+from ..errors import RunError
+from .folder import StudyFolder
+from .processes import running
+
+PROGRAM = ("-m", "limbfit")
+_SAID = 400  # characters of what a failed simulation said that are told
+
+
+def simulating(folder: StudyFolder) -> dict[str, Any] | None:
+    """``process`` and ``site`` of the simulation that this study has running; None where it has none."""
+    begin = _words(folder)
+    for process in psutil.process_iter(["pid", "cmdline", "status"]):
+        words = process.info["cmdline"] or []
+        if words[1 : len(begin)] == begin[1:] and process.info["status"] != psutil.STATUS_ZOMBIE:
+            return {"process": process.info["pid"], "site": words[len(begin)]}
+    return None
+
+
+def _words(folder: StudyFolder) -> list[str]:
+    file = str(folder.file.resolve())
+    return [sys.executable, *PROGRAM, "simulate", file, "--animation", "--site"]
+
+
+def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
+    """Simulate a site with the fields of every step.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have.
+    RunError
+        Where the study is being run or a simulation goes on.
+    """
+    name = folder.load().site(site).name
+    holder = running(folder) or simulating(folder)
+    if holder is not None:
+        raise RunError(f"process {holder['process']} works on this study; stop it first, or wait for it")
+    _said_file(folder, name).parent.mkdir(parents=True, exist_ok=True)
+    with _said_file(folder, name).open("wb") as said:
+        process = subprocess.Popen(
+            [*_words(folder), name],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            cwd=folder.folder,
+            start_new_session=True,
+        )
+    Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
+    return {"process": process.pid, "site": name}
+
+
+def _said_file(folder: StudyFolder, site: str) -> Path:
+    return folder.results / "simulate" / f".{site}.said"
+
+
+def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
+    """Interrupt the simulation, as Ctrl-C would; the steps it has stored stay.
+
+    Raises
+    ------
+    RunError
+        Where none goes on.
+    """
+    found = simulating(folder)
+    if found is None:
+        raise RunError("no simulation goes on: there is nothing to stop")
+    with suppress(psutil.NoSuchProcess):  # it has ended meanwhile
+        psutil.Process(found["process"]).send_signal(signal.SIGINT)
+    return found
+
+
+def failure_of(folder: StudyFolder, site: str) -> str | None:
+    """The error with which the last simulation of a site ended; None where it ended well or goes on."""
+    file = _said_file(folder, folder.load().site(site).name)
+    if not file.is_file():
+        return None
+    lines = [line.strip() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]
+    told = [line for line in lines if line.startswith("error:")]
+    return told[-1][:_SAID] if told else None

@@ -1,0 +1,159 @@
+"""The view Model's server side: places that clicks give end in the study file, its comments stay."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+pytest.importorskip("fastapi", reason="the studio's extra is not installed")
+
+from fastapi.testclient import TestClient
+
+from limbfit import load_study
+from limbfit.mesh import Mesh, boundary_faces, quality, write_vtu
+from limbfit.studio.app import create_app
+from limbfit.studio.folder import StudyFolder
+from limbfit.studio.guard import Door
+from limbfit.web.arrays import unpack
+
+ORIGIN = "http://127.0.0.1:8123"
+
+
+@pytest.fixture
+def page(study):
+    """The stump with comments in its file, as its page talks to it."""
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace('name = "1"', 'name = "1"  # the first one\nregion = "lateral"'))
+    door = Door("127.0.0.1", 8123)
+    client = TestClient(create_app(StudyFolder(file), door), base_url=ORIGIN, headers={"Origin": ORIGIN})
+    assert client.get("/", params={"token": door.token}).status_code == 200
+    return client
+
+
+def skin_points(study, count):
+    """Places on the wall of the stump, between its end and its cut."""
+    skin = pv.read(study / "skin.stl")
+    inside = skin.points[(skin.points[:, 2] > 0) & (skin.points[:, 2] < 100)]
+    return inside[np.random.default_rng(3).choice(len(inside), count, replace=False)]
+
+
+def test_the_scene_has_surfaces_and_every_site(page):
+    scene = page.get("/api/model/scene").json()
+    assert scene["surfaces"] == ["skin", "tibia"]
+    assert [site["name"] for site in scene["sites"]] == ["1", "2"]
+    first = scene["sites"][0]
+    assert first["fitted"]
+    assert np.linalg.norm(np.subtract(first["position_mm"], [40.0, 0.0, 60.0])) < 5
+    assert first["axis"][0] < -0.9  # into the limb
+    assert scene["meshes"] == []
+    np.testing.assert_allclose(scene["frame"], np.eye(3), atol=1e-12)
+
+
+def test_a_surface_is_sent_as_it_is(page, study):
+    arrays, _ = unpack(page.get("/api/model/surface/skin").content)
+    assert len(arrays["faces"]) == pv.read(study / "skin.stl").n_cells
+    assert np.abs(arrays["points"][:, 2]).max() <= 120.01
+    assert page.get("/api/model/surface/none").status_code == 422
+
+
+def test_a_click_becomes_a_site_of_the_study_within_a_millimetre(page, study):
+    for i, point in enumerate(skin_points(study, 5)):
+        name = f"new-{i}"
+        body = {"name": name, "position": point.tolist(), "region": 'medial "<b>"', "depth_mm": 6.5}
+        scene = page.post("/api/model/sites", json=body).json()
+        assert scene["sites"][-1]["name"] == name
+        site = load_study(study).site(name)
+        assert np.linalg.norm(np.array(site.position) - point) < 1.0
+        assert np.linalg.norm(np.array(scene["sites"][-1]["position_mm"]) - point) < 1.0
+        assert site.region == 'medial "<b>"'
+        assert site.depth_mm == 6.5
+    assert "# the first one" in (study / "study.toml").read_text()
+
+
+def test_a_site_is_moved_named_and_switched(page, study):
+    (point,) = skin_points(study, 1)
+    assert page.post("/api/model/sites/2", json={"position": point.tolist()}).status_code == 200
+    assert page.post("/api/model/sites/2", json={"name": "heel", "region": "distal"}).status_code == 200
+    assert page.post("/api/model/sites/heel", json={"fitted": True}).status_code == 200
+    site = load_study(study).site("heel")
+    assert np.linalg.norm(np.array(site.position) - point) < 1.0
+    assert (site.region, site.fitted, str(site.trace)) == ("distal", True, "2.csv")
+    assert page.post("/api/model/sites/heel/remove").status_code == 200
+    assert [site.name for site in load_study(study).sites] == ["1"]
+    assert "# the first one" in (study / "study.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "words"),
+    [
+        ("sites", {"name": "a", "position": [500, 0, 0], "depth_mm": 5}, "off the skin"),
+        ("sites", {"name": "../a", "position": [42, 0, 60], "depth_mm": 5}, "name"),
+        ("sites", {"name": "<script>", "position": [42, 0, 60], "depth_mm": 5}, "name"),
+        ("sites", {"name": "1", "position": [42, 0, 60], "depth_mm": 5}, "name"),
+        ("sites", {"name": "a", "position": [42, 0], "depth_mm": 5}, "position"),
+        ("sites", {"name": "a", "position": [42, 0, None], "depth_mm": 5}, "position"),
+        ("sites", {"name": "a", "position": [42, 0, 60], "depth_mm": -5}, "depth_mm"),
+        ("sites", {"name": "a", "position": [42, 0, 60], "depth_mm": 5, "trace": "/etc/passwd"}, "trace"),
+        ("sites/9", {"fitted": True}, "9"),
+        ("sites/1", {"name": "2"}, "2"),
+        ("sites/..%2f..%2fetc", {"fitted": True}, ""),
+    ],
+)
+def test_what_the_study_refuses_leaves_its_file_alone(page, study, path, body, words):
+    before = (study / "study.toml").read_bytes()
+    answer = page.post(f"/api/model/{path}", json=body)
+    assert 400 <= answer.status_code < 500
+    assert words in answer.text
+    assert "Traceback" not in answer.text
+    assert (study / "study.toml").read_bytes() == before
+
+
+def test_a_site_with_a_place_from_markups_stays_where_it_is(page, study):
+    point = skin_points(study, 1)[0].tolist()
+    markups = {"markups": [{"type": "Fiducial", "coordinateSystem": "LPS", "controlPoints": [
+        {"label": "2", "position": point}]}]}  # fmt: skip
+    (study / "places.mrk.json").write_text(json.dumps(markups))
+    file = study / "study.toml"
+    text = file.read_text().replace("position = [0.0, 40.0, 50.0]\n", "")
+    file.write_text(text + '\n[markups]\nfile = "places.mrk.json"\n')
+    answer = page.post("/api/model/sites/2", json={"position": [0.0, 40.0, 50.0]})
+    assert answer.status_code == 422
+    assert "markups file" in answer.json()["error"]
+    assert "position" not in tomllib.loads(file.read_text())["sites"][1]
+
+
+def _meshed(study) -> Mesh:
+    """A block of tetrahedra as the mesh of site 1."""
+    grid = pv.ImageData(dimensions=(4, 4, 4), spacing=(3, 3, 3)).to_tetrahedra(5)
+    cells = np.asarray(grid.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
+    points = np.asarray(grid.points, dtype=float)
+    corners = points[cells]
+    sides = corners[:, 1:] - corners[:, :1]
+    wrong = np.linalg.det(sides) < 0
+    cells[wrong] = cells[wrong][:, [0, 2, 1, 3]]
+    layer = (points[cells][:, :, 2].mean(axis=1) < 6).astype(np.int64)
+    mesh = Mesh(points, cells, "tet4", layer, ("skin", "muscle"))
+    folder = study / "results" / "mesh"
+    folder.mkdir(parents=True)
+    write_vtu(mesh, folder / "1.vtu")
+    (folder / "mesh.json").write_text(json.dumps({"sites": {"1": {"min_dihedral_deg": 54.7}}}))
+    return mesh
+
+
+def test_a_mesh_is_sent_with_the_quality_of_its_cells(page, study):
+    mesh = _meshed(study)
+    scene = page.get("/api/model/scene").json()
+    assert scene["meshes"] == ["1"]
+    assert scene["quality"]["1"]["min_dihedral_deg"] == 54.7
+    arrays, facts = unpack(page.get("/api/model/mesh/1").content)
+    assert facts["regions"] == ["skin", "muscle"]
+    assert arrays["min_dihedral_deg"].min() == pytest.approx(quality(mesh).min_dihedral_deg, rel=1e-5)
+    assert (arrays["neighbours"] < 0).sum() == len(boundary_faces(mesh))
+    layer, _ = unpack(page.get("/api/model/layer/1/skin").content)
+    np.testing.assert_allclose(layer["points"][:, 2], 6.0)
+    assert page.get("/api/model/mesh/2").status_code == 404
+    assert page.get("/api/model/layer/1/muscle").status_code == 422

@@ -1,0 +1,181 @@
+"""The view Results' server side: stored fields as they are stored, runs kept and compared, files to keep."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+pytest.importorskip("fastapi", reason="the studio's extra is not installed")
+
+from fastapi.testclient import TestClient
+
+from limbfit.mesh import Mesh, to_tet10, write_pvd, write_vtu
+from limbfit.studio.app import create_app
+from limbfit.studio.folder import StudyFolder
+from limbfit.studio.guard import Door
+from limbfit.studio.playback import FIELDS
+from limbfit.studio.simulating import simulating
+from limbfit.web.arrays import unpack
+
+ORIGIN = "http://127.0.0.1:8123"
+STEPS = 4
+
+
+def block() -> Mesh:
+    grid = pv.ImageData(dimensions=(4, 4, 4), spacing=(3, 3, 3)).to_tetrahedra(5)
+    cells = np.asarray(grid.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
+    points = np.asarray(grid.points, dtype=float)
+    sides = points[cells][:, 1:] - points[cells][:, :1]
+    wrong = np.linalg.det(sides) < 0
+    cells[wrong] = cells[wrong][:, [0, 2, 1, 3]]
+    return to_tet10(Mesh(points, cells, "tet4", np.zeros(len(cells), np.int64), ("muscle",)))
+
+
+def fields(mesh: Mesh, share: float) -> tuple[dict, dict]:
+    """Fields that differ from cell to cell and grow with the step."""
+    moved = share * np.column_stack([0 * mesh.points[:, 0], 0 * mesh.points[:, 0], -0.1 * mesh.points[:, 2]])
+    count = np.arange(len(mesh.cells), dtype=float)
+    cells = {"von_mises_kPa": share * count, "J": 1 - 0.01 * share * count / count.max()}
+    cells |= {f"{name}_stretch": 1 + share * count for name in ("largest", "middle", "smallest")}
+    cells["cauchy_kPa"] = share * np.column_stack([count + 10 * k for k in range(6)])
+    return {"displacement_mm": moved}, cells
+
+
+def write_outcome(results, error: float = 3.0) -> None:
+    """What calibration and prediction store, as far as the view shows it."""
+    for name in ("predict", "calibrate"):
+        (results / name).mkdir(parents=True, exist_ok=True)
+    parameters = {
+        tissue: {"c_kPa": error, "m": 4.0, "gamma": 1.0, "tau_s": 0.5} for tissue in ("skin", "muscle")
+    }
+    stages = [
+        {"name": name, "parameters": parameters, "iterations": [{}]}
+        for name in ("one material", "two materials")
+    ]
+    (results / "calibrate" / "calibration.json").write_text(json.dumps({"stages": stages}))
+    rows = [{"site": "1", "region": "", "fitted": True, "error_percent": error, "peak_force_N": 6.0}]
+    content = {"sites": rows, "mean_error_fitted_percent": error, "mean_error_heldout_percent": None}
+    (results / "predict" / "predict.json").write_text(json.dumps(content))
+    (results / "predict" / "1.csv").write_text(
+        f"time_s,displacement_mm,force_measured_N,force_simulated_N\n0,0,0,0\n1,5,6,{error}\n2,0,0,0\n"
+    )
+
+
+@pytest.fixture
+def page(study):
+    mesh, results = block(), study / "results"
+    write_outcome(results)
+    folder = results / "simulate" / "1"
+    folder.mkdir(parents=True)
+    frames = []
+    for step in range(STEPS):
+        file = folder / f"step-{step:04d}.vtu"
+        write_vtu(mesh, file, *fields(mesh, step / (STEPS - 1)))
+        frames.append((0.5 * step, file))
+    write_pvd(results / "simulate" / "1.pvd", frames)
+    write_vtu(mesh, results / "predict" / "1.vtu", *fields(mesh, 1.0))
+    door = Door("127.0.0.1", 8123)
+    client = TestClient(
+        create_app(StudyFolder(study / "study.toml"), door), base_url=ORIGIN, headers={"Origin": ORIGIN}
+    )
+    assert client.get("/", params={"token": door.token}).status_code == 200
+    return client
+
+
+def test_what_can_be_played_is_told_with_its_times(page):
+    played, peak = page.get("/api/results/site/1").json()["sources"]
+    assert played["source"] == "simulate"
+    assert played["times_s"] == [0.0, 0.5, 1.0, 1.5]
+    assert (peak["source"], peak["times_s"]) == ("predict", [1.0])  # when the record is deepest
+    assert page.get("/api/results/site/2").json()["sources"] == []
+
+
+@pytest.mark.parametrize("name", [*FIELDS])
+def test_every_field_comes_as_it_is_stored(page, name):
+    mesh = block()
+    stored, _ = unpack(page.get("/api/results/mesh/simulate/1").content)
+    corners = np.unique(mesh.cells[:, :4])
+    np.testing.assert_allclose(stored["points"], mesh.points[corners], atol=1e-5)
+    path = f"/api/results/moment/simulate/1/2/{name}"
+    if name in ("contact_pressure", "energy_density"):  # not stored here
+        assert page.get(path).status_code == 422
+        return
+    arrays, facts = unpack(page.get(path).content)
+    points, cells = fields(mesh, 2 / 3)
+    np.testing.assert_allclose(arrays["moved"], points["displacement_mm"][corners], atol=1e-6)
+    if name == "displacement":
+        assert facts["on"] == "nodes"
+        expected = np.linalg.norm(points["displacement_mm"], axis=1)[corners]
+    else:
+        assert facts["on"] == "cells"
+        values = cells[FIELDS[name].array]
+        expected = values[:, FIELDS[name].component] if values.ndim == 2 else values
+    np.testing.assert_allclose(arrays["values"], expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["moment/simulate/1/4/J", "moment/simulate/1/-1/J", "moment/simulate/2/0/J", "moment/mesh/1/0/J",
+     "moment/simulate/..%2f1/0/J", "moment/simulate/1/0/none", "mesh/predict/2", "curves/2", "curves/..%2fx",
+     "curves/1?kept=..", "?kept=../..", "site/9"],
+)  # fmt: skip
+def test_what_is_not_there_is_refused(page, path):
+    answer = page.get(f"/api/results/{path}" if path[0] != "?" else f"/api/results{path}")
+    assert answer.status_code in (404, 422)
+    assert "Traceback" not in answer.text
+
+
+def test_a_kept_run_is_compared_with_a_later_one(page, study):
+    assert page.post("/api/results/keep", json={"name": "before"}).status_code == 200
+    write_outcome(study / "results", error=2.0)
+    now, before = (page.get(f"/api/results{more}").json() for more in ("", "?kept=before"))
+    assert [run["name"] for run in now["kept"]] == ["before"]
+    assert (now["sites"][0]["error_percent"], before["sites"][0]["error_percent"]) == (2.0, 3.0)
+    assert before["stages"][-1]["parameters"]["skin"]["c_kPa"] == 3.0
+    curves = [page.get(f"/api/results/curves/1{more}").json() for more in ("", "?kept=before")]
+    assert [one["force_simulated_N"][1] for one in curves] == [2.0, 3.0]
+    assert page.post("/api/results/keep", json={"name": "before"}).status_code == 422
+    assert page.post("/api/results/drop", json={"name": "before"}).status_code == 200
+    assert page.get("/api/results").json()["kept"] == []
+
+
+@pytest.mark.parametrize("name", ["..", "../out", "a/b", ".hidden", "", "a" * 41, "x\x00"])
+def test_a_kept_run_has_a_plain_name(page, study, name):
+    assert page.post("/api/results/keep", json={"name": name}).status_code == 422
+    assert not (study / "results" / "kept").exists()
+
+
+def test_files_to_keep_are_those_that_are_stored(page):
+    listed = page.get("/api/results/site/1").json()["downloads"]
+    assert {"predict/1.csv", "predict/1.vtu"} <= {file["path"] for file in listed}
+    for file in listed:
+        answer = page.get(f"/api/files/{file['path']}", params={"download": True})
+        assert answer.status_code == 200
+        assert "attachment" in answer.headers["content-disposition"]
+
+
+def test_a_febio_input_needs_meshes_that_are_up_to_date(page):
+    answer = page.post("/api/results/feb/1")
+    assert answer.status_code == 409
+    assert "until mesh" in answer.json()["error"]
+
+
+def test_a_simulation_is_found_by_its_command_and_stopped(page, study, monkeypatch):
+    """With a program in place of limbfit that takes the same words and waits."""
+    monkeypatch.setattr("limbfit.studio.simulating.PROGRAM", ("-c", "import time; time.sleep(60)"))
+    folder = StudyFolder(study / "study.toml")
+    assert page.post("/api/results/simulate/9").status_code == 422
+    started = page.post("/api/results/simulate/1").json()
+    assert simulating(folder) == started
+    assert page.get("/api/results/site/2").json()["simulating"] == started  # whoever asks
+    assert page.post("/api/results/simulate/2").status_code == 409
+    assert page.post("/api/results/stop").json() == started
+    deadline = time.monotonic() + 20
+    while simulating(folder) is not None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert simulating(folder) is None
+    assert page.post("/api/results/stop").status_code == 409
