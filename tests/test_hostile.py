@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import resource
 import shutil
 import sys
 from contextlib import suppress
@@ -12,17 +13,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from limbfit.anatomy.imaging import read_labels
 from limbfit.cli import main
-from limbfit.errors import InputError, RunError
+from limbfit.errors import InputError, LabelError, RunError
 from limbfit.pipeline import Progress, run_study
 from limbfit.study import load_study
 
 SETTINGS = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
 
 
-def check(folder, monkeypatch, capsys) -> str:
-    """``limbfit check``: the exit code must be 0 or 2; what stands on standard error."""
-    monkeypatch.setattr(sys, "argv", ["limbfit", "check", str(folder)])
+def check(folder, monkeypatch, capsys, *verb: str) -> str:
+    """``limbfit check``, or another verb: the exit code must be 0 or 2; what stands on standard error."""
+    monkeypatch.setattr(sys, "argv", ["limbfit", *(verb or ["check"]), str(folder)])
     try:
         main()
         code = 0
@@ -56,7 +58,7 @@ def damaged(content: bytes, changes) -> bytes:
 
 
 def fuzz(study, monkeypatch, capsys, examples: int) -> None:
-    """Each example damages one of the study's files; ``1.csv`` twice as often as the surface."""
+    """Each example damages one of the study's files and checks it; what passes is run up to its meshes."""
     names = ["study.toml", "study.toml", "1.csv", "1.csv", "tibia.stl"]
     whole = {name: (study / name).read_bytes() for name in set(names)}
 
@@ -65,7 +67,8 @@ def fuzz(study, monkeypatch, capsys, examples: int) -> None:
     def run(name, changes):
         (study / name).write_bytes(damaged(whole[name], changes))
         try:
-            check(study, monkeypatch, capsys)
+            if "error: " not in check(study, monkeypatch, capsys):
+                check(study, monkeypatch, capsys, "run", "--until", "traces")
         finally:
             (study / name).write_bytes(whole[name])
 
@@ -131,6 +134,54 @@ def test_a_bomb_of_zeros_in_a_compressed_image(study, monkeypatch, capsys):
     text = file.read_text().replace('[surfaces]\nskin = "skin.stl"', '[image]\npath = "image.nii.gz"')
     file.write_text(text.replace('bones = { tibia = "tibia.stl" }\n', ""))
     assert "error: " in check(study, monkeypatch, capsys)
+
+
+HUGE = b"NRRD0004\ntype: short\ndimension: 3\nspace: left-posterior-superior\nsizes: %s\n" + (
+    b"space directions: (1,0,0) (0,1,0) (0,0,1)\nspace origin: (0,0,0)\nkinds: domain domain domain\n"
+    b"endian: little\nencoding: gzip\n\n"
+)
+
+
+def of_an_image(study, name: str, more: str = "") -> None:
+    """The study has this image instead of surfaces."""
+    file = study / "study.toml"
+    text = file.read_text().replace('[surfaces]\nskin = "skin.stl"', f'[image]\npath = "{name}"')
+    file.write_text(text.replace('bones = { tibia = "tibia.stl" }\n', "") + more)
+
+
+def test_an_image_that_states_more_voxels_than_memory_is_refused_unread(study, monkeypatch, capsys):
+    (study / "image.nrrd").write_bytes(HUGE % b"9000 9000 9000" + gzip.compress(bytes(1_000_000)))
+    of_an_image(study, "image.nrrd")
+    assert "9000 x 9000 x 9000 voxels" in check(study, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("size", [b"64 64 64", b"9000 9000 9000"])
+def test_a_bomb_in_a_label_map_is_refused_unread(tmp_path, size):
+    file = tmp_path / "labels.seg.nrrd"
+    file.write_bytes(HUGE % size + gzip.compress(bytes(200_000_000), 1))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(LabelError, match=r"unpack to more|more than 1e"):
+        read_labels(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+def test_a_surface_that_states_any_number_of_points_is_refused_unread(study, monkeypatch, capsys):
+    text = (
+        '<?xml version="1.0"?><VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData>'
+        '<Piece NumberOfPoints="90000000000" NumberOfPolys="1"></Piece></PolyData></VTKFile>'
+    )
+    (study / "skin.vtp").write_text(text)
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace("skin.stl", "skin.vtp"))
+    assert "points or faces" in check(study, monkeypatch, capsys)
+
+
+def test_a_trace_that_is_a_link_out_of_the_study_gives_away_nothing(study, monkeypatch, capsys):
+    secret = study.parent / "secret.txt"
+    secret.write_text("root:x:0:0:secret\n" * 20)
+    (study / "2.csv").unlink()
+    (study / "2.csv").symlink_to(secret)
+    assert "root:x" not in check(study, monkeypatch, capsys)
 
 
 def test_a_path_out_of_the_study_gives_away_nothing(study, monkeypatch, capsys):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ImageError
+from .bounds import check_voxels
 from .dicom_headers import SliceHeader, read_headers
 from .dicom_pixels import read_pixels
 from .dicom_stack import same_plane_geometry, stacked
@@ -111,6 +112,7 @@ def _read_volume(series: Series) -> Volume:
     slices, spacing, direction = stacked(series.slices)
     origin = slices[0].position
     assert origin is not None
+    check_voxels((slices[0].columns, slices[0].rows, len(slices)), slices[0].path)
     return Volume(read_pixels(slices), spacing, origin, direction)
 
 

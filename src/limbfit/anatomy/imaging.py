@@ -12,6 +12,7 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from ..errors import ImageError, LabelError
+from .bounds import check_voxels
 from .dicom import Series, describe_series, list_series, read_series
 from .dicom_labels import find_dicom_labels, read_dicom_labels
 from .dicom_pixels import muted
@@ -161,6 +162,7 @@ def _read_image(path: Path) -> sitk.Image:
     try:
         with muted():
             reader.ReadImageInformation()
+            check_voxels(reader.GetSize(), path)
             image = reader.Execute()
     except RuntimeError as error:
         raise _unreadable(path, str(error)) from None

@@ -8,6 +8,7 @@ Header fields: https://slicer.readthedocs.io/en/latest/developer_guide/modules/s
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
 from ..errors import ImageError, LabelError
+from .bounds import check_packed
 from .grid import DEFAULT_NAMES, LabelMap
 from .naming import flatten, plain_name
 
@@ -50,8 +52,9 @@ def is_seg_nrrd(path: Path) -> bool:
 def read_seg_nrrd(path: Path) -> LabelMap:
     """A ``.seg.nrrd`` on its own, maybe cropped, grid."""
     try:
+        check_packed(path, nrrd.read_header(str(path)))
         voxels, header = nrrd.read(str(path))
-    except (nrrd.NRRDError, OSError, ValueError, EOFError, KeyError):
+    except (nrrd.NRRDError, OSError, ValueError, EOFError, KeyError, zlib.error):
         raise LabelError(
             "not a readable .seg.nrrd", file=path, remedy="save it again from 3D Slicer"
         ) from None

@@ -15,6 +15,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkObject
 
 from ..errors import SurfaceError
+from .bounds import check_items
 from .triangles import Surface, compacted, from_pyvista
 
 SUFFIXES = (".stl", ".ply", ".vtp", ".obj")
@@ -78,6 +79,8 @@ def _check_suffix(path: Path) -> None:
 def _read_poly(path: Path) -> pv.PolyData:
     shown = vtkObject.GetGlobalWarningDisplay()
     vtkObject.SetGlobalWarningDisplay(0)  # the error below says it
+    if path.suffix.lower() == ".vtp":
+        check_items(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
