@@ -47,7 +47,7 @@ class HostEnd:
         self.nonce = secrets.token_hex(8)
         self.identity: Identity | None = None
         self._encoder = Encoder(first=0)
-        self._decoder = Decoder(DEVICE_LINE, last=-1)
+        self._decoder = Decoder(DEVICE_LINE, numbered=False)
         self._pending: dict[int, _Pending] = {}
         self._patience_s = AGAIN_S
 

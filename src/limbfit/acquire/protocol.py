@@ -122,7 +122,7 @@ class Protocol:
         pin = self.settings.pin
         if self.phase is Phase.APPROACH and self._touching is not None:
             felt, travel = self._felt(sample), sample.position_um[pin - 1] - self._touching
-        elif self.phase in (Phase.SEARCH, Phase.LOAD):
+        elif self.phase is Phase.SEARCH:  # the first push: on a ramp the tissue may not be back yet
             felt, travel = self._felt(sample), sample.position_um[pin - 1] - self.touch_um
         else:
             return None

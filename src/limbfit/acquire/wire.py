@@ -76,6 +76,7 @@ class Decoder:
     limit: int
     salt: int = 0
     last: int = 0
+    numbered: bool = True  # before a session the numbers of lines mean nothing
     refused: Refusals = field(default_factory=Refusals)
     _rest: bytearray = field(default_factory=bytearray)
     _skipping: bool = False
@@ -93,7 +94,7 @@ class Decoder:
 
     def restart(self, salt: int) -> None:
         """A new session begins with the next line."""
-        self.salt, self.last = salt, 0
+        self.salt, self.last, self.numbered = salt, 0, True
 
     def _keep(self, part: bytes) -> None:
         if self._skipping:
@@ -124,6 +125,8 @@ class Decoder:
             self.refused.checksum += 1
             return None
         count = int(number)
+        if not self.numbered:
+            return Line(count, body.decode("ascii"))
         if count <= self.last or count > MAX_NUMBER:
             self.refused.replayed += 1
             return None

@@ -88,7 +88,7 @@ class VirtualFitSocket:
 
     def connect(self) -> None:
         """A host is at the wire."""
-        self._decoder = Decoder(HOST_LINE, last=-1)
+        self._decoder = Decoder(HOST_LINE, numbered=False)
         self._encoder: Encoder | None = None
 
     @property

@@ -49,7 +49,8 @@ class Motors:
         self._target[:], self._speed[:], self._acceleration[:] = 0.0, speed_mm_s, BRAKING
 
     def at_home(self) -> NDArray[np.bool_]:
-        return self.position_mm < HOME_MM
+        """Withdrawn, and not about to leave."""
+        return (self.position_mm < HOME_MM) & ~(self.driving & (self._target > self.position_mm))
 
     def step(self, jammed: Collection[int], powered: bool) -> None:
         """One time step; jammed motors (indices) and those without power stand."""

@@ -1,0 +1,156 @@
+"""The state machine: the paper's order, what each limit leads to, and that every stop has its reason."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from in_process import FAST, Bench
+
+from limbfit.acquire.events import Abort, Confirm, KeyDown, KeyUp
+from limbfit.acquire.phases import FINAL, TRANSITIONS, Outcome, Phase
+from limbfit.acquire.session import PhaseTold
+from limbfit.acquire.virtual import Fault
+
+
+def phases(bench: Bench) -> list[str]:
+    return [told.phase for told in bench.told if isinstance(told, PhaseTold)]
+
+
+def test_every_phase_can_be_reached_left_and_stopped() -> None:
+    reached = set(TRANSITIONS.values())
+    assert reached == set(Phase) - {Phase.IDLE}
+    for phase in set(Phase) - FINAL:
+        ways = [outcome for (start, outcome) in TRANSITIONS if start is phase]
+        assert len(ways) >= 2
+        if phase is not Phase.STOPPING:
+            assert TRANSITIONS[phase, Outcome.STOP] is Phase.STOPPING
+    assert not [start for start, _ in TRANSITIONS if start in FINAL]
+
+
+def test_the_paper_s_order() -> None:
+    bench = Bench(repeats=2, precondition=2, depth_mm=3.0)
+    bench.until()
+    found = phases(bench)
+    assert found[-1] == "done"
+    order = [p for p in found if p not in ("clamp", "settle")]
+    assert order == [
+        *("position", "approach", "back", "ready", "search", "return", "pause"),
+        *("load", "unload", "load", "unload"),  # preconditioning, without a pause between
+        *("pause", "load", "unload", "pause", "load", "unload", "retract", "release", "done"),
+    ]
+    protocol = bench.session.protocol
+    assert protocol.depth_um - protocol.touch_um == pytest.approx(3000, abs=150)
+    true_gap = bench.device.limb._gap[0]
+    assert protocol.touch_um / 1000 == pytest.approx(true_gap, abs=0.08)
+    assert bench.device.is_home
+
+
+def test_neighbours_stay_off_while_eleven_clamp() -> None:
+    bench = Bench(pin=14)
+    bench.until(Phase.LOAD)
+    force, position = bench.device.limb.force_N, bench.device.motors.position_mm
+    clamps = [pin - 1 for pin in bench.settings.clamps]
+    assert len(clamps) == 11
+    assert (force[clamps] > 15 - 9).all()
+    assert (position[[12, 0]] == 0).all()
+    assert (force[[12, 0]] == 0).all()
+
+
+def test_letting_go_halts_at_once_and_a_shallow_search_is_none() -> None:
+    bench = Bench(depth_mm=0.3)
+    bench.until(Phase.SEARCH)
+    bench.until(Phase.BACK)
+    assert bench.phase is Phase.BACK  # 0.3 mm are too shallow: back to the start, to try again
+    bench.depth_mm = 2.0
+    bench.until(Phase.RETURN)
+    protocol = bench.session.protocol
+    assert (protocol.depth_um - protocol.touch_um) / 1000 == pytest.approx(2.0, abs=0.15)
+
+
+def test_the_key_moves_nothing_in_other_phases() -> None:
+    bench = Bench()
+    bench.until(Phase.CLAMP)
+    for event in (KeyDown(), KeyUp(), Confirm()):
+        bench.session.handle(event, bench.now)
+    assert bench.phase is Phase.CLAMP
+    assert bench.device.motors.position_mm[0] == 0
+
+
+def test_the_comfortable_force_ends_the_search_whoever_holds_the_key() -> None:
+    bench = Bench(depth_mm=99.0, search_force_N=4.0)
+    bench.until(Phase.RETURN)
+    assert bench.device.limb.force_N[0] == pytest.approx(4.0, abs=0.5)
+
+
+FAULTS = {
+    "stuck": (Fault(kind="stuck", phase="load", at_s=0.1, duration_s=1.0, pin=1), "stuck"),
+    "saturated": (Fault(kind="saturated", phase="load", at_s=0.1, pin=5), "saturated"),
+    "dead": (Fault(kind="dead", phase="search", at_s=0.05, pin=1), "dead"),
+    "limb": (Fault(kind="limb", phase="pause", pin=3, value=-4, duration_s=0.3), "limb"),
+    "button": (Fault(kind="button", phase="unload", at_s=0.1, duration_s=0.5), "button"),
+    "power": (Fault(kind="power", phase="load", at_s=0.1, duration_s=0.5), "power"),
+    "lost": (Fault(kind="lost", phase="load", at_s=0.1, duration_s=0.2), "no fresh sample"),
+    "late": (Fault(kind="late", phase="load", at_s=0.1, duration_s=0.5, value=40), "fresh|watchdog"),
+    "deaf": (Fault(kind="deaf", phase="load", at_s=0.1, duration_s=0.2), "watchdog|answer"),
+    "corrupt": (Fault(kind="corrupt", phase="load", at_s=0.1, duration_s=0.2), "no fresh sample"),
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_each_fault_ends_retracted_with_its_reason(kind: str) -> None:
+    fault, _ = FAULTS[kind]
+    bench = Bench(faults=(fault,), depth_mm=3.0)
+    bench.until()
+    bench.settle()
+    bench.check_end()
+    assert bench.phase is Phase.STOPPED
+    reason = bench.session.protocol.reason
+    assert any(word in reason for word in FAULTS[kind][1].split("|")), reason
+
+
+@pytest.mark.parametrize("ms", [2, 10])
+def test_a_short_disturbance_is_outlived(ms: int) -> None:
+    fault = Fault(kind="lost", phase="load", at_s=0.1, duration_s=ms / 1000)
+    bench = Bench(faults=(fault,))
+    bench.until()
+    assert bench.phase is Phase.DONE
+    assert bench.session.counts.lost == pytest.approx(ms / 2, abs=1)
+
+
+def test_a_pin_that_stays_stuck_is_reported() -> None:
+    bench = Bench(faults=(Fault(kind="stuck", phase="load", at_s=0.1, pin=1),))
+    bench.until()
+    assert bench.phase is Phase.UNREACHABLE
+    assert bench.session.unreachable == (1,)
+    others = np.delete(bench.device.motors.position_mm, 0)
+    assert (others < 0.1).all()  # the others went home
+
+
+@pytest.mark.parametrize("phase", [p for p in Phase if p not in FINAL | {Phase.IDLE, Phase.STOPPING}])
+def test_an_abort_in_any_phase_retracts(phase: Phase) -> None:
+    bench = Bench()
+    bench.until(phase)
+    bench.session.handle(Abort("for the test"), bench.now)
+    bench.settle()
+    bench.check_end()
+    assert bench.session.protocol.reason == "for the test"
+
+
+def test_an_operator_who_does_not_come_is_not_waited_for_forever() -> None:
+    bench = Bench(operator_limit_s=1.0)
+    bench.until(Phase.READY)
+    bench.settle()
+    assert "ready took longer" in bench.session.protocol.reason
+    assert FAST["time_limit_s"] > 1
+    bench.check_end()
+
+
+def test_a_host_that_hangs_is_noticed_by_the_device() -> None:
+    bench = Bench()
+    bench.until(Phase.LOAD)
+    for _ in range(25):
+        bench.millisecond(host=False)
+    assert bench.device.stopped == "watchdog"
+    for _ in range(500):
+        bench.millisecond(host=False)
+    assert bench.device.is_home
