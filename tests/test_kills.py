@@ -128,3 +128,25 @@ def test_a_run_killed_at_random_moments_ends_the_same(study, tmp_path, kills):
         names = [p.name for p in results.rglob(".*") if p.name != ".lock"]
         assert not names, names
         shutil.rmtree(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("at", ["mesh 0/2", "evaluation 2"])
+def test_an_interrupt_ends_the_run_with_its_workers_and_meshers(study, workers, at):
+    file = study / "study.toml"
+    file.write_text(file.read_text() + COARSE)
+    run = begin(study, workers)
+    while at not in (line := run.stderr.readline()):
+        assert line, "the run ended before"
+    time.sleep(0.5)
+    os.killpg(run.pid, signal.SIGINT)
+    start = time.monotonic()
+    _, err = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "run the same command again to go on" in err.splitlines()[-1]
+    assert group_is_empty(run.pid)
+    print(
+        f"{at}, {workers} worker(s): ended {time.monotonic() - start:.1f} s after the interrupt", flush=True
+    )
+    assert_whole(study / "results")

@@ -27,7 +27,7 @@ from rich.progress import (
 import limbfit
 
 INTERRUPTED = "interrupted; run the same command again to go on"
-_PATIENCE_S = 4.0  # for an interrupt to be heard
+_PATIENCE_S = 3.0  # for an interrupt to be heard
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
