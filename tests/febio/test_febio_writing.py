@@ -69,7 +69,7 @@ def exported(problem, folder, **settings):
     return file, tool
 
 
-@pytest.mark.parametrize("element", ["tet4", "tet10", "tet10g8", "hex8"])
+@pytest.mark.parametrize("element", ["tet4", "tet10", "tet10p0", "tet10g8", "hex8"])
 def test_it_is_read_back_as_it_was(tmp_path, element):
     problem = block(element)
     file, _ = exported(problem, tmp_path)
