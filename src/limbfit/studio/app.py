@@ -9,6 +9,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
+from starlette.exceptions import HTTPException
 
 from ..errors import InputError, LimbfitError
 from ..web.assets import STATIC as SHARED
@@ -43,6 +44,7 @@ def create_app(folder: StudyFolder, door: Door) -> FastAPI:
     for kind, status in ((InputError, 422), (LimbfitError, 409), (FileNotFoundError, 404)):
         app.add_exception_handler(kind, _told(status))
     app.add_exception_handler(TooLargeError, _told(413))
+    app.add_exception_handler(HTTPException, _refused)
     app.add_exception_handler(Exception, _internal)
     app.add_exception_handler(RequestValidationError, _unusable)
     app.add_api_route("/", _page, include_in_schema=False)
@@ -64,6 +66,11 @@ def _told(status: int) -> Any:
         return JSONResponse({"error": text}, status)
 
     return handler
+
+
+def _refused(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": error.detail}, error.status_code)
 
 
 def _internal(request: Request, error: Exception) -> JSONResponse:
