@@ -95,3 +95,9 @@ def pristine(tmp_path_factory):
 @pytest.fixture
 def study(pristine, tmp_path):
     return shutil.copytree(pristine, tmp_path / "study")
+
+
+@pytest.fixture
+def coarse_settings() -> str:
+    """``COARSE`` for tests in folders with a conftest of their own."""
+    return COARSE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 
@@ -14,7 +15,6 @@ pytest.importorskip("fastapi", reason="the studio's extra is not installed")
 from limb_image import make_segmented
 
 from browsing import serious_findings, until
-from conftest import COARSE
 from limbfit.anatomy.imaging import read_labels
 from limbfit.pipeline import run_study, study_status
 from limbfit.study import load_study
@@ -101,9 +101,11 @@ def test_a_painted_stroke_is_saved_and_stages_turn_stale(tmp_path, serve, open_p
 
 
 @pytest.mark.slow
-def test_a_calibration_is_started_watched_reloaded_stopped_and_resumed(study, serve, open_page):
+def test_a_calibration_is_started_watched_reloaded_stopped_and_resumed(
+    study, coarse_settings, serve, open_page
+):
     file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE.replace("max_iterations = 2", "max_iterations = 12"))
+    file.write_text(file.read_text() + coarse_settings.replace("max_iterations = 2", "max_iterations = 12"))
     run_study(load_study(study), until="mesh", listener=lambda progress: None)
     page = open_page(serve(study) + "#/identification")
     iterates = re.compile(r"(\d+) iterates")
@@ -143,9 +145,9 @@ def _token(page) -> str:
 
 
 @pytest.mark.slow
-def test_a_run_outlives_its_server(study, serve, open_page):
+def test_a_run_outlives_its_server(study, coarse_settings, serve, open_page):
     file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    file.write_text(file.read_text() + coarse_settings)
     page = open_page(serve(study) + "#/identification")
     page.locator("#run-start").click()
     until(
@@ -198,20 +200,28 @@ def test_the_page_is_worked_by_keyboard(study, serve, open_page):
 
 
 @pytest.mark.slow
-def test_memory_of_server_and_page_stays_level(study, serve, open_page):
+def test_memory_of_server_and_page_stays_level(study, coarse_settings, serve, open_page):
     """A study that writes a log line all the time, watched for three minutes, with views opened in turn."""
     file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    file.write_text(file.read_text() + coarse_settings)
     run_study(load_study(study), until="traces", listener=lambda progress: None)
     page = open_page(serve(study) + "#/identification")
     server = next(p for p in psutil.Process().children() if "studio" in p.cmdline())
     client = page.context.new_cdp_session(page)
     log = study / "results" / "log" / "20990101T000000.000000.jsonl"
-    line = '{"time": "2099", "seconds": 1, "event": "progress", "stage": "mesh", "done": 1, "total": 5, "text": "x"}\n'
+    row = {
+        "time": "2099",
+        "seconds": 1,
+        "event": "progress",
+        "stage": "mesh",
+        "done": 1,
+        "total": 5,
+        "text": "x",
+    }
     heap, resident = [], []
     for turn in range(36):
         with log.open("a") as stream:
-            stream.write(line * 5)
+            stream.write((json.dumps(row) + "\n") * 5)
         page.keyboard.press(f"Alt+{(4, 3, 2, 5)[turn % 4]}")
         page.wait_for_timeout(5000)
         client.send("HeapProfiler.collectGarbage")
