@@ -25,15 +25,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runs_jobs import answer, bind, measured, nothing
+from runs_jobs import TISSUES, answer, bind, measured, nothing, stored_fields
 
 from limbfit.bench.blocks import DEPTH, INDENTATION, SPEED, layered_block
 from limbfit.execution import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.simulations import CURVE_POINTS, SimulationCache
+from limbfit.study.tables import MeshTable
 
-TISSUES = ("skin", "muscle")
 SOFT, STIFF = (6.0, 5.0, 1.5, 0.6, 4.0, 4.0, 1.5, 0.6), (9.0, 6.0, 2.0, 0.5, 4.0, 4.0, 3.0, 0.3)
 
 
@@ -51,6 +51,7 @@ def site(folder: Path, name: str, divisions: int) -> SiteModel:
         axis=(0.0, 0.0, -1.0),
         knots_s=(0.0, ramp, 2 * ramp),
         knots_mm=(0.0, INDENTATION, 0.0),
+        element=MeshTable().element,
     )
 
 
@@ -128,6 +129,9 @@ def simulation(divisions: int, sites: int) -> list[dict[str, Any]]:
                     | {"kept_kB": size.stat().st_size / 1e3, **facts}
                 )
                 print(rows[-1], flush=True)
+        fields = folder / "fields.vtu"
+        list(executor.map(stored_fields, [(model, STIFF, fields)], [model.name]))
+        rows.append({"fields_kB": fields.stat().st_size / 1e3})
     return rows
 
 

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import os
 import resource
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from limbfit.bench.measuring import max_rss_MB
-from limbfit.indentation import Simulation, SimulationJob, simulate
+from limbfit.indentation import (
+    Simulation,
+    SimulationJob,
+    SiteModel,
+    simulate,
+    simulate_fields,
+    to_parameters,
+)
+
+TISSUES = ("skin", "muscle")
 
 
 def nothing(job: Any) -> None:
@@ -27,6 +37,12 @@ def answer(job: SimulationJob) -> Simulation:
     n = len(job.times_s)
     facts = {"linear_solver": "pardiso", "element": "tet10", "steps": 38, "newton_iterations": 150}
     return Simulation(job.model.name, np.ones(n), np.ones((n, len(job.parameters))), True, "", 0.1, facts)
+
+
+def stored_fields(job: tuple[SiteModel, tuple[float, ...], Path]) -> None:
+    """The fields at the deepest point, as the stage ``predict`` stores them."""
+    model, parameters, file = job
+    simulate_fields(model, to_parameters(np.array(parameters), TISSUES), file)
 
 
 def measured(job: SimulationJob) -> tuple[Simulation, dict[str, float]]:

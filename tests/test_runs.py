@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -127,6 +128,33 @@ def test_no_room_for_a_file_is_one_clear_line_and_the_run_goes_on_later(alone):
     assert "Traceback" not in done.stderr
     run_study(load_study(alone), until="traces", listener=quiet)
     assert rows_of(alone)["traces"]["state"] == "done"
+
+
+MOUNTS = {
+    "full at once": "mount -t tmpfs -o size=20k tmpfs {0}/results",
+    "full later": "mount -t tmpfs -o size=340k tmpfs {0}/results",
+    "read-only": "mount --bind {0} {0} && mount -o remount,ro,bind {0}",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", MOUNTS)
+def test_a_full_and_a_read_only_disk_are_one_clear_line(alone, how):
+    """On real file systems, in a name space of their own."""
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-rm", "true"], check=False).returncode:
+        pytest.skip("no name spaces for mounts here")
+    (alone / "results").mkdir()
+    run = f"{sys.executable} -m limbfit run {alone} --until traces"
+    script = f"{MOUNTS[how].format(alone)} && {run}"
+    done = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", script], capture_output=True, text=True, timeout=600, check=False
+    )
+    *progress, last = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert last.startswith("error: ")
+    assert re.search("disk is full|file system is read-only", last), last
+    assert all(re.match(r"\[ *[\d.]+ s\] ", line) for line in progress), progress
+    run_study(load_study(alone), until="traces", listener=quiet)
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_line(alone, monkeypatch):

@@ -11,7 +11,8 @@ node_sets / face_sets  named integer arrays: node indices, and outward-oriented 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from os.path import relpath
 from pathlib import Path
@@ -20,7 +21,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
+from vtkmodules.vtkCommonCore import vtkObject, vtkPoints, vtkStringArray
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkFieldData, vtkUnstructuredGrid
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
 
@@ -305,6 +306,17 @@ def _add_arrays(data: vtkFieldData, arrays: Mapping[str, NDArray]) -> None:
         data.AddArray(array)
 
 
+@contextmanager
+def silent_vtk() -> Iterator[None]:
+    """VTK's own reports stay out of the terminal: what fails is said in words by who called it."""
+    shown = vtkObject.GetGlobalWarningDisplay()
+    vtkObject.SetGlobalWarningDisplay(0)
+    try:
+        yield
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+
+
 def _write(grid: vtkUnstructuredGrid, path: Path) -> None:
     draft = path.with_name(f".{path.name}.part")  # a run that is killed leaves no half of a mesh at ``path``
     writer = vtkXMLUnstructuredGridWriter()
@@ -312,7 +324,9 @@ def _write(grid: vtkUnstructuredGrid, path: Path) -> None:
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    if not writer.Write():
+    with silent_vtk():
+        written = writer.Write()
+    if not written:
         draft.unlink(missing_ok=True)
         raise ProblemError("cannot be written", file=path, remedy="check the folder and the free disk space")
     draft.replace(path)

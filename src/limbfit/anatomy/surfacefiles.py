@@ -12,9 +12,9 @@ import meshio
 import numpy as np
 import pyvista as pv
 from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkObject
 
 from ..errors import SurfaceError
+from ..mesh import silent_vtk
 from .bounds import check_items
 from .triangles import Surface, compacted, from_pyvista
 
@@ -77,20 +77,16 @@ def _check_suffix(path: Path) -> None:
 
 
 def _read_poly(path: Path) -> pv.PolyData:
-    shown = vtkObject.GetGlobalWarningDisplay()
-    vtkObject.SetGlobalWarningDisplay(0)  # the error below says it
     if path.suffix.lower() == ".vtp":
         check_items(path)
     try:
-        with warnings.catch_warnings():
+        with silent_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
     except Exception:  # readers raise many kinds; all mean the same to the user
         raise SurfaceError(
             "the surface cannot be read", file=path, remedy="export the surface again"
         ) from None
-    finally:
-        vtkObject.SetGlobalWarningDisplay(shown)
     if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
         raise SurfaceError("the file holds no triangles", file=path, remedy="export the surface again")
     corners = vtk_to_numpy(poly.GetPolys().GetConnectivityArray())
@@ -118,4 +114,5 @@ def write_surface(path: str | Path, surface: Surface) -> None:
     """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
     path = Path(path)
     _check_suffix(path)
-    surface.to_pyvista().save(str(path), recompute_normals=False)
+    with silent_vtk():
+        surface.to_pyvista().save(str(path), recompute_normals=False)

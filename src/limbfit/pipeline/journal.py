@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, TextIO
 
 from .. import __version__
 from ..study import Study
@@ -56,7 +56,7 @@ def journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
         )
         listener(event)
 
-    with stream:
+    with _closed(stream):
         write("begin", what=what, limbfit=__version__, process=os.getpid())
         try:
             yield listen
@@ -66,6 +66,16 @@ def journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
                 write(kind, error=type(error).__name__, text=discreet(str(error), study))
             raise
         write("end")
+
+
+@contextmanager
+def _closed(stream: TextIO) -> Iterator[None]:
+    """The stream is closed at the end, where a full disk would be told of once more."""
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            stream.close()
 
 
 def discreet(text: str, study: Study) -> str:
