@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import numpy as np
 import pytest
-import pyvista as pv
 
 pytest.importorskip("fastapi", reason="the studio's extra is not installed")
 
 from fastapi.testclient import TestClient
+from stored_fields import block, fields, write_outcome, write_stored
 
-from limbfit.mesh import Mesh, to_tet10, write_pvd, write_vtu
 from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door
@@ -22,62 +20,11 @@ from limbfit.studio.simulating import simulating
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
-STEPS = 4
-
-
-def block() -> Mesh:
-    grid = pv.ImageData(dimensions=(4, 4, 4), spacing=(3, 3, 3)).to_tetrahedra(5)
-    cells = np.asarray(grid.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
-    points = np.asarray(grid.points, dtype=float)
-    sides = points[cells][:, 1:] - points[cells][:, :1]
-    wrong = np.linalg.det(sides) < 0
-    cells[wrong] = cells[wrong][:, [0, 2, 1, 3]]
-    return to_tet10(Mesh(points, cells, "tet4", np.zeros(len(cells), np.int64), ("muscle",)))
-
-
-def fields(mesh: Mesh, share: float) -> tuple[dict, dict]:
-    """Fields that differ from cell to cell and grow with the step."""
-    moved = share * np.column_stack([0 * mesh.points[:, 0], 0 * mesh.points[:, 0], -0.1 * mesh.points[:, 2]])
-    count = np.arange(len(mesh.cells), dtype=float)
-    cells = {"von_mises_kPa": share * count, "J": 1 - 0.01 * share * count / count.max()}
-    cells |= {f"{name}_stretch": 1 + share * count for name in ("largest", "middle", "smallest")}
-    cells["cauchy_kPa"] = share * np.column_stack([count + 10 * k for k in range(6)])
-    return {"displacement_mm": moved}, cells
-
-
-def write_outcome(results, error: float = 3.0) -> None:
-    """What calibration and prediction store, as far as the view shows it."""
-    for name in ("predict", "calibrate"):
-        (results / name).mkdir(parents=True, exist_ok=True)
-    parameters = {
-        tissue: {"c_kPa": error, "m": 4.0, "gamma": 1.0, "tau_s": 0.5} for tissue in ("skin", "muscle")
-    }
-    stages = [
-        {"name": name, "parameters": parameters, "iterations": [{}]}
-        for name in ("one material", "two materials")
-    ]
-    (results / "calibrate" / "calibration.json").write_text(json.dumps({"stages": stages}))
-    rows = [{"site": "1", "region": "", "fitted": True, "error_percent": error, "peak_force_N": 6.0}]
-    content = {"sites": rows, "mean_error_fitted_percent": error, "mean_error_heldout_percent": None}
-    (results / "predict" / "predict.json").write_text(json.dumps(content))
-    (results / "predict" / "1.csv").write_text(
-        f"time_s,displacement_mm,force_measured_N,force_simulated_N\n0,0,0,0\n1,5,6,{error}\n2,0,0,0\n"
-    )
 
 
 @pytest.fixture
 def page(study):
-    mesh, results = block(), study / "results"
-    write_outcome(results)
-    folder = results / "simulate" / "1"
-    folder.mkdir(parents=True)
-    frames = []
-    for step in range(STEPS):
-        file = folder / f"step-{step:04d}.vtu"
-        write_vtu(mesh, file, *fields(mesh, step / (STEPS - 1)))
-        frames.append((0.5 * step, file))
-    write_pvd(results / "simulate" / "1.pvd", frames)
-    write_vtu(mesh, results / "predict" / "1.vtu", *fields(mesh, 1.0))
+    write_stored(study / "results")
     door = Door("127.0.0.1", 8123)
     client = TestClient(
         create_app(StudyFolder(study / "study.toml"), door), base_url=ORIGIN, headers={"Origin": ORIGIN}

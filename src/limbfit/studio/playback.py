@@ -62,7 +62,7 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
         found.append(
             {
                 "source": "simulate",
-                "title": "every step of the simulation",
+                "title": "every step, simulated",
                 "times_s": [time for time, _ in moments],
                 "parameters_from": origin,
             }
@@ -70,7 +70,7 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     if (folder.results / "predict" / f"{site}.vtu").is_file():
         peak = {
             "source": "predict",
-            "title": "the deepest point, as predicted",
+            "title": "the deepest point, predicted",
             "parameters_from": "identified",
         }
         found.append(peak | {"times_s": [_peak_time(folder, site)]})

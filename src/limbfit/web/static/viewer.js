@@ -233,10 +233,10 @@ export class Viewer {
     this.redraw();
   }
 
-  /** A click that was no drag: tells onSite of a site, else onSurface of the point and normal hit. */
+  /** A click that was no drag: tells onSite of a site, else onSurface of the point hit; while `placing` that alone. */
   click(event) {
     if (this.view.moved > 4 || event.button !== 0) return;
-    const site = this.siteAt(event);
+    const site = this.placing ? null : this.siteAt(event);
     if (site && this.onSite) return this.onSite(site.name);
     const hit = this.surfaceAt(event, "skin");
     if (hit && this.onSurface) this.onSurface(hit);

@@ -99,9 +99,8 @@ class ModelView {
     }
     await Promise.all([...wanted].map(async ([name, { kind, path }]) => {
       if (this.shapes.has(name) && !all) return;
+      if (!this.shapes.has(name)) this.shapes.set(name, { kind, shown: kind !== "layer" });
       const { arrays } = readArrays(await this.context.api.bytes(`model/${path}`));
-      const shown = this.shapes.get(name)?.shown ?? kind !== "layer";
-      this.shapes.set(name, { kind, shown });
       this.viewer.setSurface(name, { points: arrays.points.values, faces: arrays.faces.values, ...SURFACES[kind] });
     }));
   }

@@ -29,10 +29,10 @@ export class Player {
     this.warpText = el("output", { class: "hint" });
     this.limits = ["lowest colour", "highest colour"].map((text) => el("input", { type: "number", step: "any", class: "limit", placeholder: "auto", "aria-label": text, onchange: () => this.scale() }));
     this.cut = cutPanel((plane) => this.viewer?.cutMesh(plane), (normal) => this.viewer?.view.lookAlong(normal.map((value) => -value)), { whole: false });
-    this.settings = el("div", {}, labelled("fields of", this.source), labelled("show", this.field), labelled("colours", this.map),
+    this.settings = el("div", {}, labelled("stored", this.source), labelled("show", this.field), labelled("colours", this.map),
       el("div", { class: "field" }, "range", el("span", {}, ...this.limits)),
       el("label", { class: "field" }, "deformation", this.warpText, this.warp),
-      el("label", { class: "row" }, this.smooth, "smooth: mean of the cells at each node"),
+      el("label", { class: "row" }, this.smooth, "smooth (means at the nodes)"),
       el("label", { class: "row" }, this.edges, "edges of cells"), this.cut.part);
     this.button = el("button", { type: "button", class: "main", "aria-label": "Play", onclick: () => this.toggle() }, "▶ Play");
     this.slider = el("input", { type: "range", min: "0", max: "0", step: "1", value: "0", "aria-label": "moment", oninput: () => { this.stop(); this.show(Number(this.slider.value)); } });
@@ -136,7 +136,8 @@ export class Player {
     const frame = this.frames[at], time = this.times[at];
     this.slider.setAttribute("aria-valuetext", `${shortNumber(time)} s`);
     const field = this.titles?.get(this.field.value);
-    const largest = frame ? `; ${field.title} ${shortNumber(frame.ends[2])} to ${shortNumber(frame.ends[3])} ${field.unit}` : "; reading";
+    const told = frame ? frame.ends.slice(2).map((value) => shortNumber(Math.abs(value) < 1e-6 ? 0 : value)) : null;
+    const largest = told ? `; ${field.title} ${told.join(" to ")} ${field.unit}` : "; reading";
     this.words.textContent = `${shortNumber(time)} s${largest}`;
     this.moment(time);
     if (!frame || !this.viewer) return;

@@ -38,11 +38,12 @@ class ResultsView {
     this.compared = el("div", { class: "table-box", tabindex: "0", role: "region", "aria-label": "Tables of the results" });
     this.main = el("div", { class: "stagearea results-main" }, this.player.stage, this.player.bar,
       el("div", { class: "cards padded" },
-        el("section", { class: "card wide" }, el("div", { class: "row" }, el("h2", {}, "Force"), el("label", { class: "row" }, "against", this.axis)), this.curveBox),
-        el("section", { class: "card wide" }, el("h2", {}, "Tables, and this run beside another"),
+        el("section", { class: "card force" }, el("div", { class: "row" }, el("h2", {}, "Force"), el("label", { class: "row" }, "against", this.axis)), this.curveBox),
+        el("section", { class: "card" }, el("h2", {}, "This run beside another"),
           el("div", { class: "row" }, el("label", { class: "row" }, "beside", this.compareWith), this.drop),
           el("form", { class: "row", onsubmit: (event) => { event.preventDefault(); this.keep(); } }, this.keepName, el("button", { type: "submit" }, "Keep this run")),
-          this.compared)));
+          el("p", { class: "hint" }, "What is kept are parameters, errors and curves; they stay in results/kept.")),
+        el("section", { class: "card wide" }, this.compared)));
     element.append(side, this.main);
   }
 

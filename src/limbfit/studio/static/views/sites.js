@@ -26,15 +26,19 @@ export class SiteEditor {
   }
 
   begin(mode) {
-    this.mode = this.mode === mode ? null : mode;
-    this.draft = null;
+    this.set(this.mode === mode ? null : mode);
     this.view.marks();
     this.show();
     if (this.mode) this.view.context.say("Click on the skin, or give coordinates.");
   }
 
   end() {
-    Object.assign(this, { mode: null, draft: null });
+    this.set(null);
+  }
+
+  set(mode) {
+    Object.assign(this, { mode, draft: null });
+    if (this.view.viewer) this.view.viewer.placing = mode !== null;
   }
 
   /** A click on the skin. */
