@@ -92,7 +92,7 @@ def test_a_painted_stroke_is_saved_and_stages_turn_stale(tmp_path, serve, open_p
     until(lambda: "Nothing painted" in page.locator("#changes").inner_text())
     after = read_labels(file)
     changed = after.array != before.array
-    assert changed.sum() == painted > 10
+    assert changed.sum() == painted > 3
     assert np.all(after.array[changed] == before.value("tibia"))
     assert np.count_nonzero(changed.any(axis=(1, 2))) == 1  # one slice
     until(lambda: page.locator("#strip .stage.stale", has_text="segment").count())

@@ -58,7 +58,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
 def get_curves(folder: Folder, name: str) -> dict[str, Any]:
     """A site's measured force, and the simulated ones: of the prediction, or the newest while it is searched.
 
-    Time in s from touch-down, displacement in mm, force in N.
+    Time in s from touch-down, displacement in mm, force in N; ``of`` is null where nothing is simulated yet.
     """
     site = folder.load().site(name)
     states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
@@ -72,7 +72,7 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
     if stored.is_file():
         of = "the prediction" if states["predict"] == "done" else "the last prediction, which is stale"
         return {"site": site.name, "of": of, **{k: v.tolist() for k, v in read_curves(stored).items()}}
-    raise FileNotFoundError(f"predict/{site.name}.csv")
+    return {"site": site.name, "of": None}
 
 
 @router.post("/start")

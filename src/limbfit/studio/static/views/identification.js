@@ -205,12 +205,16 @@ class IdentificationView {
     try {
       found = await this.context.api.get(`identification/curves/${encodeURIComponent(name)}`);
     } catch (error) {
-      this.curveNote.textContent = error.status === 404 ? "Nothing is simulated at this site yet." : error.message;
+      this.context.warn(error.message);
+      return;
+    }
+    if (name !== this.site) return;
+    if (!found.of) {
+      this.curveNote.textContent = "Nothing is simulated at this site yet.";
       this.parts.get("curves")?.close();
       this.parts.delete("curves");
       return;
     }
-    if (name !== this.site) return;
     this.curveNote.textContent = `Simulated: ${found.of}.`;
     const { time_s: x, displacement_mm: depth } = found;
     const series = [{ label: "measured", colour: "--measured", width: 2, x, y: found.force_measured_N },
