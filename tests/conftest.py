@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 import pyvista as pv
 
+from browsing import launch, open_page, playwright, serve
+
+__all__ = ["launch", "open_page", "playwright", "serve"]
+
 # Where the tests run in the background of a script, interrupts are ignored, and so they would be in the
 # processes that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -17,6 +17,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
+from ..pipeline.journal import discreet
 from .folder import StudyFolder
 from .processes import running
 
@@ -94,4 +95,4 @@ def failure_of(folder: StudyFolder, site: str) -> str | None:
         return None
     lines = [line.strip() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]
     told = [line for line in lines if line.startswith("error:")]
-    return told[-1][:_SAID] if told else None
+    return discreet(told[-1], folder.load())[:_SAID] if told else None

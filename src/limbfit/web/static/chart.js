@@ -50,8 +50,15 @@ export class Chart {
 
   /** New curves of the same kind: what is enlarged and read stays. */
   move(content) {
+    const same = content.series.length === this.content.series.length;
     this.content = content;
-    this.draw();
+    if (same) this.chart.setData(this.data(), false);
+    else this.draw();
+    this.chart.redraw();
+  }
+
+  data() {
+    return [null, ...this.content.series.map((one) => [one.x, one.y])];
   }
 
   resize() {
@@ -89,7 +96,7 @@ export class Chart {
         setCursor: [(plot) => this.follow(plot)], setSelect: [(plot) => this.enlarge(plot)],
       },
     };
-    this.chart = new uPlot(options, [null, ...series.map((one) => [one.x, one.y])], this.plot);
+    this.chart = new uPlot(options, this.data(), this.plot);
     this.chart.over.addEventListener("dblclick", () => this.show(null));
     this.drawKey();
   }

@@ -186,11 +186,10 @@ export class Viewer {
     uniforms.cuts.value = Boolean(cut && !cut.whole);
     if (cut) uniforms.plane.value = [...cut.normal, cut.offset];
     const shape = this.body.geometry;
-    const put = (name, values, width) => shape.setAttribute(name, new THREE.BufferAttribute(values, width));
     shape.dispose();
-    put("position", vectorsAt(this.corners, this.mesh.points), 3);
-    put("tint", tintsOf(this.corners, this.mesh, this.colours), 3);
-    put("inside", this.corners.inside, 1);
+    put(shape, "position", vectorsAt(this.corners, this.mesh.points), 3);
+    put(shape, "tint", tintsOf(this.corners, this.mesh, this.colours), 3);
+    put(shape, "inside", this.corners.inside, 1);
     shape.computeBoundingBox();
     shape.boundingSphere = null;
     this.setMoment(this.field, this.vectors);
@@ -207,9 +206,8 @@ export class Viewer {
     this.vectors = vectors;
     if (!this.body) return;
     const shape = this.body.geometry, { count } = this.corners;
-    shape.setAttribute("moved", new THREE.BufferAttribute(vectorsAt(this.corners, vectors), 3));
-    const values = field ? valuesAt(this.corners, this.mesh, field) : new Float32Array(count);
-    shape.setAttribute("value", new THREE.BufferAttribute(values, 1));
+    put(shape, "moved", vectorsAt(this.corners, vectors), 3);
+    put(shape, "value", field ? valuesAt(this.corners, this.mesh, field) : new Float32Array(count), 1);
     this.body.material.uniforms.mapped.value = Boolean(field);
     this.redraw();
   }
@@ -274,6 +272,14 @@ export class Viewer {
     const at = new THREE.Vector3(...point).project(this.view.camera);
     return [((at.x + 1) / 2) * box.width + box.left, ((1 - at.y) / 2) * box.height + box.top];
   }
+}
+
+/** Values of a shape in the buffer that it has, where they fit: moments that are played leave none behind. */
+function put(shape, name, values, width) {
+  const old = shape.getAttribute(name);
+  if (old?.array.length !== values.length) return shape.setAttribute(name, new THREE.BufferAttribute(values, width));
+  old.array.set(values);
+  old.needsUpdate = true;
 }
 
 function meshMaterial() {
