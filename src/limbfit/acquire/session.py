@@ -28,7 +28,7 @@ from .recording import Recorder
 from .settings import Settings, micro
 
 LIVE_EVERY = 20  # samples between two that are told: 25 a second
-PACED_SILENCE_S = 5.0  # wall time, where the device's clock waits for limbfit's
+PACED_SILENCE_S = 20.0  # wall time, where the device's clock waits for limbfit's
 LOOP_S = 0.002
 FIRST_S = 1.0  # the first sample may take longer than those after it
 DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making samples look late
@@ -266,9 +266,12 @@ class _Wire:
 
 
 def prioritise() -> str:
-    """Ask for this thread to run as soon as it can; ``real-time`` where that is allowed, else ``normal``."""
+    """Ask that this thread, and those it starts, run at once: ``real-time`` where allowed, else ``normal``.
+
+    The other threads too: one that the system puts aside while it holds the interpreter holds up all.
+    """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except (AttributeError, OSError):
         return "normal"
     return "real-time"

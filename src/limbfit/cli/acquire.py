@@ -14,7 +14,7 @@ import typer
 
 import limbfit
 
-from ..acquire import DEFAULT_ADDRESS, DEFAULT_PORT, Event
+from ..acquire import DEFAULT_ADDRESS, DEFAULT_PORT, Event, prioritise
 from ..acquire.events import Abort
 from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
@@ -68,6 +68,7 @@ def _one(
     study: limbfit.Study, name: str, device: str, depth: float | None, unattended: bool, again: bool
 ) -> dict[str, Any]:
     events: SimpleQueue[Event] = SimpleQueue()
+    prioritise()  # before the threads of the display and the keys start
     shown = Live(name, study.acquire) if STDERR.is_terminal else PlainLines(name)
     operated = nullcontext() if unattended else keys(events, study.acquire.key_gap_ms / 1000)
     with _signals(events), operated, shown:

@@ -54,6 +54,7 @@ class VirtualFitSocket:
     time_us : of the device.
     stopped : the code of the stop that is latched, empty for none.
     is_armed : a session runs, samples are sent, the watchdog watches.
+    has_left : the host has ended its session.
     acknowledged_us : device time of the newest sample that limbfit has dealt with.
     """
 
@@ -90,6 +91,7 @@ class VirtualFitSocket:
         """A host is at the wire."""
         self._decoder = Decoder(HOST_LINE, numbered=False)
         self._encoder: Encoder | None = None
+        self.has_left = False
 
     @property
     def refused(self) -> object:
@@ -137,6 +139,7 @@ class VirtualFitSocket:
                 return b""
             case Bye():
                 self._leave()
+                self.has_left = True
                 return b""
         code = self._obey(command)
         return self._say(Declined(number, code).body if code else Accepted(number).body)

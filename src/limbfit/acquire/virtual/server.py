@@ -18,7 +18,7 @@ from ..links import Link, TcpLink
 from .fitsocket import EVERY, VirtualFitSocket
 
 AHEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with
-HANG_S = 2.0  # wall time after which a paced device takes its host for gone
+HANG_S = 10.0  # wall time after which a paced device takes its host for gone
 GREETING_S = 5.0  # a connection that does not become a session is closed
 STALL_S = 0.25  # a device that could not run for so long does not make up for it
 IDLE_S = 0.02
@@ -226,7 +226,7 @@ class _Server:
             return
         over = device.stopped and device.is_home and silent > 1.0
         if self.serving.pty is not None:
-            ended = device.has_session and not device.is_armed and device.is_home
+            ended = device.has_left and device.is_home
             if ended or (over and device.has_session):
                 device.disconnect()
                 device.connect()

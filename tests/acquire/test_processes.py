@@ -1,0 +1,364 @@
+"""Both ends as processes, on real sockets and terminals: whole sessions, kills, hostile devices."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import random
+import re
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from queue import SimpleQueue
+
+import numpy as np
+import pytest
+from in_process import indentation, settings
+
+from limbfit.acquire import LineDevice, LiveTold, Session, connect, read_recording, run_session
+from limbfit.acquire.events import Abort, Confirm, Flags, Sample
+from limbfit.acquire.messages import SetLimits
+from limbfit.acquire.phases import Phase
+from limbfit.acquire.wire import Encoder
+from limbfit.errors import RunError
+from limbfit.pipeline.stages.traces import read_site_trace, write_curves
+from limbfit.study import load_study
+
+SPEED = "40"  # an accelerated clock
+ACQUIRE = """
+[acquire]
+clamp_speed_mm_s = 8.0
+approach_speed_mm_s = 6.0
+settle_s = 0.3
+clamp_tolerance_N = 4.0
+pause_s = 0.5
+ramp_speed_mm_s = 1.4
+"""
+
+
+@pytest.fixture
+def ready(study):
+    """The stump with stored simulations of both sites, its records yet to be made."""
+    folder = study / "results" / "simulate"
+    folder.mkdir(parents=True)
+    for name, peak in (("1", 6.0), ("2", 4.0)):
+        time_s, displacement, force = indentation(peak=peak)
+        write_curves(folder / f"{name}.csv", time_s=time_s, displacement_mm=displacement, force_N=force)
+        (study / f"{name}.csv").unlink()
+    file = study / "study.toml"
+    file.write_text(file.read_text() + ACQUIRE)
+    return study
+
+
+def start(*words: object, **options) -> subprocess.Popen:
+    command = [sys.executable, "-m", "limbfit", *map(str, words)]
+    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+
+
+@contextmanager
+def fitsocket(study, *words: object):
+    """A virtual FitSocket as a process, on a port of its own; its address and itself."""
+    process = start("virtual-fitsocket", study, "--port", 0, *words)
+    try:
+        yield process.stdout.readline().removeprefix("device: ").strip(), process
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+def acquire(study, address: str, *words: object) -> tuple[int, dict, str]:
+    process = start("acquire", study, "--device", address, "--json", *words)
+    out, err = process.communicate(timeout=300)
+    assert "Traceback" not in err
+    return process.returncode, json.loads(out) if out else {}, err
+
+
+def test_both_sites_are_acquired_into_the_study(ready) -> None:
+    with fitsocket(ready, "--speed", SPEED) as (address, _):
+        code, found, err = acquire(ready, address, "--unattended", "--depth", 4.0)
+        assert code == 0, err
+        again = acquire(ready, address, "--unattended", "--site", "1")
+        assert again[0] == 2
+        assert "--again" in again[2]
+    study = load_study(ready)
+    for site, row in zip(study.sites, found["sites"], strict=True):
+        assert row["completed"]
+        assert row["verdict"]["good"]
+        assert row["lost"] == 0
+        assert sum(row["refused"].values()) == 0
+        assert row["depth_mm"] == pytest.approx(4.0, abs=0.15)
+        trace, _, facts = read_site_trace(study, site)
+        assert 3.0 < facts["depth_mm"] < 4.1  # after a short pause the tissue is not quite back
+        assert facts["speed_load_mm_s"] == pytest.approx(1.4, abs=0.01)
+        assert np.allclose(np.diff(trace.time_s), 0.002)
+        record = read_recording(row["files"]["record"])
+        assert record.lost_bytes == 0
+        assert record.head["device"]["model"] == "VirtualFitSocket"
+        assert record.head["settings"]["ramp_speed_mm_s"] == 1.4
+        assert str(ready) not in json.dumps(record.head)
+    assert {p.name for p in ready.iterdir()} == {
+        *("study.toml", "skin.stl", "tibia.stl", "results", "acquired", "1.csv", "2.csv")
+    }
+
+
+def is_home(address: str) -> bool:
+    """Greets the device until it takes a session, which it does only once everything is home."""
+    for _ in range(40):
+        time.sleep(0.25)
+        try:
+            device = LineDevice(connect(address))
+        except RunError:
+            continue
+        device.send(SetLimits(1, 25_000, 25_000, 60_000, 8000, 500), 0.0)
+        until = time.monotonic() + 2
+        while time.monotonic() < until:
+            for report in device.receive(0.05):
+                if isinstance(report, Sample) and report.flags & Flags.HOME:
+                    device.close()
+                    return True
+        device.close()
+    return False
+
+
+def wait_for_record(study, samples: int, process: subprocess.Popen) -> Path:
+    """Until the record that a session is writing has so many rows."""
+    for _ in range(1200):
+        assert process.poll() is None, process.stderr.read()
+        files = list(study.glob("acquired/*/*/record.csv"))
+        if files and files[0].read_bytes().count(b"\n") > samples:
+            return files[0]
+        time.sleep(0.05)
+    raise AssertionError("no record is written")
+
+
+def kill_the_host(ready, samples: int) -> None:
+    with fitsocket(ready, "--speed", SPEED) as (address, device):
+        host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
+        file = wait_for_record(ready, samples, host)
+        host.kill()
+        host.communicate()
+        assert is_home(address)
+        assert device.poll() is None
+    found = read_recording(file)
+    rows = sum(line[:1].isdigit() for line in file.read_bytes().split(b"\n"))
+    assert rows - len(found.number) <= 50
+    assert np.all(np.diff(found.device_us) == 2000)
+
+
+def kill_the_device(ready, samples: int) -> None:
+    with fitsocket(ready, "--speed", SPEED) as (address, device):
+        host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
+        file = wait_for_record(ready, samples, host)
+        device.kill()
+        _, err = host.communicate(timeout=60)
+    assert host.returncode == 1
+    assert "whether the device has retracted is not known" in err
+    assert "Traceback" not in err
+    found = read_recording(file)
+    assert found.lost_bytes == 0
+    assert found.phases()[-1][0] == "unreachable"
+    assert not (ready / "1.csv").exists()
+
+
+def test_a_killed_host_leaves_a_readable_record_and_a_retracted_device(ready) -> None:
+    kill_the_host(ready, 2500)
+
+
+def test_a_killed_device_ends_the_session_with_a_reason(ready) -> None:
+    kill_the_device(ready, 2500)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("end", [kill_the_host, kill_the_device])
+def test_both_ends_killed_at_random_moments(ready, end, seed: int) -> None:
+    end(ready, random.Random(seed).randrange(60, 8000))
+
+
+def test_termination_retracts(ready) -> None:
+    with fitsocket(ready, "--speed", SPEED) as (address, _):
+        host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
+        file = wait_for_record(ready, 1500, host)
+        host.send_signal(signal.SIGTERM)
+        _, err = host.communicate(timeout=60)
+    assert host.returncode == 1
+    assert "signal SIGTERM (stopped)" in err
+    assert read_recording(file).phases()[-1][0] == "stopped"
+
+
+def test_faults_on_demand_stop_the_session(ready, tmp_path) -> None:
+    faults = tmp_path / "faults.toml"
+    faults.write_text(
+        '[[faults]]\nkind = "limb"\nphase = "load"\nat_s = 0.5\npin = 4\nvalue = -6\nduration_s = 0.3\n'
+    )
+    with fitsocket(ready, "--speed", SPEED, "--faults", faults) as (address, _):
+        code, found, err = acquire(ready, address, "--unattended", "--depth", 4.0)
+    assert code == 1
+    (row,) = found["sites"]  # the second site is not begun
+    assert "the limb has moved" in row["reason"], err
+    assert row["phase"] == "stopped"
+
+
+def test_two_sessions_over_one_serial_port(ready) -> None:
+    pytest.importorskip("serial", reason="needs pyserial")
+    with fitsocket(ready, "--speed", SPEED, "--terminal") as (address, _):
+        for _ in range(2):
+            device = LineDevice(connect(address))
+            events: SimpleQueue = SimpleQueue()
+
+            def listen(told, events=events) -> None:
+                if told.phase == "position":
+                    events.put(Confirm())
+                elif isinstance(told, LiveTold) and told.phase == "clamp":
+                    events.put(Abort("enough"))
+
+            session = Session(settings(), device, site="1", listener=listen)
+            ending = run_session(session, events)
+            assert (ending.phase, ending.reason) == (Phase.STOPPED, "enough")
+            assert ending.samples > 20
+            assert device.refused.total == 0
+
+
+@pytest.mark.slow
+def test_a_whole_session_over_a_serial_port(ready) -> None:
+    pytest.importorskip("serial", reason="needs pyserial")
+    with fitsocket(ready, "--speed", SPEED, "--terminal") as (address, _):
+        assert re.fullmatch(r"serial:/dev/pts/\d+", address)
+        for words in ((), ("--again",)):  # one session after the other on the same wire
+            code, found, err = acquire(ready, address, "--unattended", "--site", "1", "--depth", 3.0, *words)
+            assert code == 0, err
+            assert found["sites"][0]["verdict"]["good"]
+    assert len(list(ready.glob("1.until-*.csv"))) == 1
+
+
+def test_the_operator_s_keys_in_a_terminal(ready) -> None:
+    """Enter, then the space bar held until 3 mm: as at a keyboard that repeats 30 times a second."""
+    with fitsocket(ready, "--speed", "2") as (address, _):
+        near, far = pty.openpty()
+        words = ["acquire", str(ready), "--device", address, "--site", "1"]
+        host = subprocess.Popen(
+            [sys.executable, "-m", "limbfit", *words],
+            stdin=far,
+            stdout=far,
+            stderr=far,
+            env={**os.environ, "TERM": "xterm"},
+        )
+        os.close(far)
+        shown, held, confirmed = "", 0, False
+        end = time.monotonic() + 200
+        while time.monotonic() < end:
+            ready_to_read, _, _ = select.select([near], [], [], 0.03)
+            if ready_to_read:
+                try:
+                    shown += os.read(near, 65536).decode(errors="replace")
+                except OSError:
+                    break
+            if not confirmed and "then Enter" in shown:
+                os.write(near, b"\n")
+                confirmed = True
+            if "hold the space bar" in shown and held < 25:
+                os.write(near, b" ")
+                held += 1
+        code = host.wait(timeout=20)
+        os.close(near)
+    assert code == 0, shown[-2000:]
+    assert "N over mm" in shown
+    assert "•" in shown
+    depth = float(re.search(r"site 1: ([0-9.]+) mm deep", shown)[1])
+    assert 1.0 < depth < 15.0
+
+
+def test_without_a_terminal_an_operator_is_asked_for(ready) -> None:
+    process = start("acquire", ready, stdin=subprocess.DEVNULL)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "--unattended" in err
+
+
+def test_the_server_binds_to_loopback_and_takes_one_host(ready) -> None:
+    with fitsocket(ready) as (address, process):
+        host, port = re.fullmatch(r"tcp://(127\.0\.0\.1):(\d+)", address).groups()
+        first = LineDevice(connect(address))
+        second = socket.create_connection((host, int(port)))
+        second.settimeout(10)
+        assert second.recv(100) == b""  # closed at once
+        first.close()
+        silent = socket.create_connection((host, int(port)))
+        silent.settimeout(30)
+        assert silent.recv(100) == b""  # closed for want of a greeting
+        noisy = socket.create_connection((host, int(port)))
+        noisy.settimeout(30)
+        noisy.sendall(b"\x00\xff" * 200_000 + b"\n" + Encoder().encode("MOVE 1 50000 8000 0")[1])
+        assert noisy.recv(100) == b""
+        for closed in (second, silent, noisy):
+            closed.close()
+        assert process.poll() is None
+        assert is_home(address)
+
+
+def identity(model: str) -> bytes:
+    body = f"ID 1 {'0' * 16} 14 500 60000 50000 12500 real {model} S1 2024-01-01"
+    return Encoder(first=0).encode(body)[1]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"\x1b[2J\x1b[31mowned\n" * 50,
+        b"A" * 3_000_000,
+        b"0 ID 1 \x1b]0;x\x07*00000000\n",
+        identity("x" * 60),
+        identity("Fit Socket"),
+        identity("FitSocket").replace(b"ID 1", b"ID 2"),
+    ],
+    ids=["ansi", "endless", "control", "long", "space", "spoilt"],
+)
+def test_a_hostile_device_gets_one_clean_line(ready, answer: bytes) -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+    address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 3.0)
+    connection, _ = listener.accept()
+    connection.sendall(answer)
+    _, err = host.communicate(timeout=60)
+    assert host.returncode == 1
+    assert err.startswith("error: no greeting from the device")
+    assert len(err.splitlines()) == 1
+    assert err.strip().isprintable()
+    assert not list(ready.glob("acquired/*"))
+    connection.close()
+    listener.close()
+
+
+def test_nothing_is_written_outside_the_study(ready) -> None:
+    file = ready / "study.toml"
+    file.write_text(file.read_text().replace('trace = "1.csv"', 'trace = "../1.csv"'))
+    code, _, err = acquire(ready, "tcp://127.0.0.1:1", "--unattended", "--site", "1", "--depth", 3.0)
+    assert code == 2
+    assert "outside the study's folder" in err
+    shutil.rmtree(ready / "results")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("[[faults]]\nkind = 'fire'\n", "faults.0.kind"),
+        ("[[faults]]\nkind = 'stuck'\npin = 15\n", "faults.0.pin"),
+        ("faults = [", "TOML"),
+        ("", "faults"),
+    ],
+)
+def test_bad_fault_files_are_refused(ready, tmp_path, content: str, said: str) -> None:
+    file = tmp_path / "faults.toml"
+    file.write_text(content)
+    process = start("virtual-fitsocket", ready, "--port", 0, "--faults", file)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert said in err
+    assert "Traceback" not in err

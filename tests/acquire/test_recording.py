@@ -1,0 +1,169 @@
+"""Records: what was written is read, whatever a crash or a bad disk leaves of it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from in_process import Bench
+
+from limbfit.acquire import Recorder, judge, ramps, read_recording
+from limbfit.acquire.events import PINS, Sample
+from limbfit.acquire.recording import COLUMNS
+from limbfit.errors import TraceError
+
+
+def sample(number: int) -> Sample:
+    return Sample(number, 2000 * number, 8, 0, (number,) * PINS, (-number,) * PINS, (5,) * PINS)
+
+
+def write(file, rows: int) -> None:
+    recorder = Recorder(file, {"site": "1", "settings": {"pin": 1}})
+    for number in range(1, rows + 1):
+        recorder.sample(sample(number), 2000 * number + 300)
+        if number == 30:
+            recorder.event("phase", 60_400, phase="clamp")
+    recorder.close()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    file = tmp_path_factory.mktemp("record") / "record.csv"
+    write(file, 130)
+    return file
+
+
+def test_what_was_written_is_read(written) -> None:
+    found = read_recording(written)
+    assert found.head["site"] == "1"
+    assert found.lost_bytes == 0
+    assert found.number.tolist() == list(range(1, 131))
+    assert (found.force_mN == -found.number[:, None]).all()
+    assert found.phases() == [("clamp", 60_400, 260_301)]
+
+
+def test_any_table_reader_reads_the_rows(written) -> None:
+    table = np.genfromtxt(written, delimiter=",", names=True, comments="#", skip_header=2)
+    assert table.dtype.names == COLUMNS
+    assert table["p3_um"].tolist() == list(range(1, 131))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(share=st.floats(0, 1))
+def test_a_record_cut_anywhere_is_read_up_to_a_tenth_of_a_second(written, tmp_path_factory, share) -> None:
+    data = written.read_bytes()
+    cut = data[: int(share * len(data))]
+    file = tmp_path_factory.mktemp("cut") / "record.csv"
+    file.write_bytes(cut)
+    whole = len([line for line in cut.split(b"\n")[:-1] if line[:1].isdigit()])
+    if cut.find(b"#block 0 ") < 0 or b"\n" not in cut[cut.find(b"#block 0 ") :]:
+        with pytest.raises(TraceError):
+            read_recording(file)
+    else:
+        found = read_recording(file)
+        assert whole - len(found.number) <= 50  # 0.1 s
+        assert found.number.tolist() == list(range(1, len(found.number) + 1))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(share=st.floats(0, 0.999), byte=st.integers(0, 255))
+def test_a_damaged_byte_is_never_believed(written, tmp_path_factory, share, byte) -> None:
+    data = bytearray(written.read_bytes())
+    at = int(share * len(data))
+    if data[at] == byte:
+        return
+    data[at] = byte
+    file = tmp_path_factory.mktemp("damage") / "record.csv"
+    file.write_bytes(data)
+    try:
+        found = read_recording(file)
+    except TraceError:
+        return
+    assert found.number.tolist() == list(range(1, len(found.number) + 1))
+    assert (found.position_um == found.number[:, None]).all()
+    assert found.lost_bytes > 0
+
+
+@pytest.mark.parametrize("content", [b"", b"time,force\n1,2\n", b"#limbfit-recording 1\n", b"\xff" * 100])
+def test_what_is_no_record_is_refused(tmp_path, content: bytes) -> None:
+    file = tmp_path / "record.csv"
+    file.write_bytes(content)
+    with pytest.raises(TraceError):
+        read_recording(file)
+
+
+def test_a_record_is_never_overwritten(written) -> None:
+    with pytest.raises(FileExistsError):
+        Recorder(written, {})
+
+
+def session(tmp_path, **changes):
+    """A whole session, recorded."""
+    bench = Bench(depth_mm=3.0, **changes)
+    file = tmp_path / "record.csv"
+    head = {
+        "site": "1",
+        "settings": {
+            "pin": 1,
+            "repeats": bench.settings.repeats,
+            "precondition": bench.settings.precondition,
+        },
+        "device": {"range_mN": 50_000},
+    }
+    recorder = bench.session.recorder = Recorder(file, json.loads(json.dumps(head)))
+    bench.until()
+    recorder.close()
+    return bench, read_recording(file)
+
+
+def checks(recording) -> dict[str, bool | None]:
+    return {check.name: check.passed for check in judge(recording).checks}
+
+
+def test_a_good_session_is_called_good(tmp_path) -> None:
+    bench, recording = session(
+        tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, pause_s=3.0, settle_s=0.5
+    )
+    verdict = judge(recording)
+    assert verdict.is_good, verdict
+    found = ramps(recording)
+    assert [ramp.cycle for ramp in found] == [1, 2, 3]
+    for ramp in found:
+        protocol = bench.session.protocol
+        assert ramp.trace.displacement_mm.max() == pytest.approx(
+            (protocol.depth_um - protocol.start_um) / 1000, abs=0.02
+        )
+        assert np.allclose(np.diff(ramp.trace.time_s), 0.002)
+        assert abs(ramp.trace.displacement_mm[[0, -1]]).max() < 0.1
+
+
+def test_what_is_wrong_is_named(tmp_path) -> None:
+    _, recording = session(tmp_path, ramp_speed_mm_s=6.0, settle_s=0.5)
+    assert checks(recording)["speed"] is False
+    recording.force_mN[recording.host_us > 3_000_000, 0] += 400
+    recording.force_mN[100, 7] = 50_000
+    found = checks(recording)
+    assert found["drift"] is False
+    assert found["saturation"] is False
+    keep = np.ones(len(recording.number), dtype=bool)
+    keep[200:220] = False
+    thinned = type(recording)(
+        **{
+            name: value[keep] if isinstance(value, np.ndarray) else value
+            for name, value in vars(recording).items()
+        }
+    )
+    assert checks(thinned)["samples"] is False
+
+
+def test_ramps_that_do_not_repeat_are_named(tmp_path) -> None:
+    _, recording = session(
+        tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, pause_s=3.0, settle_s=0.5
+    )
+    assert checks(recording)["repeatability"] is True
+    second = [event["at_us"] for event in recording.events if event.get("phase") == "load"][2]
+    recording.force_mN[recording.host_us > second, 0] *= 2
+    assert checks(recording)["repeatability"] is False
