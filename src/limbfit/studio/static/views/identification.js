@@ -165,7 +165,7 @@ class IdentificationView {
       `${of === "log" ? "As the log tells it: " : ""}${last.of}, ${rows.length} iterates, mean force error ${last.error_percent.toFixed(2)} % of the largest force.`;
     if (!last) return;
     const x = rows.map((_, i) => i);
-    const sites = Object.keys(last.error_percent_by_site);
+    const sites = Object.keys(last.error_percent_by_site).sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
     const many = sites.length > 6;
     const series = [{ label: "mean of the fitted sites", colour: "--simulated", width: 3, points: true, x, y: rows.map((row) => row.error_percent) },
       ...sites.map((site, i) => ({ label: many ? "" : `site ${site}`, colour: many ? "--muted" : LOOKS[(i + 1) % 4][0], dash: ["dashed", "dotted", "dashdot"][i % 3], width: 1.2,

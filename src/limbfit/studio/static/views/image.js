@@ -14,7 +14,7 @@ export async function mount(element, context) {
   await view.open(facts);
   context.on((changed) => changed.labels && view.labelsChanged());
   context.on((changed) => changed.theme && view.colours());
-  return { show: () => view.viewer.resizeListener(), view };
+  return { show: () => view.wake(), hide: () => view.sleep() };
 }
 
 class ImageView {
@@ -58,8 +58,19 @@ class ImageView {
     });
     this.viewer.onLocationChange = (at) => this.tellPlace(at);
     this.viewer.onDrawingChanged = (action) => action === "draw" && this.stroke();
+    this.viewer.createOnLocationChange();
     await this.surfaces(facts.surfaces);
     this.context.say("Image ready.");
+  }
+
+  /** Nothing is drawn on a canvas without a size. */
+  sleep() {
+    this.viewer.drawScene = () => {};
+  }
+
+  wake() {
+    delete this.viewer.drawScene;
+    this.viewer.resizeListener();
   }
 
   /** Many changes, drawn once. */
@@ -68,7 +79,7 @@ class ImageView {
     try {
       await change();
     } finally {
-      delete this.viewer.drawScene;
+      if (this.canvas.clientWidth) delete this.viewer.drawScene;
     }
     this.viewer.drawScene();
   }
@@ -215,7 +226,7 @@ class ImageView {
     const [level, levelRow] = slider("level", "Level (grey value)", (a + b) / 2, low, high, step, () => this.window());
     const [width, widthRow] = slider("width", "Window (grey values)", b - a, step, (high - low) || 1, step, () => this.window());
     this.sliders = { level, width };
-    const layouts = LAYOUTS.map(([key, text]) => el("button", { type: "button", "aria-pressed": "false", id: `layout-${key}`, onclick: () => this.layout(key) }, text));
+    const layouts = LAYOUTS.map(([key, text]) => el("button", { type: "button", class: "tiny", "aria-pressed": "false", id: `layout-${key}`, onclick: () => this.layout(key) }, text));
     replace(this.side,
       el("h2", {}, "View"),
       el("div", { class: "row", role: "group", "aria-label": "Planes" }, layouts),

@@ -20,6 +20,7 @@ class TracesView {
     this.context = context;
     this.charts = [];
     this.site = null;
+    this.found = { sites: [], flags: [] };
     element.classList.add("split");
     this.side = el("div", { class: "side" });
     this.area = el("div", { class: "stagearea padded" });
@@ -27,34 +28,50 @@ class TracesView {
   }
 
   async refresh() {
-    if (this.dragging) return;
+    const sites = this.context.study?.sites ?? [];
+    if (this.dragging || !sites.length) return;
+    if (!sites.some((site) => site.name === this.site)) this.site = (sites.find((site) => site.has_trace) ?? sites[0]).name;
+    this.list();
+    await Promise.all([this.open(this.site), this.judge()]);
+  }
+
+  /** All records are read for this, which takes seconds where there are many. */
+  async judge() {
     try {
       this.found = await this.context.api.get("traces");
     } catch (error) {
       this.context.warn(error.message);
       return;
     }
-    const known = this.found.sites.map((row) => row.site);
-    if (!known.includes(this.site)) this.site = this.found.sites.find((row) => row.facts)?.site ?? known[0];
     this.list();
-    await this.open(this.site);
+    this.doubts();
   }
 
   list() {
-    const of = (name) => this.found.flags.filter((flag) => flag.sites.includes(name)).length;
-    const rows = this.found.sites.map((row) => {
-      const flags = of(row.site);
-      const notes = [row.fitted ? "fitted" : "held out", row.region];
-      if (!row.has_trace) notes.push("no record");
-      if (row.error) notes.push("unreadable");
-      if (row.stated && Object.values(row.stated).some((value) => value !== null)) notes.push("set by hand");
-      return el("li", {}, el("button", { type: "button", class: "site", "data-site": row.site, "aria-pressed": String(row.site === this.site),
-        onclick: () => this.choose(row.site) },
-      el("strong", {}, row.site), el("span", {}, notes.filter(Boolean).join(", ")),
-      flags || row.error ? el("span", { class: "flagged" }, `⚠ ${flags || 1}`) : null));
+    const focused = this.side.contains(document.activeElement) ? document.activeElement.dataset.site : null;
+    const rows = this.context.study.sites.map((site) => {
+      const error = this.found.sites.find((row) => row.site === site.name)?.error;
+      const flags = this.flags(site.name).length;
+      const notes = [site.fitted ? "fitted" : "held out", site.region];
+      if (!site.has_trace) notes.push("no record");
+      if (error) notes.push("unreadable");
+      if (site.touch_down_s !== null || site.peak_s !== null) notes.push("set by hand");
+      return el("li", {}, el("button", { type: "button", class: "site", "data-site": site.name, "aria-pressed": String(site.name === this.site),
+        onclick: () => this.choose(site.name) },
+      el("strong", {}, site.name), el("span", {}, notes.filter(Boolean).join(", ")),
+      flags || error ? el("span", { class: "flagged" }, `⚠ ${flags || 1}`) : null));
     });
     replace(this.side, el("h2", {}, "Records"), el("ul", { class: "plain sites" }, rows),
       el("p", { class: "hint" }, "⚠ counts what is doubtful about a record. Drag touch-down or peak, or move it with the arrow keys: the time is stored in the study file at once."));
+    if (focused) this.side.querySelector(`[data-site="${CSS.escape(focused)}"]`)?.focus();
+  }
+
+  flags(name) {
+    return this.found.flags.filter((flag) => flag.sites.includes(name));
+  }
+
+  doubts() {
+    if (this.flagList) replace(this.flagList, this.flags(this.site).map((flag) => el("li", { class: "doubt" }, `⚠ ${flag.text}`)));
   }
 
   async choose(name) {
@@ -67,15 +84,24 @@ class TracesView {
   async open(name) {
     this.charts.forEach((chart) => chart.close());
     this.charts = [];
-    const row = this.found.sites.find((one) => one.site === name);
-    const flags = this.found.flags.filter((flag) => flag.sites.includes(name)).map((flag) => el("li", { class: "doubt" }, `⚠ ${flag.text}`));
-    const head = [el("h2", {}, `Site ${name}${row?.region ? `, ${row.region}` : ""}`), flags.length ? el("ul", { class: "plain flags" }, flags) : null];
-    if (!row?.facts) {
-      replace(this.area, head, el("p", {}, row?.error ?? "This site has no record: it is planned to be simulated."));
+    const turn = (this.turn = (this.turn ?? 0) + 1);
+    const site = this.context.study.sites.find((one) => one.name === name);
+    this.flagList = el("ul", { class: "plain flags" });
+    this.doubts();
+    const head = [el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList];
+    if (!site.has_trace) {
+      replace(this.area, head, el("p", {}, "This site has no record: it is planned to be simulated."));
       return;
     }
-    this.record = await this.context.api.get(`traces/${encodeURIComponent(name)}`);
-    if (name !== this.site) return;
+    let record;
+    try {
+      record = await this.context.api.get(`traces/${encodeURIComponent(name)}`);
+    } catch (error) {
+      replace(this.area, head, el("p", { class: "bad" }, error.message));
+      return;
+    }
+    if (turn !== this.turn) return;
+    this.record = record;
     const [force, depth, loop] = [0, 1, 2].map(() => el("div", {}));
     this.facts = el("dl", { class: "facts", id: "trace-facts" });
     this.reset = el("button", { type: "button", id: "trace-reset", onclick: () => this.store({ touch_down_s: null, peak_s: null }) }, "Leave both to limbfit");
