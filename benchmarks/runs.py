@@ -100,13 +100,16 @@ def throughput(divisions: int, rounds: int) -> list[dict[str, Any]]:
             list(executor.map(bind, range(executor.workers), keys[: executor.workers]))
             list(executor.map(simulate, jobs[:4], keys[:4]))
         for _ in range(rounds):
-            seconds = []
+            wall, cpu = [], []
             for executor in (one, two):
                 start = time.perf_counter()
-                list(executor.map(simulate, jobs, keys))
-                seconds.append(time.perf_counter() - start)
-            print(seconds, flush=True)
-            rows.append({"one_s": seconds[0], "two_s": seconds[1], "ratio": seconds[0] / seconds[1]})
+                made = list(executor.map(measured, jobs, keys))
+                wall.append(time.perf_counter() - start)
+                cpu.append(sum(facts["cpu_s"] for _, facts in made))
+            rows.append(
+                {"one_s": wall[0], "two_s": wall[1], "one_cpu_s": cpu[0], "two_cpu_s": cpu[1]}
+                | {"ratio": wall[0] / wall[1]}
+            )
     return rows
 
 

@@ -236,7 +236,7 @@ def test_ctrl_c_ends_the_run_and_its_workers_quietly(tmp_path):
     run.stdout.readline()
     time.sleep(0.3)
     os.killpg(run.pid, signal.SIGINT)
-    _, errors = run.communicate(timeout=5)
+    _, errors = run.communicate(timeout=60)
     assert errors.count("Traceback") == 1
     assert "KeyboardInterrupt" in errors
     assert_group_ends(run.pid)
@@ -300,6 +300,13 @@ def test_a_job_that_kills_every_worker_can_be_a_failure_instead_of_an_end(pool):
 
 def test_limits_are_for_jobs_that_can_be_lost():
     with ProcessExecutor(1, limits=Limits(time_s=0.01)) as executor:
+        assert list(executor.map(square, [3])) == [9]
+
+
+def test_code_that_lies_where_a_run_is_started_is_not_run(tmp_path, monkeypatch):
+    (tmp_path / "pickle.py").write_text("import os; os._exit(3)")
+    monkeypatch.chdir(tmp_path)
+    with ProcessExecutor(1) as executor:
         assert list(executor.map(square, [3])) == [9]
 
 

@@ -11,6 +11,7 @@ import typer
 
 from .. import __version__
 from ..errors import InputError, LimbfitError
+from ..execution import SAFE_PATH
 from . import acquire, bench, commands, experiments, febio, geometry, runs, studio, trust
 from .console import INTERRUPTED, STDOUT, fail, prompt_interrupt
 
@@ -47,6 +48,7 @@ app.add_typer(bench.app, name="bench")
 
 def main() -> None:
     """The entry point: errors become one line and an exit code."""
+    os.environ.update(SAFE_PATH)  # for all that a verb starts
     try:
         with prompt_interrupt():
             app()

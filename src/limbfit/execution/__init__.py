@@ -6,11 +6,12 @@ order of the jobs whatever runs them, so a caller cannot tell one executor from 
 
 from .choice import Placement, make_executor, placed, sharing
 from .cluster import QUEUES, DaskExecutor
-from .face import THREAD_VARIABLES, Executor, Limits, SerialExecutor, usable_cores
+from .face import SAFE_PATH, THREAD_VARIABLES, Executor, Limits, SerialExecutor, usable_cores
 from .processes import ProcessExecutor
 
 __all__ = [
     "QUEUES",
+    "SAFE_PATH",
     "THREAD_VARIABLES",
     "DaskExecutor",
     "Executor",

@@ -18,7 +18,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from .face import THREAD_VARIABLES, Limits
+from .face import SAFE_PATH, THREAD_VARIABLES, Limits
 
 GRACE_S = 2.0  # for workers to end when told so
 READY = "ready"  # a worker's first word: its start is not its first job's time
@@ -44,7 +44,8 @@ class Worker:
         self.connection, far = context.Pipe()
         self.process = context.Process(target=serve, args=(far,), daemon=True)
         self.began: float | None = None  # its job; None before it is ready
-        with _environment(dict.fromkeys(THREAD_VARIABLES, str(threads))), _no_main(), _may_have_children():
+        variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | SAFE_PATH
+        with _environment(variables), _no_main(), _may_have_children():
             self.process.start()
         far.close()
 
