@@ -32,7 +32,8 @@ class TracesView {
     if (this.dragging || !sites.length) return;
     if (!sites.some((site) => site.name === this.site)) this.site = (sites.find((site) => site.has_trace) ?? sites[0]).name;
     this.list();
-    await Promise.all([this.open(this.site), this.judge()]);
+    await this.open(this.site);
+    await this.judge();
   }
 
   /** All records are read for this, which takes seconds where there are many. */
@@ -81,26 +82,33 @@ class TracesView {
     await this.open(name);
   }
 
-  async open(name) {
+  close() {
     this.charts.forEach((chart) => chart.close());
     this.charts = [];
+  }
+
+  async open(name) {
     const turn = (this.turn = (this.turn ?? 0) + 1);
     const site = this.context.study.sites.find((one) => one.name === name);
     this.flagList = el("ul", { class: "plain flags" });
     this.doubts();
     const head = [el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList];
     if (!site.has_trace) {
+      this.close();
       replace(this.area, head, el("p", {}, "This site has no record: it is planned to be simulated."));
       return;
     }
+    if (!this.charts.length) replace(this.area, head, el("p", { class: "hint" }, "Reading the record …"));
     let record;
     try {
       record = await this.context.api.get(`traces/${encodeURIComponent(name)}`);
     } catch (error) {
+      this.close();
       replace(this.area, head, el("p", { class: "bad" }, error.message));
       return;
     }
     if (turn !== this.turn) return;
+    this.close();
     this.record = record;
     const [force, depth, loop] = [0, 1, 2].map(() => el("div", {}));
     this.facts = el("dl", { class: "facts", id: "trace-facts" });
