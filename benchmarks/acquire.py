@@ -54,6 +54,7 @@ from limbfit.acquire.wire import HOST_LINE, Decoder, Encoder, salt_of
 from limbfit.study.acquisition import AcquireTable
 
 SITE = "bench"
+WATCHDOG_MS = 500.0  # a machine that stalls is to be measured, not to end the measurement
 
 
 def hold(study: Path, minutes: float, site: str) -> dict[str, Any]:
@@ -69,7 +70,7 @@ def hold(study: Path, minutes: float, site: str) -> dict[str, Any]:
 
 
 def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
-    table = AcquireTable(repeats=50, pause_s=0.5, search_depth_mm=4.0, time_limit_s=600.0)
+    table = AcquireTable(repeats=50, pause_s=0.5, search_depth_mm=4.0, watchdog_ms=WATCHDOG_MS)
     settings = Settings(**table.model_dump())
     events: SimpleQueue[Event] = SimpleQueue()
     file = Path(tempfile.mkdtemp()) / "record.csv"
@@ -93,6 +94,8 @@ def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
         "lost": session.counts.lost,
         "late_2ms_percent": round(100 * float((late > 2).mean()), 4),
         "late_10ms_percent": round(100 * float((late > 10).mean()), 4),
+        "late_20ms": int((late > 20).sum()),
+        "stalls_over_20ms": int((np.diff((late > 20).astype(int)) == 1).sum()),
         "latest_ms": round(float(late.max()), 2),
         "median_ms": round(float(np.median(late)), 3),
         "cpu_percent": round(100 * cpu / seconds, 1),
@@ -187,6 +190,14 @@ def _trial(connection: socket.socket, random: np.random.Generator) -> float:
             connection.sendall(line)
 
 
+def stolen_s() -> float:
+    """Seconds that a virtual machine's host has taken from its processors so far; 0 where nobody tells."""
+    file = Path("/proc/stat")
+    return (
+        int(file.read_text().split("\n")[0].split()[8]) / os.sysconf("SC_CLK_TCK") if file.exists() else 0.0
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("study", type=Path)
@@ -197,10 +208,12 @@ def main() -> None:
     given = parser.parse_args()
     found: dict[str, Any] = {"cores": os.cpu_count(), "load": [round(x, 1) for x in os.getloadavg()]}
     found["priority"] = "normal" if given.normal else prioritise()
+    stolen = stolen_s()
     if given.minutes:
         found["held"] = hold(given.study, given.minutes, given.site)
     if given.trials:
         found["reaction"] = react(given.trials)
+    found["stolen_s"] = round(stolen_s() - stolen, 2)
     found["load_after"] = [round(x, 1) for x in os.getloadavg()]
     sys.stdout.write(json.dumps(found, indent=1) + "\n")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,7 +27,7 @@ from limbfit.acquire.messages import (
     sample_body,
 )
 from limbfit.acquire.phases import Phase
-from limbfit.acquire.wire import HOST_LINE, Decoder, Encoder
+from limbfit.acquire.wire import DEVICE_LINE, HOST_LINE, Decoder, Encoder, salt_of
 
 COMMANDS = [
     Hello("0123456789abcdef"),
@@ -189,3 +191,21 @@ def test_nothing_moves_without_a_session() -> None:
     wire = Direct(far)
     wire.send(Move(1, 20_000, 1000), 0.0)
     assert [r.code for r in wire.receive() if isinstance(r, Declined)] == ["not-armed"]
+
+
+def test_the_documented_exchange_is_what_is_spoken() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "device-protocol.md").read_text(encoding="utf-8")
+    lines = [line[6:].encode() + b"\n" for line in page.split("\n") if line.startswith(("    > ", "    < "))]
+    hello, who, limits, accepted, _, beat = lines
+    device_end, host_end = Decoder(HOST_LINE, numbered=False), Decoder(DEVICE_LINE, numbered=False)
+    (greeting,), (answer,) = device_end.feed(hello), host_end.feed(who)
+    greeted, identity = parse_command(greeting.body), parse_report(answer.body, answer.number)
+    salt = salt_of(greeted.nonce, identity.nonce)
+    device_end.restart(salt)
+    host_end.restart(salt)
+    assert [parse_command(line.body) for line in device_end.feed(limits + beat)] == [
+        SetLimits(1, 25_000, 25_000, 60_000, 8000, 20),
+        Beat(2),
+    ]
+    assert [parse_report(line.body, line.number) for line in host_end.feed(accepted)] == [Accepted(1)]
+    assert device_end.refused.total == host_end.refused.total == 0
