@@ -133,7 +133,8 @@ class ResultsView {
   async readCurves() {
     const name = this.chosen, path = `results/curves/${encodeURIComponent(name)}`;
     const read = (more) => this.context.api.get(path + more).catch(() => null);
-    const [ours, theirs] = await Promise.all([read(""), this.other ? read(`?kept=${encodeURIComponent(this.other)}`) : null]);
+    const has = (run) => run?.sites.some((row) => row.site === name);
+    const [ours, theirs] = await Promise.all([has(this.outcome) ? read("") : null, has(this.beside) ? read(`?kept=${encodeURIComponent(this.other)}`) : null]);
     if (name !== this.chosen) return;
     this.curves = { ours, theirs };
     this.drawCurves();
