@@ -172,8 +172,13 @@ def test_the_self_test_knows_its_answer():
 
 
 @pytest.mark.slow
-def test_doctor_says_what_there_is_and_what_cannot_be_written(tmp_path):
+def test_doctor_says_what_there_is_and_what_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))  # neither browser nor FEBio there
+    monkeypatch.delenv("FEBIO_CMD", raising=False)
     found = diagnose(tmp_path)
+    remedies = {row["check"]: row["remedy"] for row in found["checks"]}
+    assert "copy report.html" in remedies["browser"]
+    assert "FEBIO_CMD" in remedies["FEBio"]
     assert found["healthy"], found
     assert {"cores", "memory", "sparse solvers", "mesher MMG", "self-test"} <= {
         row["check"] for row in found["checks"]

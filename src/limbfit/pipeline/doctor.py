@@ -127,7 +127,10 @@ def _meshers() -> Iterator[Finding]:
     for name, module, required in (("MMG", "mmgpy", True), ("Netgen", "netgen.meshing", False)):
         try:
             code = subprocess.run(
-                [sys.executable, "-c", f"import {module}"], capture_output=True, timeout=120, check=False
+                [sys.executable, "-P", "-c", f"import {module}"],
+                capture_output=True,
+                timeout=120,
+                check=False,
             ).returncode
         except subprocess.TimeoutExpired:
             code = -1
