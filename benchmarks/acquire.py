@@ -22,11 +22,13 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from limbfit.acquire import (
     LineDevice,
@@ -54,7 +56,7 @@ from limbfit.acquire.wire import HOST_LINE, Decoder, Encoder, salt_of
 from limbfit.study.acquisition import AcquireTable
 
 SITE = "bench"
-WATCHDOG_MS = 500.0  # a machine that stalls is to be measured, not to end the measurement
+WATCHDOG_S = 60.0  # a machine that stalls is to be measured, not to end the measurement
 
 
 def hold(study: Path, minutes: float, site: str) -> dict[str, Any]:
@@ -70,8 +72,8 @@ def hold(study: Path, minutes: float, site: str) -> dict[str, Any]:
 
 
 def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
-    table = AcquireTable(repeats=50, pause_s=0.5, search_depth_mm=4.0, watchdog_ms=WATCHDOG_MS)
-    settings = Settings(**table.model_dump())
+    table = AcquireTable(repeats=50, pause_s=0.5, search_depth_mm=4.0)
+    settings = replace(Settings(**table.model_dump()), watchdog_ms=1000 * WATCHDOG_S)
     events: SimpleQueue[Event] = SimpleQueue()
     file = Path(tempfile.mkdtemp()) / "record.csv"
     device = LineDevice(connect(address))
@@ -105,9 +107,13 @@ def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
 
 
 def late_ms(host_us: np.ndarray, device_us: np.ndarray) -> np.ndarray:
-    """How much later than the promptest sample each was dealt with; both clocks are this machine's."""
+    """How much later than the promptest sample of the 2.5 s around it each was dealt with.
+
+    Both clocks are this machine's; a device that stood still for long does not make up for it, and its time is
+    behind from then on.
+    """
     lead = host_us - device_us
-    return (lead - lead.min()) / 1000
+    return (lead - minimum_filter1d(lead, 1251)) / 1000
 
 
 def react(trials: int) -> dict[str, Any]:
