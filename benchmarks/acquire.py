@@ -109,7 +109,7 @@ def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
 def late_ms(host_us: np.ndarray, device_us: np.ndarray) -> np.ndarray:
     """How much later than the promptest sample of the 2.5 s around it each was dealt with.
 
-    Both clocks are this machine's; a device that stood still for long does not make up for it, and its time is
+    Both clocks are this machine's; a device that stood still for long does not make up for it: its time is
     behind from then on.
     """
     lead = host_us - device_us
