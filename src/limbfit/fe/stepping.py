@@ -107,7 +107,7 @@ class Simulation:
         control: StepControl,
         sensitivities: bool,
         warm_start: Result | None,
-        system: System | None,
+        system: System | None = None,
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
