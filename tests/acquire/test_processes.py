@@ -80,6 +80,7 @@ def acquire(study, address: str, *words: object) -> tuple[int, dict, str]:
     return process.returncode, json.loads(out) if out else {}, err
 
 
+@pytest.mark.slow
 def test_both_sites_are_acquired_into_the_study(ready) -> None:
     with fitsocket(ready, "--speed", SPEED) as (address, _):
         code, found, err = acquire(ready, address, "--unattended", "--depth", 4.0)
@@ -238,6 +239,7 @@ def test_a_whole_session_over_a_serial_port(ready) -> None:
     assert len(list(ready.glob("1.until-*.csv"))) == 1
 
 
+@pytest.mark.slow
 def test_the_operator_s_keys_in_a_terminal(ready) -> None:
     """Enter, then the space bar held until 3 mm: as at a keyboard that repeats 30 times a second."""
     with fitsocket(ready, "--speed", "2") as (address, _):
