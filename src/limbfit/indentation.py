@@ -7,7 +7,7 @@ and numbers. ``simulate`` is the one function that every stage, executor and pha
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -184,7 +184,7 @@ def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
     return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]
 
 
-_KEPT = 9  # sites that a worker keeps the discretisation of: its share of one study
+_KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest usual ones, some 5 GB in all
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}  # tissue that sets a site's contact penalty
 _REFERENCE_STEPS = 4  # to the deepest point
 _MARGIN = 0.3  # of the penetration that is allowed: few other tissues then need a larger penalty
@@ -218,7 +218,8 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         penalty = control.penalty
         if penalty is None:
             penalty = _reference_penalty(problem, control, system)
-        known = _keep(_prepared, (model, tissues), Prepared(problem, system, penalty))
+        made = Prepared(problem, system, penalty)
+        known = _keep(_prepared, (model, tissues), made, lambda one: len(one.problem.mesh.points))
     _prepared.move_to_end((model, tissues))
     return known
 
@@ -237,9 +238,11 @@ def _reference_penalty(problem: Problem, control: StepControl, system: System) -
     return found.states[0].penalty if found.completed and found.states else None
 
 
-def _keep(places: OrderedDict[Site, Any], site: Site, what: Any) -> Any:
+def _keep(places: OrderedDict[Site, Any], site: Site, what: Any, nodes: Callable[[Any], int]) -> Any:
+    """Keep what is known of a site, and forget the sites not used for longest where there are too many."""
     places[site] = what
-    while len(places) > _KEPT:
+    places.move_to_end(site)
+    while len(places) > 1 and sum(map(nodes, places.values())) > _KEPT_NODES:
         places.popitem(last=False)
     return what
 
@@ -266,7 +269,7 @@ def _solve_from_rest(model: SiteModel, tissues: tuple[str, ...], parameters: tup
     # Sensitivities are most of the states' memory; a first guess needs few digits of them.
     states = tuple(replace(s, sensitivity=_single(s.sensitivity)) for s in found.states)
     found = replace(found, states=states)
-    _keep(_rested, (model, tissues), (parameters, found))
+    _keep(_rested, (model, tissues), (parameters, found), lambda one: len(one[1].problem.mesh.points))
     return found
 
 
