@@ -33,10 +33,11 @@ HINTS = {
 
 
 class PlainLines:
-    """Phases as lines on standard error."""
+    """Phases as lines on standard error, with the time since the first."""
 
     def __init__(self, site: str) -> None:
         self.site = site
+        self._began: float | None = None
 
     def __enter__(self) -> PlainLines:
         return self
@@ -46,11 +47,11 @@ class PlainLines:
 
     def listen(self, told: Told) -> None:
         if isinstance(told, PhaseTold):
+            self._began = told.time_s if self._began is None else self._began
             cycle = f" (ramp {told.cycle})" if told.phase in ("load", "unload") else ""
             reason = f": {told.reason}" if told.reason else ""
-            STDERR.print(
-                f"[{told.time_s:10.3f} s] site {self.site}: {told.phase}{cycle}{reason}", soft_wrap=True
-            )
+            since = told.time_s - self._began
+            STDERR.print(f"[{since:8.3f} s] site {self.site}: {told.phase}{cycle}{reason}", soft_wrap=True)
 
 
 class Live:
