@@ -76,6 +76,7 @@ def test_memory_is_that_of_the_process_alone():
     assert mine.all()
 
 
+@pytest.mark.slow
 def test_facts_of_a_timed_simulation():
     facts = timed_solve(punched_block("tet4", 6), StepControl(load_steps=3, unload_steps=2), True)
     assert facts["completed"]

@@ -77,7 +77,8 @@ def test_opposite_corners_of_the_bounds(skin, muscle, depth):
     assert result.force[-1] < 1e-3 * result.peak_force
 
 
-@pytest.mark.parametrize("number", [3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [3, 4])
 def test_drawn_cases_complete_and_keep_to_the_laws(robustness, number):
     outcome = robustness.run_case(0, number)
     assert (outcome.outcome, outcome.broken) == ("completed", []), outcome.reason
