@@ -72,7 +72,7 @@ def hold(study: Path, minutes: float, site: str) -> dict[str, Any]:
 
 
 def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
-    table = AcquireTable(repeats=50, pause_s=0.5, search_depth_mm=4.0)
+    table = AcquireTable(repeats=50, search_depth_mm=4.0)
     settings = replace(Settings(**table.model_dump()), watchdog_ms=1000 * WATCHDOG_S)
     events: SimpleQueue[Event] = SimpleQueue()
     file = Path(tempfile.mkdtemp()) / "record.csv"

@@ -27,10 +27,9 @@ from typing import Any
 import numpy as np
 from runs_jobs import TISSUES, answer, bind, measured, nothing, stored_fields
 
-from limbfit.bench.blocks import DEPTH, INDENTATION, SPEED, layered_block
+from limbfit.bench.blocks import DEPTH, INDENTATION, block_site, layered_block
 from limbfit.execution import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
-from limbfit.mesh import write_vtu
 from limbfit.pipeline.simulations import CURVE_POINTS, SimulationCache
 from limbfit.study.tables import MeshTable
 
@@ -41,18 +40,8 @@ def site(folder: Path, name: str, divisions: int) -> SiteModel:
     """A block as the mesh of a site; its lower face is fixed. In and out as the robot of the study does."""
     block = layered_block("tet10", divisions)
     low = np.flatnonzero(block.points[:, 2] <= -DEPTH)
-    file, ramp = folder / f"{name}.vtu", INDENTATION / SPEED
-    write_vtu(replace(block, node_sets={"fixed_bottom": low}), file)
-    return SiteModel(
-        name=name,
-        mesh=file,
-        mesh_digest=name,
-        position=(0.0, 0.0, 0.0),
-        axis=(0.0, 0.0, -1.0),
-        knots_s=(0.0, ramp, 2 * ramp),
-        knots_mm=(0.0, INDENTATION, 0.0),
-        element=MeshTable().element,
-    )
+    mesh = replace(block, node_sets={"fixed_bottom": low})
+    return block_site(name, folder / f"{name}.vtu", mesh, INDENTATION, element=MeshTable().element)
 
 
 def job_of(model: SiteModel, parameters: tuple[float, ...], sensitivities: bool = True) -> SimulationJob:

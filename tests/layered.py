@@ -11,7 +11,7 @@ import numpy as np
 
 from limbfit.anatomy.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.triangles import Surface
-from limbfit.bench.blocks import SIX_TETS, boxes, upright
+from limbfit.bench.blocks import SIX_TETS, block_site, boxes, upright
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
@@ -20,7 +20,7 @@ from limbfit.pipeline.context import Context
 from limbfit.pipeline.simulations import COARSE
 from limbfit.pipeline.stages.traces import run_traces
 from limbfit.pipeline.store import Store, write_json
-from limbfit.study import SolverTable, Study
+from limbfit.study import Study
 
 TISSUES = ("skin", "fat", "muscle")
 TRUTH = {
@@ -54,22 +54,6 @@ def layered_block(
     )
 
 
-def block_model(name: str, file: Path, mesh: Mesh, depth_mm: float, steps: SolverTable) -> SiteModel:
-    """A site on a block, its mesh stored in ``file``; in and out at 0.96 mm/s."""
-    write_vtu(mesh, file)
-    ramp = depth_mm / 0.96
-    return SiteModel(
-        name=name,
-        mesh=file,
-        mesh_digest=name,
-        position=(0.0, 0.0, 0.0),
-        axis=(0.0, 0.0, -1.0),
-        knots_s=(0.0, ramp, 2 * ramp),
-        knots_mm=(0.0, depth_mm, 0.0),
-        steps=steps,
-    )
-
-
 def box(sides: tuple[float, float], height: tuple[float, float]) -> Surface:
     """A closed box, outward."""
     points = np.array([[x, y, z] for x in sides for y in sides for z in height])
@@ -97,7 +81,7 @@ def store_blocks(
     places = []
     for i, (name, (thickness, depth, fitted)) in enumerate(blocks.items()):
         mesh = layered_block(thickness, tissues, divisions=divisions)
-        model = block_model(name, store["mesh"] / f"{name}.vtu", mesh, depth, study.solver)
+        model = block_site(name, store["mesh"] / f"{name}.vtu", mesh, depth, study.solver)
         if coarse is not None:
             (store["mesh"] / COARSE).mkdir(exist_ok=True)
             write_vtu(

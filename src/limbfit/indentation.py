@@ -7,7 +7,7 @@ and numbers. ``simulate`` is the one function that every stage, executor and pha
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from .errors import ProblemError, SurfaceError
-from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, StepControl, System, solve
+from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, State, StepControl, System, solve
 from .fields import Animation, write_fields
 from .mesh import Mesh, read_vtu
 from .study import PARAMETERS, IndenterTable, SolverTable, Vector
@@ -190,26 +190,25 @@ _REFERENCE_STEPS = 4  # to the deepest point
 _MARGIN = 0.3  # of the penetration that is allowed: few other tissues then need a larger penalty
 
 
-@dataclass(frozen=True)
+@dataclass
 class Prepared:
-    """What all simulations of a site share, and nothing that depends on which of them came first.
+    """What a process keeps of a site for its next simulations.
 
-    ``penalty`` is that of contact; None where the solver is to find it.
+    ``problem``, ``system`` and ``penalty`` (of contact; None where the solver is to find it) follow from the
+    site alone. ``rested``: the newest simulation from rest with its parameters, all of its states kept.
     """
 
     problem: Problem
     system: System
     penalty: float | None
+    rested: tuple[tuple[float, ...], Result] | None = None
 
 
-Site = tuple[SiteModel, tuple[str, ...]]  # with the tissues of its parameters
-_prepared: OrderedDict[Site, Prepared] = OrderedDict()
-# The newest simulation from rest of each site, all of its states kept: first guesses of others.
-_rested: OrderedDict[Site, tuple[tuple[float, ...], Result]] = OrderedDict()
+_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...]], Prepared] = OrderedDict()
 
 
 def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
-    """The site's discretisation and contact penalty."""
+    """The site's discretisation and contact penalty; sites not used for longest are forgotten."""
     known = _prepared.get((model, tissues))
     if known is None:
         problem = build_problem(model, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
@@ -218,9 +217,12 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         penalty = control.penalty
         if penalty is None:
             penalty = _reference_penalty(problem, control, system)
-        made = Prepared(problem, system, penalty)
-        known = _keep(_prepared, (model, tissues), made, lambda one: len(one.problem.mesh.points))
+        known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
+    while (
+        len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > _KEPT_NODES
+    ):
+        _prepared.popitem(last=False)
     return known
 
 
@@ -238,15 +240,6 @@ def _reference_penalty(problem: Problem, control: StepControl, system: System) -
     return found.states[0].penalty if found.completed and found.states else None
 
 
-def _keep(places: OrderedDict[Site, Any], site: Site, what: Any, nodes: Callable[[Any], int]) -> Any:
-    """Keep what is known of a site, and forget the sites not used for longest where there are too many."""
-    places[site] = what
-    places.move_to_end(site)
-    while len(places) > 1 and sum(map(nodes, places.values())) > _KEPT_NODES:
-        places.popitem(last=False)
-    return what
-
-
 def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     """Simulate a site with what is prepared for it: the same answer, whatever was simulated before."""
     known = _prepare(model, tuple(parameters))
@@ -260,21 +253,17 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
 
 def _solve_from_rest(model: SiteModel, tissues: tuple[str, ...], parameters: tuple[float, ...]) -> Result:
     """Simulate a site with sensitivities and keep all states, unless this was the newest such simulation."""
-    known = _rested.get((model, tissues))
-    if known is not None and known[0] == parameters:
-        _rested.move_to_end((model, tissues))
-        return known[1]
-    values = to_parameters(np.array(parameters), tissues)
-    found = _solve(model, values, sensitivities=True, store="all")
-    # Sensitivities are most of the states' memory; a first guess needs few digits of them.
-    states = tuple(replace(s, sensitivity=_single(s.sensitivity)) for s in found.states)
-    found = replace(found, states=states)
-    _keep(_rested, (model, tissues), (parameters, found), lambda one: len(one[1].problem.mesh.points))
-    return found
+    known = _prepare(model, tissues)
+    if known.rested is None or known.rested[0] != parameters:
+        found = _solve(model, to_parameters(np.array(parameters), tissues), sensitivities=True, store="all")
+        known.rested = parameters, replace(found, states=tuple(map(_lightened, found.states)))
+    return known.rested[1]
 
 
-def _single(values: Array | None) -> Any:
-    return None if values is None else values.astype(np.float32)
+def _lightened(state: State) -> State:
+    """Sensitivities are most of a state's memory; a first guess needs few digits of them."""
+    single = None if state.sensitivity is None else state.sensitivity.astype(np.float32)
+    return replace(state, sensitivity=single)  # type: ignore[arg-type]
 
 
 def steps_of(model: SiteModel) -> StepControl:
@@ -312,24 +301,13 @@ def simulate(job: SimulationJob) -> Simulation:
 
 
 def simulate_fields(
-    model: SiteModel,
-    parameters: Parameters,
-    file: Path,
-    animation: Path | None = None,
-    kept: bool = False,
+    model: SiteModel, parameters: Parameters, file: Path, animation: Path | None = None
 ) -> Result:
     """Simulate an indentation and store its fields at the deepest point as VTU (see `fields`).
 
     With ``animation`` (a ``.pvd``) the fields of every step are stored too.  A simulation that fails in its
-    first step has no fields at its deepest point, and ``file`` is not written.  ``kept``: the fields of the
-    simulation with sensitivities that `simulate` keeps; it is done where this process has not done it.
+    first step has no fields at its deepest point, and ``file`` is not written.
     """
-    if kept:
-        tissues = tuple(parameters)
-        vector = tuple(map(float, to_vector(parameters, tissues)))
-        result = _solve_from_rest(model, tissues, vector)
-        _write_deepest(result, file)
-        return result
     frames = None
     if animation is not None:
         prepared = _prepare(model, tuple(parameters)).problem
@@ -337,6 +315,16 @@ def simulate_fields(
     result = _solve(model, parameters, on_step=None if frames is None else frames.add, store="peak")
     _write_deepest(result, file)
     return result
+
+
+def rested_fields(model: SiteModel, parameters: Parameters, file: Path) -> None:
+    """Fields as `simulate_fields` stores them, of the simulation that `simulate` keeps.
+
+    That is the one from rest with sensitivities; it is done where this process has not just done it.
+    """
+    tissues = tuple(parameters)
+    vector = tuple(map(float, to_vector(parameters, tissues)))
+    _write_deepest(_solve_from_rest(model, tissues, vector), file)
 
 
 def _write_deepest(result: Result, file: Path) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from .events import (
-    PERIOD_US,
+    RATE_HZ,
     Abort,
     Action,
     Begin,
@@ -60,9 +60,7 @@ class Protocol:
         self.settings, self.device = settings, device
         self.phase, self.reason = Phase.IDLE, ""
         self.touch_um = self.start_um = self.depth_um = self.cycle = 0
-        self.guard = Guard(
-            session_limits(settings, device.stroke_um, device.range_mN, 1_000_000 // PERIOD_US)
-        )
+        self.guard = Guard(session_limits(settings, device.stroke_um, device.range_mN, RATE_HZ))
         self._watch = ClampWatch(settings.clamps)
         self._entered = self._heard = 0.0
         self._rounds = 0

@@ -19,7 +19,7 @@ from typing import Any
 
 from ..errors import RunError
 from .device import Device as AnyDevice
-from .events import Abort, Action, Begin, Event, Hold, LinkLost, Move, Sample, Stop, Tick
+from .events import PERIOD_US, Abort, Action, Begin, Event, Hold, LinkLost, Move, Sample, Stop, Tick
 from .hostend import limits_command
 from .messages import Beat, Bye, Declined, Identity, Note, OutOfReach, Tripped
 from .phases import Phase
@@ -191,7 +191,7 @@ class Session:
         counts = self.counts
         counts.samples += 1
         if self._last is not None:
-            counts.lost += max((sample.time_us - self._last.time_us) // 2000 - 1, 0)
+            counts.lost += max((sample.time_us - self._last.time_us) // PERIOD_US - 1, 0)
         self._last = sample
         lead = now - sample.time_us / 1e6
         self._lead = min(self._lead + DRIFT_S, lead)

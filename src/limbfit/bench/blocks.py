@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
-from ..mesh import Mesh, boundary_faces, to_tet10
+from ..indentation import SiteModel
+from ..mesh import Mesh, boundary_faces, to_tet10, write_vtu
+from ..study import SolverTable
 
 Array = NDArray[np.float64]
 # Kuhn's six tetrahedra of a box whose corners are numbered 4 i + 2 j + k.
@@ -29,6 +33,25 @@ def punched_block(element: str, divisions: int) -> Problem:
         contact_faces=mesh.face_sets["skin"],
         indenter=Indenter("square", 20.0, 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
         history=History(np.array([0.0, ramp, 2 * ramp]), np.array([0.0, INDENTATION, 0.0])),
+        element=element,
+    )
+
+
+def block_site(
+    name: str, file: Path, mesh: Mesh, depth_mm: float, steps: SolverTable | None = None, element: str = ""
+) -> SiteModel:
+    """A site in the middle of a block's top, its mesh stored in ``file``; in and out at the usual speed."""
+    write_vtu(mesh, file)
+    ramp = depth_mm / SPEED
+    return SiteModel(
+        name=name,
+        mesh=file,
+        mesh_digest=name,
+        position=(0.0, 0.0, 0.0),
+        axis=(0.0, 0.0, -1.0),
+        knots_s=(0.0, ramp, 2 * ramp),
+        knots_mm=(0.0, depth_mm, 0.0),
+        steps=steps or SolverTable(),
         element=element,
     )
 

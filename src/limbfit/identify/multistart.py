@@ -37,9 +37,10 @@ class Started:
 
 @dataclass(frozen=True)
 class Multistart:
-    """The best calibration and what came of every start, in their order."""
+    """The best calibration, the number of its start, and what came of every start, in their order."""
 
     best: Calibration
+    number: int
     starts: tuple[Started, ...]
 
     @property
@@ -82,13 +83,12 @@ def multistart(
                 raise
             found.append(None)
             reasons.append(str(error))
-    ended = [one for one in found if one is not None]
+    ended = [(number, one) for number, one in enumerate(found) if one is not None]
     if not ended:
         raise CalibrationError(f"none of {count} starts can be simulated: {reasons[0]}")
-    best = min(ended, key=lambda one: one.cost)
-    return Multistart(
-        best, tuple(_started(s, one, best, why) for s, one, why in zip(starts, found, reasons, strict=True))
-    )
+    number, best = min(ended, key=lambda pair: pair[1].cost)
+    told = (_started(s, one, best, why) for s, one, why in zip(starts, found, reasons, strict=True))
+    return Multistart(best, number, tuple(told))
 
 
 def _started(start: Array, one: Calibration | None, best: Calibration, reason: str) -> Started:

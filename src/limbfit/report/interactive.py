@@ -202,8 +202,7 @@ def convergence_curves(store: Store) -> Interactive | None:
             {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for _, step in steps]}
             for tissue in store.tissues
         ]
-        unit = UNITS[name] if UNITS[name] != "–" else "–"
-        panels.append({"title": SYMBOLS[name], "unit": unit, "log": False, "series": series})
+        panels.append({"title": SYMBOLS[name], "unit": UNITS[name], "log": False, "series": series})
     caption = "The same, to read values from; iterates are counted through all stages."
     return Interactive(
         "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": panels}

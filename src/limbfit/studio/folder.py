@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..pipeline.store import Store
+from ..pipeline.store import Store, read_json
 from ..study import Study, load_study
 
 
@@ -67,6 +67,11 @@ class StudyFolder:
             "labels": fingerprint(results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")),
             "log": fingerprint([*logs, *work]),
         }
+
+
+def stored(file: Path) -> dict[str, Any]:
+    """What a JSON artefact holds; empty where there is none."""
+    return dict(read_json(file)) if file.is_file() else {}
 
 
 def fingerprint(files: Iterable[Path]) -> str:

@@ -134,7 +134,7 @@ def _last(log: Path, is_running: bool) -> dict[str, Any]:
     return {
         "what": events[0].get("what") if events else None,
         "state": end,
-        "error": events[-1].get("text") if end in ("failed",) else None,
+        "error": events[-1].get("text") if end == "failed" else None,
         "began": events[0]["time"] if events else None,
         "now": {key: progress[-1].get(key) for key in keys} if progress else None,
         "lines": [

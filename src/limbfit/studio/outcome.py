@@ -12,8 +12,8 @@ from typing import Any
 from ..errors import InputError, RunError
 from ..pipeline import export_study
 from ..pipeline.stages.traces import read_curves
-from ..pipeline.store import read_json, write_json
-from .folder import StudyFolder
+from ..pipeline.store import write_json
+from .folder import StudyFolder, stored
 from .study_routes import stages_of_folder
 
 KEPT, ABOUT = "kept", "kept.json"
@@ -37,7 +37,7 @@ def outcome_of(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
     kept : name of a kept run; by default the study's own results.
     """
     place = folder.results if kept is None else _kept(folder, kept)
-    calibration, predicted = (_read(place / name) for name in _FILES)
+    calibration, predicted = (stored(place / name) for name in _FILES)
     uncertainty = calibration.get("uncertainty") or {}
     return {
         "stages": [
@@ -53,10 +53,6 @@ def outcome_of(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
         ],
         "means": {key: value for key, value in predicted.items() if key.endswith("_percent")},
     }
-
-
-def _read(file: Path) -> dict[str, Any]:
-    return dict(read_json(file)) if file.is_file() else {}
 
 
 def curves_of(folder: StudyFolder, site: str, kept: str | None = None) -> dict[str, list[float]]:
@@ -78,7 +74,7 @@ def curves_of(folder: StudyFolder, site: str, kept: str | None = None) -> dict[s
 def kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     """``name`` and ``since`` of the runs that were kept, newest first."""
     found = [
-        {"name": file.parent.name, "since": _read(file).get("since", "")}
+        {"name": file.parent.name, "since": stored(file).get("since", "")}
         for file in (folder.results / KEPT).glob(f"*/{ABOUT}")
     ]
     return sorted(found, key=lambda row: str(row["since"]), reverse=True)

@@ -14,10 +14,9 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from ..errors import InputError
 from ..mesh import read_grid, read_vtu
 from ..pipeline.stages.traces import read_curves
-from ..pipeline.store import read_json
 from ..web.arrays import pack
 from ..web.shapes import volume_of
-from .folder import StudyFolder
+from .folder import StudyFolder, stored
 
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
 
@@ -57,8 +56,7 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     found = []
     moments = _moments(folder, site)
     if moments:
-        summary = folder.results / "simulate" / f"{site}.json"
-        origin = read_json(summary).get("parameters_from") if summary.is_file() else None
+        origin = stored(folder.results / "simulate" / f"{site}.json").get("parameters_from")
         found.append(
             {
                 "source": "simulate",

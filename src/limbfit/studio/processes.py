@@ -1,24 +1,21 @@
 """Runs of the study as processes of their own: started, found again after a restart, and stopped.
 
-A run is ``limbfit run STUDY`` in its own session, so that it lives on when the server ends. Whether one runs
-is what the study's lock says, whoever started it; what it does is what its log says.
+A run is ``limbfit run STUDY``. Whether one runs is what the study's lock says, whoever started it; what it
+does is what its log says.
 """
 
 from __future__ import annotations
 
 import re
-import signal
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import psutil
 
 from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
+from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder
 
 try:
@@ -54,16 +51,12 @@ def _is_held(file: Path) -> bool:
 
 def starting(folder: StudyFolder) -> int | None:
     """The process that was started here for a run and does not hold the study yet; None where none is."""
-    wanted = _command(folder)
-    for process in psutil.process_iter(["cmdline", "status"]):
-        words = process.info["cmdline"] or []
-        if words[1 : len(wanted)] == wanted[1:] and process.info["status"] != psutil.STATUS_ZOMBIE:
-            return process.pid
-    return None
+    found = find_command(_command(folder))
+    return None if found is None else found[0]
 
 
 def _command(folder: StudyFolder) -> list[str]:
-    return [sys.executable, "-m", "limbfit", "run", str(folder.file.resolve())]
+    return [*PROGRAM, "run", str(folder.file.resolve())]
 
 
 def start_run(
@@ -88,16 +81,7 @@ def start_run(
             raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
     options = [*(["--until", until] if until else []), *(["--from", start] if start else [])]
     options += [word for name in force for word in ("--force", name)]
-    process = subprocess.Popen(
-        [*_command(folder), *options],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        cwd=folder.folder,
-        start_new_session=True,
-    )
-    Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
-    return {"process": process.pid}
+    return {"process": start_command([*_command(folder), *options], folder.folder)}
 
 
 def stop_run(folder: StudyFolder) -> dict[str, Any]:
@@ -120,7 +104,7 @@ def stop_run(folder: StudyFolder) -> dict[str, Any]:
             raise RunError(
                 f"process {process.pid}, which holds this study, is no limbfit command; end it where it runs"
             )
-        process.send_signal(signal.SIGINT)
+        interrupt(process.pid)
     except psutil.Error:
         raise RunError(f"process {holder['process']} cannot be interrupted; end it where it runs") from None
     return holder

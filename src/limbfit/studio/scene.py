@@ -14,11 +14,10 @@ from ..anatomy.surfaces import Anatomy, load_anatomy
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
 from ..pipeline.stages.geometry import given_anatomy, place_site
-from ..pipeline.store import read_json
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, cell_quality, interface, patient_frame, volume_of
-from .folder import StudyFolder
+from .folder import StudyFolder, stored
 
 SKIN = "skin"
 
@@ -37,21 +36,17 @@ def scene_of(folder: StudyFolder) -> dict[str, Any]:
     """
     study = folder.load()
     anatomy = anatomy_of(folder, study)
-    stored = {row["site"]: row for row in _stored(folder, "sites", "sites.json").get("sites", [])}
-    meshes = _stored(folder, "mesh", "mesh.json")
+    rows = stored(folder.results / "sites" / "sites.json").get("sites", [])
+    placed = {row["site"]: row for row in rows}
+    meshes = stored(folder.results / "mesh" / "mesh.json")
     return {
         "surfaces": [] if anatomy is None else [SKIN, *anatomy.bones],
         "frame": patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
-        "sites": [_site_row(site, study, anatomy, stored.get(site.name)) for site in study.sites],
+        "sites": [_site_row(site, study, anatomy, placed.get(site.name)) for site in study.sites],
         "meshes": [site.name for site in study.sites if _mesh_file(folder, site.name) is not None],
         "layers": list(study.tissues[:-1]),
         "quality": meshes.get("sites", {}),
     }
-
-
-def _stored(folder: StudyFolder, stage: str, name: str) -> dict[str, Any]:
-    file = folder.results / stage / name
-    return dict(read_json(file)) if file.is_file() else {}
 
 
 def _mesh_file(folder: StudyFolder, site: str) -> Path | None:
@@ -60,7 +55,7 @@ def _mesh_file(folder: StudyFolder, site: str) -> Path | None:
 
 
 def _site_row(
-    site: Site, study: Study, anatomy: Anatomy | None, stored: Mapping[str, Any] | None
+    site: Site, study: Study, anatomy: Anatomy | None, placed: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     row: dict[str, Any] = {
         "name": site.name,
@@ -74,7 +69,6 @@ def _site_row(
         "problem": None,
     }
     try:
-        placed = stored
         if site.position is not None:
             placed = None if anatomy is None else place_site(site, study, anatomy, None)
         if placed is None:

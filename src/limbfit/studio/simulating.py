@@ -6,38 +6,30 @@ what it has reached by the files that it writes after every step.
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import psutil
 
 from ..errors import RunError
 from ..pipeline.journal import discreet
+from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder
 from .processes import running
 
-PROGRAM = ("-m", "limbfit")
 _SAID = 400  # characters of what a failed simulation said that are told
 
 
 def simulating(folder: StudyFolder) -> dict[str, Any] | None:
     """``process`` and ``site`` of the simulation that this study has running; None where it has none."""
     begin = _words(folder)
-    for process in psutil.process_iter(["pid", "cmdline", "status"]):
-        words = process.info["cmdline"] or []
-        if words[1 : len(begin)] == begin[1:] and process.info["status"] != psutil.STATUS_ZOMBIE:
-            return {"process": process.info["pid"], "site": words[len(begin)]}
-    return None
+    found = find_command(begin)
+    return None if found is None else {"process": found[0], "site": found[1][len(begin)]}
 
 
 def _words(folder: StudyFolder) -> list[str]:
-    file = str(folder.file.resolve())
-    return [sys.executable, *PROGRAM, "simulate", file, "--animation", "--site"]
+    return [*PROGRAM, "simulate", str(folder.file.resolve()), "--animation", "--site"]
 
 
 def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
@@ -56,16 +48,8 @@ def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
         raise RunError(f"process {holder['process']} works on this study; stop it first, or wait for it")
     _said_file(folder, name).parent.mkdir(parents=True, exist_ok=True)
     with _said_file(folder, name).open("wb") as said:
-        process = subprocess.Popen(
-            [*_words(folder), name],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            cwd=folder.folder,
-            start_new_session=True,
-        )
-    Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
-    return {"process": process.pid, "site": name}
+        process = start_command([*_words(folder), name], folder.folder, said)
+    return {"process": process, "site": name}
 
 
 def _said_file(folder: StudyFolder, site: str) -> Path:
@@ -84,7 +68,7 @@ def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
     if found is None:
         raise RunError("no simulation goes on: there is nothing to stop")
     with suppress(psutil.NoSuchProcess):  # it has ended meanwhile
-        psutil.Process(found["process"]).send_signal(signal.SIGINT)
+        interrupt(found["process"])
     return found
 
 

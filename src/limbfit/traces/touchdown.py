@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import TraceError
-from .displacement import broken_line
+from .displacement import BrokenLine, broken_line
 from .numerics import Array, bins, noise_level
 from .record import MIN_SAMPLES, Trace
 
@@ -48,7 +48,10 @@ def find_touch_down(trace: Trace) -> TouchDown:
     TraceError
         Where the force does not rise on the way in.
     """
-    line = broken_line(trace.time_s, trace.displacement_mm)
+    return _from_onset(trace, broken_line(trace.time_s, trace.displacement_mm))
+
+
+def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
     load = trace.time_s <= line.peak_s
     # Counting travel along the fitted line keeps the noise of the displacement sensor out of the abscissa.
     travel, force = line(trace.time_s[load]), trace.force_N[load]
@@ -87,7 +90,7 @@ def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
             place="touch_down_s",
             remedy=f"give a time from {first:.3f} s to before {last:.3f} s",
         )
-    return replace(find_touch_down(trace), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
+    return replace(_from_onset(trace, line), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def _measured(record: SiteRecord) -> Measured:
 def _forces(
     context: Context, cache: SimulationCache, records: Sequence[SiteRecord], parameters: Array
 ) -> list[SiteResponse]:
-    """Forces on the study's own meshes; with derivatives where a calibration on them has made them so."""
+    """Forces on the study's own meshes; with derivatives where the study's prediction has made them so."""
     searched = context.study.mesh.coarse is None
     jobs = [record.job(parameters, sensitivities=searched) for record in records]
     none = np.zeros((0, 0))

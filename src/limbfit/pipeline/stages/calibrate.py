@@ -165,8 +165,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     def run(number: int, start: Unknowns) -> Calibration:
         if number:
             context.tell("calibrate", 0, 0, f"start {number + 1} of {table.starts}")
-        found, rounds = laboratory.identify(start, stages)
-        rounds_of[id(found)] = rounds
+        found, rounds_of[number] = laboratory.identify(start, stages)
         return found
 
     tried = multistart(run, unknowns(study), table.starts, table.seed)
@@ -175,7 +174,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     known = estimate_uncertainty(
         found.parameters, found.responses, laboratory.measured, unknowns(study), noise, stages[-1]
     )
-    rounds = rounds_of[id(found)]
+    rounds = rounds_of[tried.number]
     laboratory.answer(found.parameters)
     content = _calibration_record(context, found, known, laboratory)
     content |= {

@@ -19,6 +19,7 @@ from ...indentation import (
     Simulation,
     SimulationJob,
     SiteModel,
+    rested_fields,
     simulate_fields,
     to_parameters,
     to_vector,
@@ -43,7 +44,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
-    jobs = _jobs(context, records, best, one if len(found) > 1 else None)
+    jobs = _jobs(context, records, best, _one_material(calibration, study.tissues))
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
@@ -69,18 +70,36 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     return {}
 
 
+def _one_material(calibration: dict[str, Any], tissues: Sequence[str]) -> tuple[Array, Array | None] | None:
+    """The answer with one material, where the calibration started its simulation; None where it is best."""
+    stage, *others = calibration["stages"]
+    if not others:
+        return None
+    guess = stage["iterations"][-1]["first_guess"]
+    return to_vector(stage["parameters"], tissues), None if guess is None else to_vector(guess, tissues)
+
+
 def _jobs(
-    context: Context, records: Sequence[SiteRecord], best: Array, one: Array | None
+    context: Context,
+    records: Sequence[SiteRecord],
+    best: Array,
+    simple: tuple[Array, Array | None] | None,
 ) -> list[SimulationJob]:
     """Every record with all materials, then with one (unless None), then on coarse meshes where there are.
 
-    With coarse meshes derivatives are theirs, and so is the one material's force at held-out sites; at the
-    fitted ones the calibration has simulated it already. Without, one material's simulation starts from that
-    with all, which has just been done.
+    At the fitted sites the calibration has simulated the one material already. With coarse meshes derivatives
+    are theirs, and so is the one material's force at held-out sites; without, its simulation there starts
+    from that with all, which has just been done.
     """
+    one, guess = (None, None) if simple is None else simple
     if context.study.mesh.coarse is None:
-        simple = [] if one is None else [r.job(one, sensitivities=False, start=best) for r in records]
-        return [record.job(best) for record in records] + simple
+        jobs = [record.job(best) for record in records]
+        if one is not None:
+            jobs += [
+                r.job(one, start=guess) if r.site.fitted else r.job(one, sensitivities=False, start=best)
+                for r in records
+            ]
+        return jobs
     coarse = [site_record(context, record.site, coarse=True) for record in records]
     jobs = [record.job(best, sensitivities=False) for record in records]
     if one is not None:
@@ -105,7 +124,7 @@ def _fine_force(simple: Simulation, fine: Simulation, coarse: Simulation) -> Sim
 
 @dataclass(frozen=True)
 class FieldJob:
-    """Fields at the deepest point of a site, to be computed and stored by a worker; see `simulate_fields`."""
+    """Fields at the deepest point of a site, to be stored by a worker; ``kept``: of what it has simulated."""
 
     model: SiteModel
     parameters: Parameters
@@ -114,7 +133,7 @@ class FieldJob:
 
 
 def store_fields(job: FieldJob) -> str:
-    simulate_fields(job.model, job.parameters, job.file, kept=job.kept)
+    (rested_fields if job.kept else simulate_fields)(job.model, job.parameters, job.file)
     return job.model.name
 
 

@@ -1,0 +1,56 @@
+"""``limbfit`` commands as processes of their own: found by their command line, started, interrupted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Thread
+from typing import IO
+
+import psutil
+
+from ..execution import SAFE_PATH
+
+PROGRAM = ("-m", "limbfit")  # for this Python
+
+
+def find_command(begin: Sequence[str]) -> tuple[int, list[str]] | None:
+    """The process whose words after the interpreter begin with ``begin``, and those words; None if none."""
+    for process in psutil.process_iter(["pid", "cmdline", "status"]):
+        words = (process.info["cmdline"] or [])[1:]
+        if words[: len(begin)] == list(begin) and process.info["status"] != psutil.STATUS_ZOMBIE:
+            return process.info["pid"], words
+    return None
+
+
+def start_command(words: Sequence[str], folder: Path, stderr: int | IO[bytes] = subprocess.DEVNULL) -> int:
+    """Start this Python with ``words`` in a session of its own, so that it lives on when the server ends.
+
+    It is started in ``folder``, but takes no code from there. Returns its process number.
+    """
+    process = subprocess.Popen(
+        [sys.executable, *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=stderr,
+        cwd=folder,
+        env=os.environ | SAFE_PATH,
+        start_new_session=True,
+    )
+    Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
+    return process.pid
+
+
+def interrupt(process: int) -> None:
+    """What Ctrl-C in its terminal would do.
+
+    Raises
+    ------
+    psutil.Error
+        Where there is no such process, or it belongs to somebody else.
+    """
+    psutil.Process(process).send_signal(signal.SIGINT)

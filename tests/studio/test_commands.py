@@ -1,0 +1,36 @@
+"""Commands that the studio starts: in the study's folder, without running what lies there."""
+
+from __future__ import annotations
+
+import time
+
+import psutil
+
+from limbfit.studio.commands import find_command, interrupt, start_command
+
+
+def ended(process, within_s=60.0):
+    until = time.monotonic() + within_s
+    while psutil.pid_exists(process) and psutil.Process(process).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_no_code_of_the_folder_is_run(tmp_path):
+    for name in ("limbfit", "psutil", "typer"):
+        (tmp_path / f"{name}.py").write_text("open('ran', 'w').close()")
+    with (tmp_path / "said").open("wb") as said:
+        ended(start_command(["-m", "limbfit", "--version"], tmp_path, said))
+    assert not (tmp_path / "ran").exists()
+    assert b"Traceback" not in (tmp_path / "said").read_bytes()
+
+
+def test_a_command_is_found_and_interrupted(tmp_path):
+    words = ["-c", "import time; time.sleep(600)", str(tmp_path)]
+    process = start_command([*words, "more"], tmp_path)
+    while find_command(words) is None:
+        time.sleep(0.05)
+    assert find_command(words) == (process, [*words, "more"])
+    interrupt(process)
+    ended(process)
+    assert find_command(words) is None
