@@ -43,13 +43,13 @@ def skin_points(study, count):
 
 def test_the_scene_has_surfaces_and_every_site(page):
     scene = page.get("/api/model/scene").json()
-    assert scene["surfaces"] == ["skin", "tibia"]
+    assert list(scene["surfaces"]) == ["skin", "tibia"]
     assert [site["name"] for site in scene["sites"]] == ["1", "2"]
     first = scene["sites"][0]
     assert first["fitted"]
     assert np.linalg.norm(np.subtract(first["position_mm"], [40.0, 0.0, 60.0])) < 5
     assert first["axis"][0] < -0.9  # into the limb
-    assert scene["meshes"] == []
+    assert scene["meshes"] == {}
     np.testing.assert_allclose(scene["frame"], np.eye(3), atol=1e-12)
 
 
@@ -147,7 +147,9 @@ def _meshed(study) -> Mesh:
 def test_a_mesh_is_sent_with_the_quality_of_its_cells(page, study):
     mesh = _meshed(study)
     scene = page.get("/api/model/scene").json()
-    assert scene["meshes"] == ["1"]
+    assert list(scene["meshes"]) == ["1"]
+    write_vtu(mesh, study / "results" / "mesh" / "1.vtu")
+    assert page.get("/api/model/scene").json()["meshes"] != scene["meshes"]  # made anew: to be read again
     assert scene["quality"]["1"]["min_dihedral_deg"] == 54.7
     arrays, facts = unpack(page.get("/api/model/mesh/1").content)
     assert facts["regions"] == ["skin", "muscle"]

@@ -16,6 +16,7 @@ from ..web.assets import STATIC as SHARED
 from . import (
     identification_routes,
     image_routes,
+    live_routes,
     model_routes,
     results_routes,
     study_routes,
@@ -30,6 +31,7 @@ ROUTES = (
     image_routes,
     model_routes,
     traces_routes,
+    live_routes,
     identification_routes,
     results_routes,
 )

@@ -45,7 +45,7 @@ def edit_study(file: Path, change: Callable[[tomlkit.TOMLDocument], None]) -> St
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
             stream.write(tomlkit.dumps(document))
         try:
-            load_study(written)
+            load_study(written, recorded=False)
         except StudyError as error:
             raise StudyError(error.what, file=file, place=error.place, remedy=error.remedy) from None
         os.chmod(written, file.stat().st_mode & 0o777)
@@ -53,7 +53,7 @@ def edit_study(file: Path, change: Callable[[tomlkit.TOMLDocument], None]) -> St
     except BaseException:
         written.unlink(missing_ok=True)
         raise
-    return load_study(file)
+    return load_study(file, recorded=False)
 
 
 def set_site(file: Path, site: str, values: Mapping[str, Any]) -> Study:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..pipeline.acquire import FOLDER as ACQUIRED
 from ..pipeline.store import Store, read_json
 from ..study import Study, load_study
 
@@ -32,7 +33,8 @@ class StudyFolder:
         return Store(self.results)
 
     def load(self) -> Study:
-        return load_study(self.file)
+        """The study as it stands; records may be yet to be made."""
+        return load_study(self.file, recorded=False)
 
     def artefact(self, *parts: str) -> Path:
         """A file under ``results/`` by the parts of its path; each part is a plain name.
@@ -44,17 +46,7 @@ class StudyFolder:
         FileNotFoundError
             Where there is none.
         """
-        for part in parts:
-            is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
-            if not is_plain or part.startswith("."):
-                raise InputError("not the name of a file of the study", remedy="names have no path in them")
-        path = self.results.joinpath(*parts)
-        inside = self.results.resolve()
-        if not path.resolve().is_relative_to(inside):
-            raise InputError("the file lies outside of the study's results")
-        if not path.is_file():
-            raise FileNotFoundError("/".join(parts))
-        return path
+        return inside(self.results, *parts)
 
     def changes(self) -> dict[str, str]:
         """A fingerprint of each thing that a page may have to read again."""
@@ -66,7 +58,22 @@ class StudyFolder:
             "stages": fingerprint([*sorted(results.glob("*/stage.json")), *sorted(results.glob(".work-*"))]),
             "labels": fingerprint(results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")),
             "log": fingerprint([*logs, *work]),
+            "acquired": fingerprint(sorted(self.folder.glob(f"{ACQUIRED}/*/*"))),
         }
+
+
+def inside(root: Path, *parts: str) -> Path:
+    """A file below a folder by the parts of its path; see `StudyFolder.artefact` for the errors."""
+    for part in parts:
+        is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
+        if not is_plain or part.startswith("."):
+            raise InputError("not the name of a file of the study", remedy="names have no path in them")
+    path = root.joinpath(*parts)
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise InputError(f"the file lies outside of {root.name}")
+    if not path.is_file():
+        raise FileNotFoundError("/".join(parts))
+    return path
 
 
 def stored(file: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from ..mesh import read_grid, read_vtu
 from ..pipeline.stages.traces import read_curves
 from ..web.arrays import pack
 from ..web.shapes import volume_of
-from .folder import StudyFolder, stored
+from .folder import StudyFolder, fingerprint, stored
 
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
 
@@ -51,7 +51,7 @@ FIELDS = {
 def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     """What can be shown of a site: every step of a simulation, or the deepest point of the prediction.
 
-    Each has ``source``, ``title``, ``times_s`` and ``parameters_from``.
+    Each has ``source``, ``title``, ``times_s``, ``parameters_from``, and ``mark``, which other fields change.
     """
     found = []
     moments = _moments(folder, site)
@@ -63,15 +63,20 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
                 "title": "every step, simulated",
                 "times_s": [time for time, _ in moments],
                 "parameters_from": origin,
+                "mark": fingerprint(file for _, file in moments),
             }
         )
-    if (folder.results / "predict" / f"{site}.vtu").is_file():
-        peak = {
-            "source": "predict",
-            "title": "the deepest point, predicted",
-            "parameters_from": "identified",
-        }
-        found.append(peak | {"times_s": [_peak_time(folder, site)]})
+    predicted = folder.results / "predict" / f"{site}.vtu"
+    if predicted.is_file():
+        found.append(
+            {
+                "source": "predict",
+                "title": "the deepest point, predicted",
+                "times_s": [_peak_time(folder, site)],
+                "parameters_from": "identified",
+                "mark": fingerprint([predicted]),
+            }
+        )
     return found
 
 

@@ -15,6 +15,7 @@ import psutil
 
 from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
+from ..study import load_study
 from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder
 
@@ -67,11 +68,11 @@ def start_run(
     Raises
     ------
     InputError
-        Where the study cannot be read or a stage does not exist.
+        Where the study cannot be read, a record is yet to be made, or a stage does not exist.
     RunError
         Where a run holds the study.
     """
-    folder.load()
+    load_study(folder.file)
     holder = running(folder)
     busy = starting(folder) if holder is None else holder["process"]
     if busy is not None:

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 
 from ..anatomy.sites import project_to_skin
-from ..anatomy.surfaces import Anatomy, load_anatomy
+from ..anatomy.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
 from ..pipeline.stages.geometry import given_anatomy, place_site
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, cell_quality, interface, patient_frame, volume_of
-from .folder import StudyFolder, stored
+from .folder import StudyFolder, fingerprint, stored
 
 SKIN = "skin"
 
 
 def anatomy_of(folder: StudyFolder, study: Study) -> Anatomy | None:
     """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
-    if (folder.results / "surfaces" / "surfaces.json").is_file():
+    if _is_made(folder):
         return load_anatomy(folder.results / "surfaces")
     return None if study.surfaces is None else given_anatomy(study)
 
@@ -32,7 +32,8 @@ def anatomy_of(folder: StudyFolder, study: Study) -> Anatomy | None:
 def scene_of(folder: StudyFolder) -> dict[str, Any]:
     """Surfaces by name, the patient's sides, every site as the study file has it now, and what is meshed.
 
-    A site without a place (not matched to a marker yet, or off the skin) has ``problem`` in words.
+    A site without a place (not matched to a marker yet, or off the skin) has ``problem`` in words. Surfaces
+    and meshes come with fingerprints, so that the page reads again only what was made anew.
     """
     study = folder.load()
     anatomy = anatomy_of(folder, study)
@@ -40,13 +41,35 @@ def scene_of(folder: StudyFolder) -> dict[str, Any]:
     placed = {row["site"]: row for row in rows}
     meshes = stored(folder.results / "mesh" / "mesh.json")
     return {
-        "surfaces": [] if anatomy is None else [SKIN, *anatomy.bones],
+        "surfaces": {} if anatomy is None else _surface_marks(folder, study, anatomy),
         "frame": patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
         "sites": [_site_row(site, study, anatomy, placed.get(site.name)) for site in study.sites],
-        "meshes": [site.name for site in study.sites if _mesh_file(folder, site.name) is not None],
+        "meshes": {
+            site.name: fingerprint([file])
+            for site in study.sites
+            if (file := _mesh_file(folder, site.name)) is not None
+        },
         "layers": list(study.tissues[:-1]),
         "quality": meshes.get("sites", {}),
     }
+
+
+def _surface_marks(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
+    if _is_made(folder):
+        files = {name: _surface_file(folder, name) for name in (SKIN, *anatomy.bones)}
+    else:
+        assert study.surfaces is not None
+        files = {SKIN: study.surfaces.skin, **study.surfaces.bones}
+        files = {name: study.path(file) for name, file in files.items()}
+    return {name: fingerprint([file]) for name, file in files.items()}
+
+
+def _is_made(folder: StudyFolder) -> bool:
+    return (folder.results / "surfaces" / "surfaces.json").is_file()
+
+
+def _surface_file(folder: StudyFolder, name: str) -> Path:
+    return folder.artefact("surfaces", f"{name}.stl" if name == SKIN else f"bone-{name}.stl")
 
 
 def _mesh_file(folder: StudyFolder, site: str) -> Path | None:
@@ -88,12 +111,19 @@ def surface_block(folder: StudyFolder, name: str) -> bytes:
     InputError
         For a name that the model does not have.
     """
-    anatomy = anatomy_of(folder, folder.load())
-    found = {} if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}
-    if name not in found:
+    surface = _surface(folder, name)
+    if surface is None:
         raise InputError("the model has no such surface", remedy="run the stages until surfaces")
-    surface = found[name]
     return _shell_block(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
+
+
+def _surface(folder: StudyFolder, name: str) -> Surface | None:
+    """One surface; of stored ones only its file is read."""
+    if _is_made(folder):
+        bones = stored(folder.results / "surfaces" / "surfaces.json").get("bones", ())
+        return read_surface(_surface_file(folder, name)) if name == SKIN or name in bones else None
+    anatomy = anatomy_of(folder, folder.load())
+    return None if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}.get(name)
 
 
 def _shell_block(shell: Shell) -> bytes:

@@ -6,8 +6,8 @@
 //   context.api.get(path), .post(path, body), .bytes(path), .url(path)   paths below /api
 //   context.study             the study as GET /api/study tells it; always the newest
 //   context.stages, .run      rows of `limbfit status`, and the run that goes on or null
-//   context.on(listener)      listener({ study, stages, labels, log, run, theme }), true for what changed;
-//                             returns a function that ends it
+//   context.on(listener)      listener({ study, stages, labels, log, acquired, run, theme }), true for what changed;
+//                             a hidden view is told of it when it is shown again
 //   context.say(text)         a line at the bottom, read out too;  context.warn(text) one that stays
 //   context.refresh()         ask for changes at once
 // Nothing is kept here that is not in the study's files.
@@ -21,9 +21,8 @@ const VIEWS = [
   ["identification", "Identification"],
   ["results", "Results"],
 ];
-const TOPICS = ["study", "stages", "labels", "log"];
+const TOPICS = ["study", "stages", "labels", "log", "acquired"];
 const EVERY_MS = 1000;
-const listeners = new Set();
 const mounted = new Map();
 let seen = null;
 
@@ -32,10 +31,6 @@ const context = {
   study: null,
   stages: [],
   run: null,
-  on(listener) {
-    listeners.add(listener);
-    return () => listeners.delete(listener);
-  },
   say(text) {
     document.getElementById("status").textContent = text;
   },
@@ -71,7 +66,7 @@ async function poll(now = false) {
 async function tell(changed) {
   try {
     if (changed.study || context.study === null) context.study = await api.get("study");
-    if (changed.study || changed.stages || changed.labels || changed.run) {
+    if (changed.study || changed.stages || changed.labels || changed.acquired || changed.run) {
       const found = await api.get("stages");
       [context.stages, context.run] = [found.stages, found.run];
     }
@@ -81,7 +76,22 @@ async function tell(changed) {
     seen = null;
   }
   head();
-  for (const listener of [...listeners]) listener(changed);
+  tellViews(changed);
+}
+
+/** The view that is seen hears at once; for the others it is kept, so that nothing is read that nobody looks at. */
+function tellViews(changed) {
+  for (const one of mounted.values()) {
+    for (const [topic, is] of Object.entries(changed)) one.missed[topic] ||= is;
+    tellMissed(one);
+  }
+}
+
+function tellMissed(one) {
+  if (one.name !== context.view || !one.view) return;
+  const { missed } = one;
+  one.missed = {};
+  if (Object.values(missed).some(Boolean)) for (const listener of one.listeners) listener(missed);
 }
 
 function offline(text) {
@@ -122,14 +132,18 @@ async function open(name) {
   if (known) {
     known.element.hidden = false;
     known.view?.show?.();
+    tellMissed(known);
     return;
   }
   const element = el("section", { class: `view ${name}`, role: "tabpanel", id: `panel-${name}`, "aria-labelledby": `tab-${name}` });
   main.append(element);
-  mounted.set(name, { name, element });
+  const made = { name, element, listeners: new Set(), missed: {} };
+  mounted.set(name, made);
+  const own = Object.create(context, { on: { value: (listener) => made.listeners.add(listener) } });
   try {
     const module = await import(`/static/views/${name}.js`);
-    mounted.get(name).view = await module.mount(element, context);
+    made.view = (await module.mount(element, own)) ?? {};
+    tellMissed(made);
   } catch (error) {
     replace(element, el("p", { class: "failed" }, `This view does not open: ${error.message}`));
     console.error(error);
@@ -174,11 +188,11 @@ function tabs() {
 function theme() {
   const system = matchMedia("(prefers-color-scheme: dark)");
   const button = document.getElementById("theme");
-  const set = (dark, tellViews = true) => {
+  const set = (dark, begun = true) => {
     document.documentElement.dataset.theme = dark ? "dark" : "light";
     button.textContent = dark ? "Light" : "Dark";
     button.setAttribute("aria-label", dark ? "Use light colours" : "Use dark colours");
-    if (tellViews) for (const listener of [...listeners]) listener({ theme: true });
+    if (begun) tellViews({ theme: true });
   };
   const kept = localStorage.getItem("limbfit-theme");
   set(kept ? kept === "dark" : system.matches, false);

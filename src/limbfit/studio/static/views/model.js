@@ -16,10 +16,8 @@ const QUALITIES = {
 
 export async function mount(element, context) {
   const view = new ModelView(element, context);
-  await view.refresh(true);
-  context.on((changed) => {
-    if (changed.study || changed.stages) view.refresh(Boolean(changed.stages));
-  });
+  await view.refresh();
+  context.on((changed) => (changed.study || changed.stages) && view.refresh());
   return { show: () => view.viewer?.resize() };
 }
 
@@ -62,55 +60,74 @@ class ModelView {
     this.meshPanel.hidden = true;
   }
 
-  /** Read the scene again; surfaces only where stages changed. */
-  async refresh(all) {
+  async refresh() {
     const turn = ++this.reading;
     try {
       const scene = await this.context.api.get("model/scene");
       if (turn !== this.reading) return;
-      await this.take(scene, all);
+      await this.take(scene);
     } catch (error) {
       this.context.warn(error.message);
     }
   }
 
-  /** Show a scene; surfaces are read where they are new or asked for. */
-  async take(scene, all = false) {
-    const first = this.scene === null || !this.scene.surfaces.length;
+  /** Show a scene; surfaces and meshes are read where they are others than those that are shown. */
+  async take(scene) {
+    const first = this.scene === null || !Object.keys(this.scene.surfaces).length;
     this.scene = scene;
     if (!scene.sites.some((site) => site.name === this.chosen)) this.chosen = scene.sites[0]?.name ?? null;
     this.editor.show();
     this.marks();
     if (this.drawing) {
-      await this.readSurfaces(all);
+      await this.readSurfaces();
       if (first) this.viewer.lookAtAll(scene.frame);
     }
     this.showBoxes();
-    if (all) this.meshOf = null;
     await this.showMesh();
   }
 
-  async readSurfaces(all) {
+  async readSurfaces() {
     const { surfaces, layers, meshes } = this.scene;
-    const wanted = new Map(surfaces.map((name) => [name, { kind: name === "skin" ? "skin" : "bone", path: `surface/${encodeURIComponent(name)}` }]));
-    if (meshes.length) for (const layer of layers) wanted.set(`inner face of ${layer}`, { kind: "layer", path: `layer/${encodeURIComponent(meshes[0])}/${encodeURIComponent(layer)}` });
+    const wanted = new Map(Object.entries(surfaces).map(([name, mark]) => [name, { kind: name === "skin" ? "skin" : "bone", path: `surface/${encodeURIComponent(name)}`, mark }]));
+    const [meshed] = Object.keys(meshes);
+    if (meshed) for (const layer of layers) wanted.set(`inner face of ${layer}`, { kind: "layer", path: `layer/${encodeURIComponent(meshed)}/${encodeURIComponent(layer)}`, mark: meshes[meshed] });
     for (const name of [...this.shapes.keys()]) {
       if (!wanted.has(name)) { this.viewer.setSurface(name, null); this.shapes.delete(name); }
     }
-    await Promise.all([...wanted].map(async ([name, { kind, path }]) => {
-      if (this.shapes.has(name) && !all) return;
-      if (!this.shapes.has(name)) this.shapes.set(name, { kind, shown: kind !== "layer" });
-      const { arrays } = readArrays(await this.context.api.bytes(`model/${path}`));
-      this.viewer.setSurface(name, { points: arrays.points.values, faces: arrays.faces.values, ...SURFACES[kind] });
+    for (const [name, one] of wanted) this.shapes.set(name, { shown: one.kind !== "layer", read: null, ...this.shapes.get(name), ...one });
+    await this.readShown();
+  }
+
+  /** Surfaces that are shown and not read yet, or made anew. */
+  async readShown() {
+    await Promise.all([...this.shapes].filter(([, shape]) => shape.shown && shape.read !== shape.mark).map(async ([name, shape]) => {
+      shape.read = shape.mark;
+      try {
+        const { arrays } = readArrays(await this.context.api.bytes(`model/${shape.path}`));
+        this.viewer.setSurface(name, { points: arrays.points.values, faces: arrays.faces.values, ...SURFACES[shape.kind] });
+      } catch (error) {
+        shape.read = null;
+        throw error;
+      }
     }));
   }
 
   showBoxes() {
     replace(this.shown, ...[...this.shapes].map(([name, shape]) => {
-      const box = el("input", { type: "checkbox", checked: shape.shown, onchange: () => { shape.shown = box.checked; this.showSurfaces(); } });
+      const box = el("input", { type: "checkbox", checked: shape.shown, onchange: () => this.showShape(shape, box.checked) });
       return el("label", { class: "row" }, box, name);
     }));
     if (!this.shapes.size && this.drawing) replace(this.shown, el("p", { class: "hint" }, "There are no surfaces yet: run the stages until surfaces (view Identification)."));
+    this.showSurfaces();
+  }
+
+  async showShape(shape, shown) {
+    shape.shown = shown;
+    try {
+      await this.readShown();
+    } catch (error) {
+      this.context.warn(error.message);
+    }
     this.showSurfaces();
   }
 
@@ -153,13 +170,13 @@ class ModelView {
   }
 
   async showMesh() {
-    const known = this.scene?.meshes.includes(this.chosen);
+    const mark = this.scene?.meshes[this.chosen], known = Boolean(mark);
     this.meshBox.disabled = !known || !this.drawing;
     this.meshTitle.textContent = known ? `mesh of site ${this.chosen}` : `no mesh of site ${this.chosen ?? "–"} is stored`;
     const wanted = known && this.meshBox.checked && this.drawing ? this.chosen : null;
     this.meshPanel.hidden = !wanted;
-    if (wanted !== this.meshOf) {
-      this.meshOf = wanted;
+    if (wanted !== this.meshOf || (wanted && mark !== this.meshMark)) {
+      [this.meshOf, this.meshMark] = [wanted, mark];
       this.viewer?.setMesh(null);
       this.viewer?.setColours(null);
       if (wanted) await this.readMesh(wanted);

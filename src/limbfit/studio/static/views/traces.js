@@ -1,6 +1,7 @@
 // The view Traces: records raw and regularised; touch-down and peak are dragged and stored in the study file.
 import { el, replace } from "/static/dom.js";
 import { HandledChart } from "/static/handles.js";
+import { LivePanel } from "/static/views/live.js";
 
 const TIME = { title: "Time", unit: "s" };
 const FORCE = { title: "Force", unit: "N" };
@@ -9,10 +10,14 @@ const PREVIEW_MS = 250;
 
 export async function mount(element, context) {
   const view = new TracesView(element, context);
+  const live = new LivePanel(view.live, context, (site) => view.choose(site), () => view.refresh());
+  context.on((changed) => changed.acquired && live.look());
+  context.on((changed) => changed.theme && live.draw(true));
+  live.look();
   await view.refresh();
   context.on((changed) => (changed.study || changed.stages) && view.refresh());
   context.on((changed) => changed.theme && view.charts.forEach((chart) => chart.draw()));
-  return {};
+  return { show: () => live.show(), hide: () => live.hide() };
 }
 
 class TracesView {
@@ -23,8 +28,9 @@ class TracesView {
     this.found = { sites: [], flags: [] };
     element.classList.add("split");
     this.side = el("div", { class: "side" });
-    this.area = el("div", { class: "stagearea padded" });
-    element.append(this.side, this.area);
+    this.area = el("div", {});
+    this.live = el("section", { class: "card", id: "live", "aria-label": "The session that is being recorded", hidden: true });
+    element.append(this.side, el("div", { class: "stagearea padded" }, this.live, this.area));
   }
 
   async refresh() {

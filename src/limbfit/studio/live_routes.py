@@ -1,0 +1,141 @@
+"""The session that is being recorded, read from its record while it is written; nothing is commanded here."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query
+from pydantic import BaseModel, ValidationError
+
+from ..acquire import Recording, follow_recording
+from ..acquire.events import PINS
+from ..acquire.phases import FINAL
+from ..errors import TraceError
+from ..pipeline.acquire import FOLDER as ACQUIRED
+from ..pipeline.acquire import RECORD, VERDICT
+from .folder import StudyFolder, inside
+from .study_routes import Folder
+
+router = APIRouter(prefix="/api/live")
+EVERY = 5  # samples: 100 a second
+SILENT_S = 3.0  # blocks come every 50 ms: a record that has not grown for so long is not being written
+RECENT_S = 600.0  # a session that ended longer ago is not shown by itself
+_STAMP = re.compile(r"[0-9]{8}T[0-9]{6}\.[0-9]{3}")
+_WAITING = 1 << 16  # bytes: more than is written between two requests
+_MOST_VERDICT = 1 << 20
+
+
+class Check(BaseModel):
+    """One line of a stored verdict."""
+
+    name: str
+    passed: bool | None
+    found: str
+    remedy: str
+
+
+class Verdict(BaseModel):
+    """A stored verdict; ``trace`` is the record of the site that came of it, where one did."""
+
+    good: bool
+    checks: list[Check]
+    trace: str | None = None
+
+
+@router.get("")
+def get_session(folder: Folder) -> dict[str, Any]:
+    """The newest session that is being recorded, else the newest that ended lately; null if none."""
+    found = [(age, file.parent) for age, file in _records(folder) if age < RECENT_S]
+    if not found:
+        return {"session": None}
+    _, newest = max(found, key=lambda one: (one[0] < SILENT_S, one[1].name))
+    return {"session": {"site": newest.parent.name, "time": newest.name}}
+
+
+@router.get("/{site}/{stamp}")
+def get_part(
+    folder: Folder, site: str, stamp: str, offset: Annotated[int, Query(ge=0, le=1 << 40)] = 0
+) -> dict[str, Any]:
+    """What the record of a session holds beyond ``offset`` (bytes), at most half a minute of it.
+
+    Times in s of limbfit's clock, positions in mm from the pin's home, forces in N, of the test pin.
+    ``offset`` is where to go on, at once where ``more`` is true; ``age_s`` is how long ago the record grew.
+    """
+    file = inside(folder.folder, ACQUIRED, site, stamp, RECORD)
+    age = _age(file)
+    part, following = follow_recording(file, offset, every=EVERY)
+    return {
+        "site": site,
+        "time": stamp,
+        "offset": following,
+        "more": file.stat().st_size - following > _WAITING,
+        "age_s": age,
+        "silent": age > SILENT_S,
+        **_read(part, file, first=offset == 0),
+        "verdict": _verdict(file.with_name(VERDICT)),
+    }
+
+
+def _records(folder: StudyFolder) -> list[tuple[float, Path]]:
+    """Records that were begun, with their ages in s."""
+    found = []
+    for file in (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}"):
+        if _STAMP.fullmatch(file.parent.name) and file.is_file():
+            found.append((_age(file), file))
+    return found
+
+
+def _age(file: Path) -> float:
+    return max(time.time() - file.stat().st_mtime, 0.0)
+
+
+def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
+    try:
+        settings = part.head["settings"]
+        pin, limit_N = range(PINS)[int(settings["pin"]) - 1], float(settings["force_limit_N"])
+        ramps = int(settings["precondition"]) + int(settings["repeats"])
+        phases = [_phase(event) for event in part.events if event["event"] == "phase"]
+        if not math.isfinite(limit_N):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
+        raise TraceError("its head or its events lack what a session has", file=file) from None
+    ended = [one for one in phases if one["phase"] in FINAL]
+    return {
+        "head": {"pin": pin + 1, "force_limit_N": limit_N, "ramps": ramps} if first else None,
+        "phases": phases,
+        "ended": ended[-1] if ended else None,
+        "time_s": _short(part.host_us / 1e6),
+        "position_mm": _short(part.position_um[:, pin] / 1e3),
+        "force_N": _short(part.force_mN[:, pin] / 1e3),
+    }
+
+
+def _phase(event: dict[str, Any]) -> dict[str, Any]:
+    touch = event.get("touch_um")
+    return {
+        "at_s": event["at_us"] / 1e6,
+        "phase": str(event["phase"]),
+        "cycle": int(event["cycle"]),
+        "touch_mm": None if touch is None else int(touch) / 1e3,
+        "reason": str(event.get("reason", "")),
+    }
+
+
+def _verdict(file: Path) -> dict[str, Any] | None:
+    if not file.is_file():
+        return None
+    try:
+        if file.stat().st_size > _MOST_VERDICT:
+            raise ValueError
+        return Verdict.model_validate_json(file.read_bytes()).model_dump()
+    except (ValidationError, ValueError):
+        raise TraceError("not a verdict of limbfit acquire", file=file) from None
+
+
+def _short(values: np.ndarray) -> list[float]:
+    return np.round(values, 4).tolist()
