@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import pyvista as pv
 
+from acquiring import ready
 from browsing import launch, open_page, playwright, serve
 
-__all__ = ["launch", "open_page", "playwright", "serve"]
+__all__ = ["launch", "open_page", "playwright", "ready", "serve"]
 
 # Where the tests run in the background of a script, interrupts are ignored, and so they would be in the
 # processes that tests interrupt.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from acquiring import indentation
 from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp
 from limbfit.acquire.hostend import HostEnd
 from limbfit.acquire.phases import Phase
@@ -34,20 +35,6 @@ OVER_MS = 20
 
 def settings(**changes: float) -> Settings:
     return Settings(**AcquireTable(**(FAST | changes)).model_dump())
-
-
-def indentation(depth: float = 5.0, peak: float = 6.0, speed: float = 0.96, power: float = 1.8):
-    """A made-up simulation: times, displacements and forces of a quasi-linear tissue, in and out."""
-    half = depth / speed
-    fine = np.linspace(0, 2 * half, 4001)
-    elastic = ((depth - np.abs(fine - half) * speed) / depth).clip(0) ** power
-    fade = np.exp(-(fine[1] - fine[0]) / 0.7)
-    kept = np.zeros_like(fine)
-    for k in range(1, fine.size):
-        kept[k] = fade * (kept[k - 1] + elastic[k] - elastic[k - 1])
-    force = np.maximum(elastic + 1.5 * kept, 0)
-    time = np.linspace(0, 2 * half, 81)
-    return time, depth - np.abs(time - half) * speed, np.interp(time, fine, peak * force / force.max())
 
 
 SURROGATE = fit_surrogate(*indentation())

@@ -14,63 +14,22 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 
 import numpy as np
 import pytest
-from in_process import indentation, settings
+from in_process import settings
 
+from acquiring import SPEED, fitsocket, start
 from limbfit.acquire import LineDevice, LiveTold, Session, connect, read_recording, run_session
 from limbfit.acquire.events import Abort, Confirm, Flags, Sample
 from limbfit.acquire.messages import SetLimits
 from limbfit.acquire.phases import Phase
 from limbfit.acquire.wire import Encoder
 from limbfit.errors import RunError
-from limbfit.pipeline.stages.traces import read_site_trace, write_curves
+from limbfit.pipeline.stages.traces import read_site_trace
 from limbfit.study import load_study
-
-SPEED = "40"  # an accelerated clock
-ACQUIRE = """
-[acquire]
-clamp_speed_mm_s = 8.0
-approach_speed_mm_s = 6.0
-settle_s = 0.3
-clamp_tolerance_N = 4.0
-pause_s = 0.5
-ramp_speed_mm_s = 1.4
-"""
-
-
-@pytest.fixture
-def ready(study):
-    """The stump with stored simulations of both sites, its records yet to be made."""
-    folder = study / "results" / "simulate"
-    folder.mkdir(parents=True)
-    for name, peak in (("1", 6.0), ("2", 4.0)):
-        time_s, displacement, force = indentation(peak=peak)
-        write_curves(folder / f"{name}.csv", time_s=time_s, displacement_mm=displacement, force_N=force)
-        (study / f"{name}.csv").unlink()
-    file = study / "study.toml"
-    file.write_text(file.read_text() + ACQUIRE)
-    return study
-
-
-def start(*words: object, **options) -> subprocess.Popen:
-    command = [sys.executable, "-m", "limbfit", *map(str, words)]
-    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
-
-
-@contextmanager
-def fitsocket(study, *words: object):
-    """A virtual FitSocket as a process, on a port of its own; its address and itself."""
-    process = start("virtual-fitsocket", study, "--port", 0, *words)
-    try:
-        yield process.stdout.readline().removeprefix("device: ").strip(), process
-    finally:
-        process.terminate()
-        process.communicate(timeout=20)
 
 
 def acquire(study, address: str, *words: object) -> tuple[int, dict, str]:

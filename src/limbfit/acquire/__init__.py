@@ -13,7 +13,7 @@ from .events import Event
 from .links import DEFAULT_ADDRESS, DEFAULT_PORT, connect
 from .operator import Keyboard, Nobody
 from .quality import Ramp, Verdict, judge, ramps
-from .recording import Recorder, Recording, read_recording
+from .recording import Recorder, Recording, follow_recording, read_recording
 from .session import Ending, Listener, LiveTold, PhaseTold, Session, Told, prioritise, run_session
 from .settings import Settings
 
@@ -37,6 +37,7 @@ __all__ = [
     "Told",
     "Verdict",
     "connect",
+    "follow_recording",
     "judge",
     "prioritise",
     "ramps",

@@ -18,13 +18,14 @@ import io
 import json
 import os
 import re
+import sys
 import threading
 import time
 from binascii import crc32
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,9 @@ FIRST = "#limbfit-recording 1"
 ROWS = 25  # per block: 50 ms
 SYNC_S = 1.0  # how often the disk is asked to keep what was written
 MAX_BYTES = 2_000_000_000
+FOLLOWED_BYTES = 1 << 22  # read at once by who follows a record: half a minute of it
+_HEAD_BYTES = 1 << 16  # the first block and a closing line are shorter than these
+_CLOSING_BYTES = 64
 _NAMES = ("host_us", "device_us", "number", "flags", "moving")
 COLUMNS = (
     *_NAMES,
@@ -156,40 +160,109 @@ def read_recording(file: str | Path) -> Recording:
     if path.stat().st_size > MAX_BYTES:
         raise TraceError(f"larger than {MAX_BYTES:g} bytes", file=path)
     data = path.read_bytes()
-    if not data.startswith(FIRST.encode()):
-        raise TraceError("not a record of limbfit acquire", file=path, place="line 1")
-    content, used = _whole(data)
-    if not content:
-        raise TraceError("its first block is damaged", file=path, remedy="nothing can be read from it")
-    head, events, rows = _sorted_lines(content, path)
-    table = _table(rows, path)
-    first = len(_NAMES)
-    position, force, capacitance = np.split(table[:, first:], 3, axis=1)
-    host_us, device_us, number, flags, moving = table[:, :first].T
-    lost = len(data) - used
-    return Recording(
-        head, events, host_us, device_us, number, flags, moving, position, force, capacitance, lost
-    )
+    blocks = _first_block(data, path)
+    whole = _whole(data, blocks)
+    head, events, rows = _sorted_lines(blocks.content + whole.content, path)
+    return _recording(head, events, rows, len(data) - whole.end, path)
+
+
+def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tuple[Recording, int]:
+    """What a record that is being written holds beyond an offset, and the offset to go on from.
+
+    Parameters
+    ----------
+    offset : where a block ends, as an earlier call gave it; 0: from the start.
+    every : only each so many-th sample (a divisor of `ROWS`: then they stay even over the calls).
+
+    Notes
+    -----
+    At most `FOLLOWED_BYTES` are read; ``lost_bytes`` are those read that are not a whole block yet.
+
+    Raises
+    ------
+    TraceError
+        Where it is no record, no block ends at the offset, or what follows is damaged, not only unfinished.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise TraceError("no such record", file=path)
+    with path.open("rb") as stream:
+        first = _first_block(stream.read(_HEAD_BYTES), path)
+        before = _block_before(stream, offset, path) if offset else first
+        stream.seek(before.end)
+        data = stream.read(FOLLOWED_BYTES)
+    found = _whole(data, replace(before, content=b"", end=0))
+    if found.is_damaged or (not found.content and len(data) == FOLLOWED_BYTES):
+        remedy = "limbfit recording says what can be read of it"
+        place = f"byte {before.end + found.end}"
+        raise TraceError("what stands here is damaged", file=path, place=place, remedy=remedy)
+    content = found.content if offset else first.content + found.content
+    _, events, rows = _sorted_lines(content, path)
+    head, _, _ = _sorted_lines(first.content, path)
+    recording = _recording(head, events, rows[every - 1 :: every], len(data) - found.end, path)
+    return recording, before.end + found.end
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Blocks that are whole: their content, where the last ends, its CRC, and the index of the next."""
+
+    content: bytes
+    end: int
+    crc: int
+    next: int
+    is_damaged: bool = False  # what follows is closed, and yet not whole
 
 
 _CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 
 
-def _whole(data: bytes) -> tuple[bytes, int]:
-    """The content of all blocks up to the first that is not whole, and how many bytes they take."""
+def _first_block(data: bytes, path: Path) -> _Blocks:
+    """The block that holds the head."""
+    if not data.startswith(FIRST.encode()):
+        raise TraceError("not a record of limbfit acquire", file=path, place="line 1")
+    first = _whole(data, _Blocks(b"", 0, 0, 0), most=1)
+    if not first.content:
+        raise TraceError("its first block is damaged", file=path, remedy="nothing can be read from it")
+    return first
+
+
+def _block_before(stream: BinaryIO, offset: int, path: Path) -> _Blocks:
+    """What the closing line of the block that ends at an offset says."""
+    stream.seek(max(offset - _CLOSING_BYTES, 0))
+    line = stream.read(min(offset, _CLOSING_BYTES))
+    closing = _CLOSING.fullmatch(line, line.rfind(b"\n", 0, -1) + 1)
+    if closing is None:
+        raise TraceError("no block ends here", file=path, place=f"byte {offset}", remedy="read it anew")
+    return _Blocks(b"", offset, int(closing[3], 16), int(closing[1]) + 1)
+
+
+def _whole(data: bytes, before: _Blocks, most: int = sys.maxsize) -> _Blocks:
+    """The blocks after ``before``, which ends at its ``end`` in ``data``, up to one that is not whole."""
     parts: list[bytes] = []
-    at = crc = 0
-    while (mark := data.find(b"\n#block ", at)) >= 0:
+    at, crc = before.end, before.crc
+    while len(parts) < most and (mark := data.find(b"\n#block ", at)) >= 0:
         part, closing = data[at : mark + 1], _CLOSING.match(data, mark + 1)
-        crc = crc32(part, crc)
-        if closing is None:
-            break
-        index, size, stated = int(closing[1]), int(closing[2]), int(closing[3], 16)
-        if (index, size, stated) != (len(parts), len(part), crc):
-            break
+        next_crc = crc32(part, crc)
+        wanted = (before.next + len(parts), len(part), next_crc)
+        if closing is None or (int(closing[1]), int(closing[2]), int(closing[3], 16)) != wanted:
+            is_damaged = closing is not None or data.find(b"\n", mark + 1) >= 0
+            return _Blocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
         parts.append(part)
-        at = closing.end()
-    return b"".join(parts), at
+        at, crc = closing.end(), next_crc
+    return _Blocks(b"".join(parts), at, crc, before.next + len(parts))
+
+
+def _recording(
+    head: dict[str, Any], events: tuple[dict[str, Any], ...], rows: list[str], lost: int, path: Path
+) -> Recording:
+    table = _table(rows, path)
+    first = len(_NAMES)
+    position, force, capacitance = np.split(table[:, first:], 3, axis=1)
+    host_us, device_us, number, flags, moving = table[:, :first].T
+    return Recording(
+        head, events, host_us, device_us, number, flags, moving, position, force, capacitance, lost
+    )
 
 
 def _sorted_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dict[str, Any], ...], list[str]]:
@@ -206,7 +279,7 @@ def _sorted_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dic
                 rows.append(line)
         for event in events:
             event["at_us"], event["event"] = int(event["at_us"]), str(event["event"])
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
         raise TraceError("a line of it is not what a record holds", file=path) from None
     if not isinstance(head, dict):
         raise TraceError("its head is not a table", file=path)

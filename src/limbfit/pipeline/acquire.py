@@ -88,9 +88,13 @@ def acquire_site(
     _check_inside(study, site)
     settings = _settings(study, site, depth_mm, operator is None)
     device = LineDevice(connect(address))
-    with disk_errors(study.folder):
-        folder = _new_folder(study, site)
-    recorder = Recorder(folder / RECORD, _head(site, settings, device, operator is None))
+    try:
+        with disk_errors(study.folder):
+            folder = _new_folder(study, site)
+            recorder = Recorder(folder / RECORD, _head(site, settings, device, operator is None))
+    except BaseException:
+        device.close()
+        raise
     events = operator if operator is not None else stops if stops is not None else SimpleQueue()
     told = _both(Nobody(events), listener) if operator is None else listener
     try:
@@ -140,7 +144,8 @@ def judge_recording(file: Path) -> dict[str, Any]:
 def _check_inside(study: Study, site: Site) -> None:
     """Nothing outside the study's folder is written."""
     root = study.folder.resolve()
-    targets = [study.folder / FOLDER, *([study.path(site.trace)] if site.trace is not None else [])]
+    targets = [study.folder / FOLDER / site.name]
+    targets += [study.path(site.trace)] if site.trace is not None else []
     for target in targets:
         if not target.resolve().is_relative_to(root):
             raise InputError(
@@ -218,12 +223,13 @@ def _keep(study: Study, site: Site, folder: Path, completed: bool) -> dict[str, 
     verdict = judge(recording).to_dict()
     found = ramps(recording)
     with disk_errors(study.folder):
-        write_json(folder / VERDICT, verdict)
         for ramp in found:
             _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
         counted = [ramp for ramp in found if ramp.cycle > study.acquire.precondition]
         if counted and site.trace is not None:
             files["trace"] = str(_place_trace(study, site.trace, counted[0]))
+        # Last: who waits for the verdict finds the trace in its place.
+        write_json(folder / VERDICT, verdict | {"trace": str(site.trace) if files["trace"] else None})
     return {"verdict": verdict, "files": files}
 
 

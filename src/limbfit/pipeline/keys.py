@@ -34,7 +34,9 @@ class Keys:
     @cached_property
     def digests(self) -> dict[Path, str]:
         named = {path for paths in input_files(self.study).values() for path in paths}
-        return {path: file_digest(self.study.path(path)) for path in named}
+        places = {path: self.study.path(path) for path in named}
+        # A record that is yet to be made has none.
+        return {path: file_digest(place) if place.exists() else "" for path, place in places.items()}
 
     def of(
         self,

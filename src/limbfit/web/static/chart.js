@@ -57,6 +57,16 @@ export class Chart {
     this.chart.redraw();
   }
 
+  /** Longer curves of the same kind: the axes follow, but for what is enlarged; what is read stays. */
+  grow(content) {
+    const same = content.series.length === this.content.series.length;
+    this.content = content;
+    if (!same) return this.draw();
+    this.measure();
+    this.chart.setData(this.data(), false);
+    this.rescale();
+  }
+
   data() {
     return [null, ...this.content.series.map((one) => [one.x, one.y])];
   }
@@ -68,27 +78,17 @@ export class Chart {
 
   draw() {
     this.chart?.destroy();
-    const { series, band, x, y } = this.content;
+    const { series, x, y } = this.content;
+    this.measure();
     const ink = pageColour("--muted", this.host), grid = pageColour("--grid", this.host);
     const axis = ({ title, unit }, more) => ({
       label: unit ? `${title} (${unit})` : title, stroke: ink, labelSize: 20, font: "12px system-ui, sans-serif",
       labelFont: "12px system-ui, sans-serif", grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, ...more,
     });
-    const bounds = (low, high) => [low - (0.03 * (high - low) || 0.5), high + (0.03 * (high - low) || 0.5)];
-    const ends = (pick, extra) => {
-      let low = Infinity, high = -Infinity;
-      for (const values of [...series.map(pick), ...extra]) {
-        for (const value of values) if (value !== null && value < Infinity) { low = Math.min(low, value); high = Math.max(high, value); }
-      }
-      return low <= high ? [low, high] : [0, 1];
-    };
-    const [left, right] = ends((one) => one.x, band ? [band.x] : []);
-    const [low, high] = ends((one) => one.y, band ? [band.low, band.high] : []);
-    const rise = y.log ? [low / 1.2, high * 1.2] : bounds(low, high);
     const options = {
       mode: 2, width: Math.max(this.plot.clientWidth, 200), height: this.height, legend: { show: false },
       cursor: { drag: { x: true, y: true, uni: 20, setScale: false }, points: { show: false } },
-      scales: { x: { time: false, range: () => this.zoom?.x ?? bounds(left, right) }, y: { distr: y.log ? 3 : 1, range: () => this.zoom?.y ?? rise } },
+      scales: { x: { time: false, range: () => this.zoom?.x ?? this.ends.x }, y: { distr: y.log ? 3 : 1, range: () => this.zoom?.y ?? this.ends.y } },
       axes: [axis(x, { size: 30 }), axis(y, { size: 56, values: (_, ticks) => ticks.map((tick) => tick === null ? "" : shortTick(tick)) })],
       series: [{}, ...series.map((one) => this.seriesOptions(one))],
       hooks: {
@@ -99,6 +99,21 @@ export class Chart {
     this.chart = new uPlot(options, this.data(), this.plot);
     this.chart.over.addEventListener("dblclick", () => this.show(null));
     this.drawKey();
+  }
+
+  /** Where the axes end so that all is seen. */
+  measure() {
+    const { series, band, y } = this.content;
+    const bounds = (low, high) => [low - (0.03 * (high - low) || 0.5), high + (0.03 * (high - low) || 0.5)];
+    const ends = (pick, extra) => {
+      let low = Infinity, high = -Infinity;
+      for (const values of [...series.map(pick), ...extra]) {
+        for (const value of values) if (value !== null && value < Infinity) { low = Math.min(low, value); high = Math.max(high, value); }
+      }
+      return low <= high ? [low, high] : [0, 1];
+    };
+    const [low, high] = ends((one) => one.y, band ? [band.low, band.high] : []);
+    this.ends = { x: bounds(...ends((one) => one.x, band ? [band.x] : [])), y: y.log ? [low / 1.2, high * 1.2] : bounds(low, high) };
   }
 
   enlarge(plot) {
@@ -115,6 +130,10 @@ export class Chart {
   show(part) {
     this.zoom = part;
     this.chart.redraw(true, true);
+    this.rescale();
+  }
+
+  rescale() {
     for (const name of ["x", "y"]) this.chart.setScale(name, { min: 0, max: 1 });
   }
 
