@@ -169,5 +169,6 @@ class Bench:
         else:
             assert self.phase is Phase.UNREACHABLE
             assert self.device.is_home or self.has_given_up
+            assert "release" in self.session.protocol.reason  # what is left to do
         if self.phase is not Phase.DONE:
             assert self.session.protocol.reason

@@ -122,8 +122,19 @@ def test_a_pin_that_stays_stuck_is_reported() -> None:
     bench.until()
     assert bench.phase is Phase.UNREACHABLE
     assert bench.session.unreachable == (1,)
+    assert "cannot bring every pin home; use the device's own release" in bench.session.protocol.reason
     others = np.delete(bench.device.motors.position_mm, 0)
     assert (others < 0.1).all()  # the others went home
+
+
+def test_a_device_that_falls_silent_after_a_stop_is_reported() -> None:
+    bench = Bench()
+    bench.until(Phase.LOAD)
+    bench.session.handle(Abort("for the test"), bench.now)
+    for _ in range(5100):
+        bench.millisecond(device=False)
+    assert bench.phase is Phase.UNREACHABLE
+    assert bench.session.protocol.reason.startswith("for the test; silence for 5 s")
 
 
 @pytest.mark.parametrize("phase", [p for p in Phase if p not in FINAL | {Phase.IDLE, Phase.STOPPING}])

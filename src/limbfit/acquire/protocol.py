@@ -131,8 +131,12 @@ class Protocol:
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
         if self.phase is Phase.STOPPING:
-            silent, long = now - self._heard > SILENCE_S, now - self._entered > STOP_PATIENCE_S
-            return self._go(Outcome.OUT_OF_REACH, now) if silent or long else ()
+            if now - self._heard > SILENCE_S:
+                why = f"silence for {SILENCE_S:g} s: whether the device has retracted is not known"
+                return self._go(self._give_up(why), now)
+            if now - self._entered > STOP_PATIENCE_S:
+                return self._go(self._give_up(f"not every pin is home {STOP_PATIENCE_S:g} s later"), now)
+            return ()
         waits = self.phase in WAITS_FOR_OPERATOR
         limit = self.settings.operator_limit_s if waits else self.settings.time_limit_s
         if now - self._entered > limit:
@@ -294,10 +298,14 @@ class Protocol:
 
     def _end_stopping(self, sample: Sample, now: float) -> Outcome | None:
         if sample.flags & Flags.GIVEN_UP:
-            return Outcome.OUT_OF_REACH
+            return self._give_up("the device cannot bring every pin home")
         if sample.flags & Flags.STOPPED and sample.flags & Flags.HOME:
             return Outcome.RETRACTED
         return None
+
+    def _give_up(self, why: str) -> Outcome:
+        self.reason = f"{self.reason}; {why}; use the device's own release"
+        return Outcome.OUT_OF_REACH
 
     def _fail(self, reason: str) -> Outcome:
         self.reason = reason

@@ -43,7 +43,11 @@ def get_study(folder: Folder) -> dict[str, Any]:
         "material": study.material.model_dump(mode="json"),
         "indenter": study.indenter.model_dump(mode="json", exclude={"file"}),
         "sites": [
-            {**site.model_dump(mode="json", exclude={"trace"}), "has_trace": site.trace is not None}
+            {
+                **site.model_dump(mode="json", exclude={"trace"}),
+                "has_trace": site.trace is not None,
+                "is_recorded": site.trace is not None and study.path(site.trace).is_file(),
+            }
             for site in study.sites
         ],
         "notes": list(study.notes),

@@ -65,7 +65,7 @@ async function poll(now = false) {
 
 async function tell(changed) {
   try {
-    if (changed.study || context.study === null) context.study = await api.get("study");
+    if (changed.study || changed.acquired || context.study === null) context.study = await api.get("study");
     if (changed.study || changed.stages || changed.labels || changed.acquired || changed.run) {
       const found = await api.get("stages");
       [context.stages, context.run] = [found.stages, found.run];

@@ -13,9 +13,9 @@ const FORCE = { title: "Force", unit: "N" };
 const MARKS = new Map([[true, "✓"], [false, "✗"], [null, "–"]]);
 
 export class LivePanel {
-  /** host: a hidden section; show(site) shows the record of a site, arrived() is called when there is a new one. */
-  constructor(host, context, show, arrived) {
-    Object.assign(this, { host, context, showRecord: show, arrived, key: null, turn: 0, failures: 0, closed: new Set(), charts: [] });
+  /** host: a hidden section; show(site) shows the record of a site. */
+  constructor(host, context, show) {
+    Object.assign(this, { host, context, showRecord: show, key: null, turn: 0, failures: 0, closed: new Set(), charts: [] });
   }
 
   /** Is something being recorded, or was it lately? */
@@ -173,7 +173,6 @@ export class LivePanel {
     const known = verdict.trace !== null && this.context.study?.sites.some((one) => one.name === site);
     const step = known && el("button", { type: "button", class: "main", id: "live-record", onclick: () => this.showRecord(site) }, `Show the record of site ${site}`);
     replace(this.checks, el("ul", { class: "plain" }, rows), el("p", { class: "row" }, step || "The study names no record of this site: the ramps lie beside the session's record.", this.closer()));
-    this.arrived();
   }
 
   closer() {

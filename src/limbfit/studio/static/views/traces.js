@@ -10,12 +10,12 @@ const PREVIEW_MS = 250;
 
 export async function mount(element, context) {
   const view = new TracesView(element, context);
-  const live = new LivePanel(view.live, context, (site) => view.choose(site), () => view.refresh());
+  const live = new LivePanel(view.live, context, (site) => view.choose(site));
   context.on((changed) => changed.acquired && live.look());
   context.on((changed) => changed.theme && live.draw(true));
   live.look();
   await view.refresh();
-  context.on((changed) => (changed.study || changed.stages) && view.refresh());
+  context.on((changed) => (changed.study || changed.stages || changed.acquired) && view.refresh());
   context.on((changed) => changed.theme && view.charts.forEach((chart) => chart.draw()));
   return { show: () => live.show(), hide: () => live.hide() };
 }
@@ -36,7 +36,7 @@ class TracesView {
   async refresh() {
     const sites = this.context.study?.sites ?? [];
     if (this.dragging || !sites.length) return;
-    if (!sites.some((site) => site.name === this.site)) this.site = (sites.find((site) => site.has_trace) ?? sites[0]).name;
+    if (!sites.some((site) => site.name === this.site)) this.site = (sites.find((site) => site.is_recorded) ?? sites[0]).name;
     this.list();
     await this.open(this.site);
     await this.judge();
@@ -60,7 +60,7 @@ class TracesView {
       const error = this.found.sites.find((row) => row.site === site.name)?.error;
       const flags = this.flags(site.name).length;
       const notes = [site.fitted ? "fitted" : "held out", site.region];
-      if (!site.has_trace) notes.push("no record");
+      if (!site.is_recorded) notes.push(site.has_trace ? "to be recorded" : "no record");
       if (error) notes.push("unreadable");
       if (site.touch_down_s !== null || site.peak_s !== null) notes.push("set by hand");
       return el("li", {}, el("button", { type: "button", class: "site", "data-site": site.name, "aria-pressed": String(site.name === this.site),
@@ -99,9 +99,9 @@ class TracesView {
     this.flagList = el("ul", { class: "plain flags" });
     this.doubts();
     const head = [el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList];
-    if (!site.has_trace) {
+    if (!site.is_recorded) {
       this.close();
-      replace(this.area, head, el("p", {}, "This site has no record: it is planned to be simulated."));
+      replace(this.area, head, el("p", {}, site.has_trace ? "Its record is yet to be made: limbfit acquire does." : "This site has no record: it is planned to be simulated."));
       return;
     }
     if (!this.charts.length) replace(this.area, head, el("p", { class: "hint" }, "Reading the record …"));
