@@ -129,12 +129,14 @@ export class Chart {
   /** A part of the plane {x: [low, high], y: [low, high]}, or all for null. */
   show(part) {
     this.zoom = part;
-    this.chart.redraw(true, true);
     this.rescale();
   }
 
   rescale() {
-    for (const name of ["x", "y"]) this.chart.setScale(name, { min: 0, max: 1 });
+    const part = this.zoom ?? this.ends;
+    this.chart.batch(() => { // at once: who asks for places next gets those of now
+      for (const name of ["x", "y"]) this.chart.setScale(name, { min: part[name][0], max: part[name][1] });
+    });
   }
 
   seriesOptions(one) {

@@ -80,7 +80,7 @@ export class LivePanel {
         this.failures = 0;
         this.take(part);
         this.tell(part);
-        this.draw();
+        this.draw(part.head !== null); // whose limit stands in the key
         wait = part.more ? 0 : part.silent ? SLOW_MS : EVERY_MS;
       } catch (error) {
         if (turn !== this.turn) return;
