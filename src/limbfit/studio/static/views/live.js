@@ -7,6 +7,7 @@ const EVERY_MS = 200;
 const SLOW_MS = 2000; // where nothing comes
 const VERDICT_S = 20; // a session that is done is judged within less
 const MOST_POINTS = 6000;
+const HEIGHT = 300;
 const RAMPS = ["load", "unload"];
 const SEARCH = ["search", "return"];
 const FORCE = { title: "Force", unit: "N" };
@@ -62,7 +63,7 @@ export class LivePanel {
     replace(this.host, this.title, this.now, this.note, this.checks, el("div", { class: "pair" }, loop, time), el("p", { class: "hint" }, hint));
     this.host.hidden = false;
     this.say("live", `Site ${this.session.site} is being recorded`);
-    this.charts = [new Chart(loop, this.loopContent(), 260), new Chart(time, this.timeContent(), 260)];
+    this.charts = [new Chart(loop, this.loopContent(), HEIGHT), new Chart(time, this.timeContent(), HEIGHT)];
   }
 
   say(state, title) {
@@ -134,7 +135,7 @@ export class LivePanel {
     const phase = this.phases.at(-1);
     const { last } = this;
     replace(this.now, el("strong", {}, phase ? this.words(phase) : ""),
-      last && el("output", {}, `${last.time.toFixed(1)} s, ${last.depth.toFixed(2)} mm from ${this.touch === null ? "home" : "touch"}, ${last.force.toFixed(2)} N of at most ${this.head.force_limit_N} N (pin ${this.head.pin})`));
+      last && !this.ended && el("output", {}, `${last.time.toFixed(1)} s, ${last.depth.toFixed(2)} mm from ${this.touch === null ? "home" : "touch"}, ${last.force.toFixed(2)} N of at most ${this.head.force_limit_N} N (pin ${this.head.pin})`));
     const age = part.age_s < 120 ? `${part.age_s.toFixed(0)} s` : `${(part.age_s / 60).toFixed(0)} min`;
     if (part.verdict) this.judged(part.verdict);
     else if (this.ended && this.ended.phase !== "done") {

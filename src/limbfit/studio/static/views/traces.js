@@ -101,7 +101,7 @@ class TracesView {
     const head = [el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList];
     if (!site.is_recorded) {
       this.close();
-      replace(this.area, head, el("p", {}, site.has_trace ? "Its record is yet to be made: limbfit acquire does." : "This site has no record: it is planned to be simulated."));
+      replace(this.area, head, el("p", {}, site.has_trace ? "Its record is yet to be made (limbfit acquire)." : "This site has no record: it is planned to be simulated."));
       return;
     }
     if (!this.charts.length) replace(this.area, head, el("p", { class: "hint" }, "Reading the record …"));
