@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import Bench
 
-from limbfit.acquire import Recorder, judge, ramps, read_recording
+from limbfit.acquire import Recorder, follow_recording, judge, ramps, read_recording
 from limbfit.acquire.events import PINS, Sample
 from limbfit.acquire.recording import COLUMNS
 from limbfit.errors import TraceError
@@ -85,6 +85,40 @@ def test_a_damaged_byte_is_never_believed(written, tmp_path_factory, share, byte
     assert found.number.tolist() == list(range(1, len(found.number) + 1))
     assert (found.position_um == found.number[:, None]).all()
     assert found.lost_bytes > 0
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(shares=st.lists(st.floats(0, 1), max_size=5), every=st.sampled_from([1, 5, 25]))
+def test_a_record_that_grows_is_followed_without_a_gap(written, tmp_path_factory, shares, every) -> None:
+    data, whole = written.read_bytes(), read_recording(written)
+    file = tmp_path_factory.mktemp("grown") / "record.csv"
+    head = data.index(b"#block 0 ") + 100
+    offset, seen, events = 0, [], []
+    for length in sorted([*(head + int(share * (len(data) - head)) for share in shares), len(data)]):
+        file.write_bytes(data[:length])
+        part, offset = follow_recording(file, offset, every=every)
+        seen += part.number.tolist()
+        events += part.events
+        assert part.head == whole.head
+        assert part.lost_bytes == length - offset
+    assert seen == whole.number[every - 1 :: every].tolist()
+    assert tuple(events) == whole.events
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(share=st.floats(0, 0.999), byte=st.integers(0, 255))
+def test_a_damaged_byte_is_never_followed(written, tmp_path_factory, share, byte) -> None:
+    data = bytearray(written.read_bytes())
+    data[int(share * len(data))] = byte
+    file = tmp_path_factory.mktemp("damage") / "record.csv"
+    file.write_bytes(data)
+    try:
+        found, offset = follow_recording(file)
+        numbers = [*found.number, *follow_recording(file, offset)[0].number]
+    except TraceError:
+        return
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert (found.position_um == found.number[:, None]).all()
 
 
 @pytest.mark.parametrize("content", [b"", b"time,force\n1,2\n", b"#limbfit-recording 1\n", b"\xff" * 100])

@@ -59,7 +59,9 @@ class LineDevice:
                     return identity
         except RunError as error:
             self._link.close()
-            raise RunError(f"no greeting from the device: {error}") from None
+            raise RunError(
+                f"no greeting from the device: {error}; it takes one host at a time: does another have it?"
+            ) from None
         self._link.close()
         raise RunError(
             f"no greeting from the device within {GREETING_S:g} s; does it speak docs/device-protocol.md?"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import socket
 from contextlib import suppress
@@ -13,8 +15,13 @@ DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
 BAUD = 2_000_000
 _TCP = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(?::([0-9]{1,5}))?\Z")
-_SERIAL = re.compile(r"serial:(/[\x21-\x7e]+|COM[0-9]{1,3})(?:@([0-9]{3,7}))?\Z")
+_SERIAL = re.compile(r"serial:(/[\x21-\x3f\x41-\x7e]+)(?:@([0-9]{3,7}))?\Z")
 _CHUNK = 1 << 16
+_REFUSALS: tuple[type[Exception], ...] = (OSError, ValueError)  # what opening a port may raise
+with suppress(ImportError):  # Windows
+    import termios
+
+    _REFUSALS = (*_REFUSALS, termios.error)
 
 
 class Link(Protocol):
@@ -79,9 +86,8 @@ class SerialLink:
             raise InputError("serial ports need pyserial", place="--device", remedy=remedy) from None
         try:
             self._port: Any = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or type(error).__name__
-            raise RunError(f"{port} cannot be opened: {reason}") from None
+        except _REFUSALS as error:
+            raise RunError(f"{port} cannot be opened: {_why(error, baud)}") from None
         self._port.reset_input_buffer()
 
     def fileno(self) -> int:
@@ -106,6 +112,18 @@ class SerialLink:
             self._port.close()
 
 
+def _why(error: Exception, baud: int) -> str:
+    """Why a port does not open: pyserial wraps the system's reason in words of its own."""
+    if isinstance(error, ValueError):
+        return f"it does not do {baud} baud; give another after @"
+    number = getattr(error, "errno", None)
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return "another program uses it; end that first"
+    if number == errno.EACCES:
+        return "no permission; on most systems the group dialout has it"
+    return f"{os.strerror(number)}; see which ports there are" if number else "it is no serial port"
+
+
 def connect(address: str, timeout_s: float = 5.0) -> Link:
     """Open the wire of an address: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``.
 
@@ -118,6 +136,8 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
     """
     if match := _TCP.match(address):
         host, port = match[1].strip("[]"), int(match[2] or DEFAULT_PORT)
+        if not 0 < port < 1 << 16:
+            raise InputError(f"there is no port {port}", place="--device", remedy="ports are 1 to 65535")
         try:
             return TcpLink(socket.create_connection((host, port), timeout=timeout_s))
         except (OSError, OverflowError) as error:
@@ -130,5 +150,5 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
     raise InputError(
         "not an address of a device",
         place="--device",
-        remedy=f"give {DEFAULT_ADDRESS} or serial:/dev/ttyUSB0@{BAUD}",
+        remedy=f"give tcp://HOST:PORT ({DEFAULT_ADDRESS}) or serial:PATH@BAUD (serial:/dev/ttyUSB0@{BAUD})",
     )

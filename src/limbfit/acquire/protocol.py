@@ -153,7 +153,7 @@ class Protocol:
         self.reason = f"{self.reason}; {reason}" if self.reason else reason
         if self.phase is not Phase.STOPPING:
             self._go(Outcome.STOP, now)
-        return self._go(Outcome.OUT_OF_REACH, now)
+        return self._go(self._give_up("whether the device has retracted is not known"), now)
 
     def _go(self, outcome: Outcome, now: float) -> tuple[Action, ...]:
         self.phase = TRANSITIONS[self.phase, outcome]

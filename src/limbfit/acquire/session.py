@@ -174,8 +174,7 @@ class Session:
 
     def lost(self, reason: str, now: float) -> None:
         """The wire is gone."""
-        reach = "whether the device has retracted is not known: use its own release"
-        self.handle(LinkLost(f"{reason}; {reach}"), now)
+        self.handle(LinkLost(reason), now)
 
     def ending(self) -> Ending:
         p = self.protocol

@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Annotated, Any
@@ -22,6 +23,8 @@ from .commands import StudyPath
 from .console import STDERR, STDOUT, AsJson, print_json
 from .live import Live, PlainLines, keys
 
+MOST_SPEED = 1000  # of an accelerated clock
+
 
 def acquire(
     study: StudyPath,
@@ -30,7 +33,7 @@ def acquire(
         str, typer.Option(help="tcp://HOST[:PORT] or serial:PATH[@BAUD]", metavar="ADDRESS")
     ] = DEFAULT_ADDRESS,
     depth: Annotated[
-        float | None, typer.Option(help="mm from touch at which the depth search ends by itself", min=0.0)
+        float | None, typer.Option(help="mm from touch at which the depth search ends by itself")
     ] = None,
     unattended: Annotated[
         bool,
@@ -43,8 +46,12 @@ def acquire(
     again: Annotated[bool, typer.Option("--again", help="also where a record exists, which is kept")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Record indentations on a device: clamp, find the depth, ramp; the space bar is the key to be held."""
-    if not unattended and not sys.stdin.isatty():
+    """Record indentations on a device: clamp, find the depth, ramp, release.
+
+    The space bar is the key to be held in the depth search; any other key stops and retracts.
+    Exit code 0: all complete and good; 1: stopped, or not good.
+    """
+    if not unattended and not (sys.stdin.isatty() and find_spec("termios")):
         remedy = "run it in a terminal, or with --unattended"
         raise InputError("the operator's key needs a terminal", place="standard input", remedy=remedy)
     given = limbfit.load_study(study, recorded=False)
@@ -107,12 +114,16 @@ def _show(row: dict[str, Any]) -> None:
         out = f"; pins out of reach: {', '.join(map(str, row['unreachable']))}" if row["unreachable"] else ""
         STDERR.print(f"stopped: site {row['site']}: {row['reason']} ({row['phase']}{out})", soft_wrap=True)
     else:
-        good = "good" if row["verdict"]["good"] else "not good: record it again"
+        good = "good" if row["verdict"]["good"] else "not good: record it again (--site, --again)"
         STDOUT.print(f"site {row['site']}: {row['depth_mm']:.2f} mm deep, record {good}", soft_wrap=True)
         _show_checks(row["verdict"])
     STDOUT.print(f"record: {row['files']['record']}", soft_wrap=True)
     if row["files"]["trace"]:
         STDOUT.print(f"trace: {row['files']['trace']}", soft_wrap=True)
+    elif row["completed"]:
+        STDOUT.print(
+            "trace: none; no ramp counts, or the study names no file for it (sites.trace)", soft_wrap=True
+        )
 
 
 def _show_checks(verdict: dict[str, Any]) -> None:
@@ -144,20 +155,21 @@ def virtual_fitsocket(
     seed: Annotated[int, typer.Option(help="of the limb's place and the sensors' noise", min=0)] = 0,
     faults: Annotated[Path | None, typer.Option(help="TOML file of faults (docs/acquire.md)")] = None,
     host: Annotated[
-        str, typer.Option(help="address to listen at; other than loopback: whoever reaches it")
-    ] = ("127.0.0.1"),
+        str, typer.Option(help="address to listen at; whoever reaches it can move the pins")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="TCP port; 0: a free one", min=0, max=65535)] = DEFAULT_PORT,
     terminal: Annotated[bool, typer.Option("--terminal", help="a pseudo terminal instead of a port")] = False,
     speed: Annotated[
         float,
         typer.Option(
-            help="above 1: an accelerated clock, which waits for limbfit; at most so much faster",
-            min=1,
-            max=1000,
+            help="above 1, up to 1000: an accelerated clock, which waits for limbfit; at most so much faster"
         ),
     ] = 1.0,
 ) -> None:
     """A FitSocket that is a program, with the study's simulated limb in it; Ctrl-C ends it."""
+    if not 1 <= speed <= MOST_SPEED:
+        remedy = f"1 is the wall's clock, up to {MOST_SPEED} an accelerated one"
+        raise InputError(f"{speed:g} is no speed of the clock", place="--speed", remedy=remedy)
     given = limbfit.load_study(study, recorded=False)
     wrong = read_faults(faults) if faults is not None else ()
     device = limbfit.virtual_fitsocket(given, seed=seed, faults=wrong, paced=speed > 1)

@@ -146,6 +146,10 @@ def _check_inside(study: Study, site: Site) -> None:
     root = study.folder.resolve()
     targets = [study.folder / FOLDER / site.name]
     targets += [study.path(site.trace)] if site.trace is not None else []
+    if (study.folder / FOLDER).exists() and not (study.folder / FOLDER).is_dir():
+        raise InputError(
+            "is a file, where records are kept", file=study.folder / FOLDER, remedy="move it away"
+        )
     for target in targets:
         if not target.resolve().is_relative_to(root):
             raise InputError(
@@ -171,7 +175,7 @@ def _settings(study: Study, site: Site, depth_mm: float | None, unattended: bool
         raise InputError(
             f"{depth_mm:g} mm is not between acquire.min_depth_mm ({settings.min_depth_mm:g}) and "
             f"acquire.depth_limit_mm ({settings.depth_limit_mm:g})",
-            place="--depth",
+            place="--depth, or the site's depth",
         )
     return replace(settings, search_depth_mm=depth_mm)
 

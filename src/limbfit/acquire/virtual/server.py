@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import socket
 import time
-import tty
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -28,6 +28,10 @@ class PtyLink:
     """The master of a pseudo terminal; its slave looks like a serial port."""
 
     def __init__(self) -> None:
+        try:
+            import tty
+        except ImportError:
+            raise InputError("this system has no pseudo terminals", place="--terminal") from None
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -77,11 +81,16 @@ class Serving:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, port))
+            listener.listen(1)
         except (OSError, OverflowError) as error:
             listener.close()
+            if isinstance(error, socket.gaierror) or getattr(error, "errno", 0) == errno.EADDRNOTAVAIL:
+                raise InputError(f"{host} is no address of this machine", place="--host") from None
             reason = getattr(error, "strerror", None) or "no such port"
-            raise InputError(f"port {port} cannot be taken: {reason}", place="--port") from None
-        listener.listen(1)
+            remedy = "give another, or 0 for a free one"
+            raise InputError(
+                f"port {port} cannot be taken: {reason}", place="--port", remedy=remedy
+            ) from None
         listener.setblocking(False)
         return cls(listener=listener)
 
