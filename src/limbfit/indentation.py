@@ -195,13 +195,14 @@ class Prepared:
     """What a process keeps of a site for its next simulations.
 
     ``problem``, ``system`` and ``penalty`` (of contact; None where the solver is to find it) follow from the
-    site alone. ``rested``: the newest simulation from rest with its parameters, all of its states kept.
+    site alone. ``rested``: the newest simulation from rest with its parameters; one with sensitivities (True)
+    with all of its states, one without (False) with the deepest.
     """
 
     problem: Problem
     system: System
     penalty: float | None
-    rested: tuple[tuple[float, ...], Result] | None = None
+    rested: dict[bool, tuple[tuple[float, ...], Result]] = field(default_factory=dict)
 
 
 _prepared: OrderedDict[tuple[SiteModel, tuple[str, ...]], Prepared] = OrderedDict()
@@ -251,13 +252,18 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     )
 
 
-def _solve_from_rest(model: SiteModel, tissues: tuple[str, ...], parameters: tuple[float, ...]) -> Result:
-    """Simulate a site with sensitivities and keep all states, unless this was the newest such simulation."""
+def _solve_from_rest(
+    model: SiteModel, tissues: tuple[str, ...], parameters: tuple[float, ...], sensitivities: bool = True
+) -> Result:
+    """Simulate a site and keep that (see `Prepared`), unless this was the newest such simulation."""
     known = _prepare(model, tissues)
-    if known.rested is None or known.rested[0] != parameters:
-        found = _solve(model, to_parameters(np.array(parameters), tissues), sensitivities=True, store="all")
-        known.rested = parameters, replace(found, states=tuple(map(_lightened, found.states)))
-    return known.rested[1]
+    kept = known.rested.get(sensitivities)
+    if kept is None or kept[0] != parameters:
+        values, store = to_parameters(np.array(parameters), tissues), "all" if sensitivities else "peak"
+        found = _solve(model, values, sensitivities=sensitivities, store=store)
+        kept = parameters, replace(found, states=tuple(map(_lightened, found.states)))
+        known.rested[sensitivities] = kept
+    return kept[1]
 
 
 def _lightened(state: State) -> State:
@@ -282,10 +288,10 @@ def simulate(job: SimulationJob) -> Simulation:
     that a job starts from is done again where this process has not kept it.
     """
     model, parameters = job.model, to_parameters(np.array(job.parameters), job.tissues)
-    if job.start is None and job.sensitivities:
-        result = _solve_from_rest(model, job.tissues, job.parameters)
+    if job.start is None:
+        result = _solve_from_rest(model, job.tissues, job.parameters, job.sensitivities)
     else:
-        warm = None if job.start is None else _solve_from_rest(model, job.tissues, job.start)
+        warm = _solve_from_rest(model, job.tissues, job.start)
         result = _solve(model, parameters, sensitivities=job.sensitivities, warm_start=warm, store="peak")
     times = np.array(job.times_s)
     return Simulation(
@@ -317,14 +323,15 @@ def simulate_fields(
     return result
 
 
-def rested_fields(model: SiteModel, parameters: Parameters, file: Path) -> None:
-    """Fields as `simulate_fields` stores them, of the simulation that `simulate` keeps.
+def rested_fields(model: SiteModel, parameters: Parameters, file: Path, sensitivities: bool) -> None:
+    """Fields as `simulate_fields` stores them, of a simulation from rest that `simulate` keeps.
 
-    That is the one from rest with sensitivities; it is done where this process has not just done it.
+    Which of the two, with or without sensitivities, is to be stated: they differ within the solver's
+    tolerance. It is done where this process has not just done it.
     """
     tissues = tuple(parameters)
     vector = tuple(map(float, to_vector(parameters, tissues)))
-    _write_deepest(_solve_from_rest(model, tissues, vector), file)
+    _write_deepest(_solve_from_rest(model, tissues, vector, sensitivities), file)
 
 
 def _write_deepest(result: Result, file: Path) -> None:

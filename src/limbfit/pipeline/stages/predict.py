@@ -20,7 +20,6 @@ from ...indentation import (
     SimulationJob,
     SiteModel,
     rested_fields,
-    simulate_fields,
     to_parameters,
     to_vector,
 )
@@ -124,16 +123,16 @@ def _fine_force(simple: Simulation, fine: Simulation, coarse: Simulation) -> Sim
 
 @dataclass(frozen=True)
 class FieldJob:
-    """Fields at the deepest point of a site, to be stored by a worker; ``kept``: of what it has simulated."""
+    """Fields at the deepest point of a site, to be stored by a worker, of what it has just simulated."""
 
     model: SiteModel
     parameters: Parameters
     file: Path
-    kept: bool
+    sensitivities: bool
 
 
 def store_fields(job: FieldJob) -> str:
-    (rested_fields if job.kept else simulate_fields)(job.model, job.parameters, job.file)
+    rested_fields(job.model, job.parameters, job.file, job.sensitivities)
     return job.model.name
 
 
@@ -141,8 +140,8 @@ def _write_fields(
     context: Context, folder: Path, records: Sequence[SiteRecord], vector: Array, before: int
 ) -> None:
     parameters = to_parameters(vector, context.study.tissues)
-    kept = context.study.mesh.coarse is None  # then a simulation with derivatives was on this mesh
-    jobs = [FieldJob(r.model, parameters, folder / f"{r.site.name}.vtu", kept) for r in records]
+    with_derivatives = context.study.mesh.coarse is None  # else those are the coarse mesh's
+    jobs = [FieldJob(r.model, parameters, folder / f"{r.site.name}.vtu", with_derivatives) for r in records]
     missing = [job for job in jobs if not job.file.is_file()]
     names = [job.model.name for job in missing]
     for i, name in enumerate(context.executor.map(store_fields, missing, keys=names)):
