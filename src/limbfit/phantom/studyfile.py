@@ -36,8 +36,8 @@ penalty_per_mm = {penalty:.1f}
 # The fitted sites identify the material; all others are predicted and compared.
 """
 
-# The far field, which hardly strains, is meshed wide. A coarse phantom is there to be identified in minutes; meshes
-# of the paper's detail come within 0.3 % of the peak force of finer ones (docs/identification.md).
+# The far field, which hardly strains, is meshed wide. A coarse phantom is there to be identified in minutes;
+# meshes of the paper's detail come within 0.3 % of the peak force of finer ones (docs/identification.md).
 _MESH = {
     "coarse": """
 [mesh]
