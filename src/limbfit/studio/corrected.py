@@ -8,9 +8,10 @@ which then names that one: the given file stays as it is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
-from ..anatomy.imaging import LabelMap, write_labels
+from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..pipeline.store import file_digest
 from ..study import Study
 from .editing import set_key
@@ -39,6 +40,12 @@ def shown_labels(folder: StudyFolder) -> Shown | None:
     if given == Path(BESIDE) and (folder.folder / BESIDE).is_file():
         file = folder.folder / BESIDE
     return Shown(file, file_digest(file)) if file.is_file() else None
+
+
+@lru_cache(maxsize=1)
+def labels_of(shown: Shown) -> LabelMap:
+    """The label map on the page; the last one is kept: a page asks for its names, then for its voxels."""
+    return read_labels(shown.file)
 
 
 def save_labels(folder: StudyFolder, study: Study, shown: Shown, labels: LabelMap) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict
 
+from ..pipeline import STAGE_NAMES
 from ..pipeline.simulations import newest_simulations
 from ..pipeline.stages.traces import read_curves
 from ..study import PARAMETERS
@@ -34,7 +35,7 @@ class Wanted(BaseModel):
 
 @router.get("")
 def get_identification(folder: Folder) -> dict[str, Any]:
-    """Stages, the run that goes on or the last one, the iterates of the search, and its answer."""
+    """Stages, those of them that a run does, that run or the last one, iterates of the search, its answer."""
     study = folder.load()
     stages = stages_of_folder(folder)
     logs = sorted((folder.results / "log").glob("*.jsonl"))
@@ -43,6 +44,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
     state = next(row for row in stages if row["stage"] == "calibrate")
     return {
         "stages": stages,
+        "chain": [row["stage"] for row in stages if row["stage"] in STAGE_NAMES],
         "run": run,
         "starting": starting(folder) if run is None else None,
         "last": _last(logs[-1], run is not None) if logs else None,

@@ -11,13 +11,12 @@ import SimpleITK as sitk  # noqa: N813
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
-from ..anatomy.imaging import LabelMap, Volume, read_labels
+from ..anatomy.imaging import LabelMap, Volume, check_image, read_volume
 from ..anatomy.labelfiles import colour_of
 from ..anatomy.surfaces import read_surface
 from ..errors import InputError, RunError
-from ..pipeline.stages.inputs import study_image
 from ..study import Study
-from .corrected import LABELS, save_labels, shown_labels
+from .corrected import LABELS, labels_of, save_labels, shown_labels
 from .processes import running
 from .study_routes import Folder
 
@@ -47,7 +46,7 @@ def get_facts(folder: Folder) -> dict[str, Any]:
     facts: dict[str, Any] = {"has_image": True, "surfaces": surfaces, "labels": None}
     shown = shown_labels(folder)
     if shown is not None:
-        labels = read_labels(shown.file)
+        labels = labels_of(shown)
         facts["labels"] = {
             "base": shown.digest,
             "saved_to": shown.saved_to(study),
@@ -71,7 +70,7 @@ def get_labels(folder: Folder) -> Response:
     shown = shown_labels(folder)
     if shown is None:
         raise FileNotFoundError(LABELS)
-    answer = _nifti(read_labels(shown.file).along(PAGE_AXES))
+    answer = _nifti(labels_of(shown).along(PAGE_AXES))
     answer.headers["X-Base"] = shown.digest
     return answer
 
@@ -89,7 +88,7 @@ def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
         raise RunError("a run of this study goes on; stop it or wait for it before labels are saved")
     if shown.digest != painting.base:
         raise RunError("the labels have changed since they were opened here; open them anew and paint again")
-    labels = read_labels(shown.file)
+    labels = labels_of(shown)
     painted = paint(labels, painting.runs)
     changed = int((painted.array != labels.array).sum())
     if changed:
@@ -132,9 +131,13 @@ def paint(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
 
 
 def _study_volume(study: Study) -> Volume:
+    """The image as it is; what ``segment`` asks of it besides, one limb, is for that stage to say."""
     if study.image is None:
         raise InputError("the study has no image", file=study.file, place="image")
-    return study_image(study)
+    path = study.path(study.image.path)
+    volume = read_volume(path, study.image.series)
+    check_image(volume, path)
+    return volume
 
 
 def _nifti(grid: Volume | LabelMap) -> Response:

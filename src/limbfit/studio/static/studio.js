@@ -8,7 +8,7 @@
 //   context.stages, .run      rows of `limbfit status`, and the run that goes on or null
 //   context.on(listener)      listener({ study, stages, labels, log, acquired, run, theme }), true for what changed;
 //                             a hidden view is told of it when it is shown again
-//   context.say(text)         a line at the bottom, read out too;  context.warn(text) one that stays
+//   context.say(text)         a line at the bottom, read out too, while the view is seen;  context.warn(text) one that stays
 //   context.refresh()         ask for changes at once
 // Nothing is kept here that is not in the study's files.
 import { api, ApiError } from "/static/api.js";
@@ -110,7 +110,7 @@ function head() {
   const items = context.stages.map((row) =>
     el("span", { class: `stage ${row.state}`, title: [row.state, ...(row.why ?? [])].join("; ") },
       el("span", { class: "mark", "aria-hidden": "true" }, MARKS[row.state] ?? "?"),
-      row.stage, el("span", { class: "hidden-text" }, `: ${row.state}`)));
+      row.stage, el("span", { class: row.state === "stale" || row.state === "begun" ? "" : "hidden-text" }, `: ${row.state}`)));
   const run = context.run ? [el("span", { class: "stage running" }, `running (process ${context.run.process})`)] : [];
   replace(document.getElementById("strip"), ...items, ...run);
 }
@@ -123,6 +123,7 @@ async function open(name) {
     tab.setAttribute("aria-selected", String(key === name));
     tab.tabIndex = key === name ? 0 : -1;
   }
+  if (context.view !== name) context.say(""); // what was said was of another view
   context.view = name;
   if (before && before.name !== name) {
     before.element.hidden = true;
@@ -139,7 +140,10 @@ async function open(name) {
   main.append(element);
   const made = { name, element, listeners: new Set(), missed: {} };
   mounted.set(name, made);
-  const own = Object.create(context, { on: { value: (listener) => made.listeners.add(listener) } });
+  const own = Object.create(context, {
+    on: { value: (listener) => made.listeners.add(listener) },
+    say: { value: (text) => context.view === name && context.say(text) },
+  });
   try {
     const module = await import(`/static/views/${name}.js`);
     made.view = (await module.mount(element, own)) ?? {};

@@ -3,6 +3,7 @@ import { element } from "./overlay.js";
 import { shortNumber } from "./colours.js";
 
 const DASHES = { solid: [], dashed: [7, 4], dotted: [2, 3], dashdot: [8, 3, 2, 3] };
+const KEY_LINES = { dashed: "dashed", dotted: "dotted", dashdot: "dashed" };
 
 /** A colour of the page's style sheet by its name, for example --simulated; other words are colours already. */
 export function pageColour(name, at = document.documentElement) {
@@ -166,7 +167,7 @@ export class Chart {
     const { series, band } = this.content;
     const rows = series.map((one) => {
       const line = element("i", { className: "lf-key-line" });
-      line.style.borderTop = `${Math.min(one.width ?? 2, 3)}px ${one.dash ? "dashed" : "solid"} ${pageColour(one.colour, this.host)}`;
+      line.style.borderTop = `${Math.max(2, Math.min(one.width ?? 2, 3))}px ${KEY_LINES[one.dash] ?? "solid"} ${pageColour(one.colour, this.host)}`;
       return element("li", {}, line, one.label);
     });
     if (band) {

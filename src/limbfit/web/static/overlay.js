@@ -57,7 +57,7 @@ export class Overlay {
       const x = 46 + 30 * right[k], y = height - 46 - 30 * above[k];
       this.sides[k].style.transform = `translate(${x - 6}px, ${y - 9}px)`;
       const length = 22 * Math.hypot(right[k], above[k]);
-      this.sides[k].hidden = this.lines[k].hidden = length < 7; // it points at who looks
+      this.sides[k].hidden = this.lines[k].hidden = length < 11; // it points at who looks
       this.lines[k].style.width = `${length}px`;
       this.lines[k].style.transform = `translate(46px, ${height - 46}px) rotate(${Math.atan2(-above[k], right[k])}rad)`;
     }
@@ -69,7 +69,7 @@ function niceLength(most) {
   return [5, 2, 1].map((step) => step * power).find((length) => length <= most) ?? power;
 }
 
-/** A colour bar with its quantity and ends: {title, low, high, gradient}; nothing for null. */
+/** A colour bar with its quantity and ends: {title, low, high, gradient, beyond}; nothing for null. beyond: whether values lie [below, above]. */
 export function drawColourBar(host, bar, shortNumber) {
   host.replaceChildren();
   host.hidden = !bar;
@@ -77,8 +77,10 @@ export function drawColourBar(host, bar, shortNumber) {
   const strip = element("span", { className: "lf-bar-strip" });
   strip.style.background = bar.gradient;
   const values = [0, 0.25, 0.5, 0.75, 1].map((share) => bar.low + share * (bar.high - bar.low));
-  const ticks = values.map((value) =>
-    element("span", { textContent: shortNumber(Math.abs(value) < 1e-4 * (bar.high - bar.low) ? 0 : value) }));
+  const [below, above] = bar.beyond ?? [false, false];
+  const signs = [below ? "≤ " : "", "", "", "", above ? "≥ " : ""];
+  const ticks = values.map((value, i) =>
+    element("span", { textContent: signs[i] + shortNumber(Math.abs(value) < 1e-4 * (bar.high - bar.low) ? 0 : value) }));
   host.append(element("span", { className: "lf-bar-title", textContent: bar.title }), strip,
     element("span", { className: "lf-bar-ticks" }, ...ticks));
 }

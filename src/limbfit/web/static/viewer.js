@@ -61,6 +61,8 @@ export class Viewer {
     this.lamp = new THREE.DirectionalLight(0xffffff, 1.5);
     this.scene.add(this.lamp, this.lamp.target);
     this.surfaces = new Map();
+    this.paint = meshMaterial(); // kept, as those of the marks: a material made anew is compiled anew
+    this.markPaints = new Map();
     this.sites = [];
     this.marks = new THREE.Group();
     this.scene.add(this.marks);
@@ -76,6 +78,8 @@ export class Viewer {
   close() {
     this.watcher.disconnect();
     this.scene.traverse((part) => { part.geometry?.dispose(); part.material?.dispose(); });
+    this.paint.uniforms.map.value?.dispose();
+    for (const paint of [this.paint, ...this.markPaints.values()]) paint.dispose();
     this.renderer.dispose();
     this.renderer.forceContextLoss();
     this.host.replaceChildren();
@@ -145,7 +149,7 @@ export class Viewer {
   setSites(sites, size = 4) {
     this.sites = sites.map((site) => ({ ...site, outward: site.axis.map((value) => -value) }));
     for (const mark of [...this.marks.children]) this.drop(mark, this.marks);
-    for (const site of this.sites) this.marks.add(siteMark(site, site.chosen ? 1.35 * size : size));
+    for (const site of this.sites) this.marks.add(siteMark(site, site.chosen ? 1.35 * size : size, (colour) => this.markPaint(colour)));
     this.overlay.setSites(this.sites);
     this.redraw();
   }
@@ -156,10 +160,18 @@ export class Viewer {
     this.redraw();
   }
 
+  markPaint(colour) {
+    if (!this.markPaints.has(colour)) this.markPaints.set(colour, new THREE.MeshBasicMaterial({ color: colour }));
+    return this.markPaints.get(colour);
+  }
+
   drop(part, parent = this.scene) {
     if (!part) return;
     parent.remove(part);
-    part.traverse((piece) => { piece.geometry?.dispose(); piece.material?.dispose(); });
+    part.traverse((piece) => {
+      piece.geometry?.dispose();
+      if (piece.material?.isMeshLambertMaterial) piece.material.dispose(); // of a surface, and of nothing else
+    });
   }
 
   /** A mesh: {points, cells, regions, faces, owners, neighbours} and colours, one per region; null takes it away. */
@@ -171,7 +183,7 @@ export class Viewer {
     this.colours = colours.map((colour) => new THREE.Color(colour).toArray());
     this.visible = colours.map(() => true);
     if (!mesh) return this.redraw();
-    this.body = new THREE.Mesh(new THREE.BufferGeometry(), meshMaterial());
+    this.body = new THREE.Mesh(new THREE.BufferGeometry(), this.paint);
     this.body.frustumCulled = false;
     this.scene.add(this.body);
     this.cutMesh(this.cut ?? null);
@@ -299,12 +311,12 @@ function tintsOf(corners, mesh, colours) {
 }
 
 /** A ball on the skin, open where the site is held out, and a rod along the indenter's axis. */
-function siteMark(site, size) {
+function siteMark(site, size, paintOf) {
   const mark = new THREE.Group();
-  const paint = new THREE.MeshBasicMaterial({ color: site.colour });
+  const paint = paintOf(site.colour);
   mark.add(new THREE.Mesh(new THREE.SphereGeometry(size, 20, 14), paint));
   if (!site.filled) {
-    const heart = new THREE.Mesh(new THREE.SphereGeometry(0.62 * size, 16, 12), new THREE.MeshBasicMaterial({ color: "#ffffff" }));
+    const heart = new THREE.Mesh(new THREE.SphereGeometry(0.62 * size, 16, 12), paintOf("#ffffff"));
     heart.position.set(...site.axis.map((value) => -0.5 * size * value));
     mark.add(heart);
   }

@@ -5,6 +5,7 @@ import { shortNumber } from "/web/colours.js";
 
 const UNITS = { c_kPa: ["c", "kPa"], m: ["m", ""], gamma: ["gamma", ""], tau_s: ["tau", "s"] };
 const LOOKS = [["--second", "solid"], ["--simulated", "dashed"], ["--third", "dashdot"], ["--measured", "dotted"]];
+const ENDS = { running: "goes on", ended: "ended well" };
 const STATES = { done: "done", stale: "stale", begun: "begun", missing: "not done" };
 
 export async function mount(element, context) {
@@ -111,7 +112,7 @@ class IdentificationView {
   }
 
   tellRun() {
-    const { run, last, stages } = this.found;
+    const { run, last, stages, chain } = this.found;
     const starting = Boolean(this.found.starting);
     this.start.disabled = Boolean(run) || starting;
     this.stop.disabled = !run && !starting;
@@ -120,16 +121,17 @@ class IdentificationView {
     const begun = stages.some((row) => row.state === "begun");
     this.start.textContent = begun && !run ? "Resume" : "Run what is missing";
     const now = last?.now;
-    const ended = last ? `The last run (${last.what}) ${last.state === "running" ? "goes on" : last.state}${last.error ? `: ${last.error}` : "."}` : "Nothing was run yet.";
-    this.state.textContent = starting ? "Starting …" : run && now ? `${now.stage}: ${now.text}` : run ? "Running" : ended;
+    const ended = last ? `The last run${last.what === "run" ? "" : ` (limbfit ${last.what})`} ${ENDS[last.state] ?? last.state}${last.error ? `: ${last.error}` : "."}` : "Nothing was run yet.";
+    const next = stages.find((row) => chain.includes(row.stage) && row.state !== "done");
+    const then = next ? `Next: ${next.stage}${next.state === "stale" ? ", which is stale" : ""}.` : "All stages are done: there is nothing to run.";
+    this.state.textContent = starting ? "Starting …" : run && now ? `${now.stage}: ${now.text}` : run ? "Running" : `${ended} ${then}`;
     this.state.className = !run && last?.error ? "bad" : "";
     this.meter.hidden = !run;
     if (run && now?.total) this.meter.value = Math.min(now.done / now.total, 1);
     else this.meter.removeAttribute("value");
     const chosen = this.until.value;
-    const names = stages.map((row) => row.stage).filter((name) => this.context.stages.some((row) => row.stage === name));
-    if (this.until.childElementCount !== names.length + 1) {
-      replace(this.until, el("option", { value: "" }, "the report"), names.slice(0, -1).map((name) => el("option", { value: name }, name)));
+    if (this.until.childElementCount !== chain.length) {
+      replace(this.until, el("option", { value: "" }, "the report"), chain.slice(0, -1).map((name) => el("option", { value: name }, name)));
       this.until.value = chosen;
     }
     this.stageTable(stages, Boolean(run) || starting);
@@ -139,9 +141,9 @@ class IdentificationView {
   stageTable(stages, busy) {
     const focused = document.activeElement?.dataset?.anew;
     const rows = stages.map((row) => [row.stage, el("span", { class: { done: "good", stale: "doubt", begun: "doubt" }[row.state] ?? "" }, STATES[row.state] ?? row.state),
-      row.seconds === null ? "" : `${row.seconds.toFixed(1)} s`,
-      row.state === "missing" ? "" : el("button", { type: "button", class: "tiny", "data-anew": row.stage, disabled: busy, title: `Do ${row.stage} and all after it anew`,
-        "aria-label": `Do ${row.stage} and all after it anew`, onclick: () => this.run({ start: row.stage }) }, "anew")]);
+      row.seconds === null ? "" : `${row.seconds.toFixed(row.seconds < 100 ? 1 : 0)} s`,
+      row.state === "missing" || !this.found.chain.includes(row.stage) ? "" : el("button", { type: "button", class: "tiny", "data-anew": row.stage, disabled: busy, title: `Do ${row.stage} and all after it once more`,
+        "aria-label": `Redo ${row.stage} and all after it`, onclick: () => this.run({ start: row.stage }) }, "redo")]);
     const why = stages.filter((row) => row.why?.length).map((row) => el("li", {}, `${row.stage}: ${row.why.join("; ")}`));
     replace(this.stages, table(["Stage", "State", "Time", ""], rows), why.length ? el("details", {}, el("summary", {}, "Why stale"), el("ul", { class: "hint" }, why)) : null);
     if (focused) this.stages.querySelector(`[data-anew="${focused}"]`)?.focus();

@@ -43,6 +43,7 @@ class ImageView {
       multiplanarLayout: MULTIPLANAR_TYPE.GRID, multiplanarEqualSize: false, show3Dcrosshair: false, crosshairWidth: 0.35,
       meshThicknessOn2D: 0, isOrientCube: false, tileMargin: 4, viewModeHotKey: "", clipPlaneHotKey: "",
       cycleClipPlaneHotKey: "", isRadiologicalConvention: true, loadingText: "", maxDrawUndoBitmaps: 1,
+      fontColor: [1, 1, 1, 1], fontMinPx: 16, showAllOrientationMarkers: true,
     });
     await this.viewer.attachToCanvas(this.canvas, false);
     this.colours();
@@ -258,7 +259,7 @@ class ImageView {
       el("h2", {}, "Labels"),
       el("div", { class: "row" }, this.save, this.back, this.again),
       this.changes,
-      slider("opacity", "Shown (%)", 35, 0, 100, 5, (value) => this.viewer.setDrawOpacity(value / 100))[1],
+      slider("opacity", "Opacity (%)", 35, 0, 100, 5, (value) => this.viewer.setDrawOpacity(value / 100))[1],
       el("fieldset", {}, el("legend", {}, "Pen"), choose(null, "none: look only"),
         names.map((row) => choose(row.value, row.name, row.colour)), choose(0, "outside (erase)", "#000000")),
       slider("pen-size", "Pen size (voxels)", this.viewer.opts.penSize, 1, 21, 2, (value) => (this.viewer.opts.penSize = value))[1],
@@ -325,7 +326,8 @@ class ImageView {
     const label = this.before?.[at.vox[0] + this.viewer.back.dimsRAS[1] * (at.vox[1] + this.viewer.back.dimsRAS[2] * at.vox[2])];
     const name = this.facts.labels?.names.find((row) => row.value === label)?.name ?? "outside";
     const value = at.values[0]?.value;
-    this.place.textContent = `LPS ${(-x).toFixed(1)}, ${(-y).toFixed(1)}, ${z.toFixed(1)} mm · grey value ${value === undefined ? "–" : Number(value.toPrecision(4))}${this.facts.labels ? ` · ${name}` : ""}`;
+    const mm = [-x, -y, z].map((part) => part.toFixed(1).replace("-", "−")).join(", ");
+    this.place.textContent = `LPS ${mm} mm · grey value ${value === undefined ? "–" : Number(value.toPrecision(4))}${this.facts.labels ? ` · ${name}` : ""}`;
   }
 
   key(event) {

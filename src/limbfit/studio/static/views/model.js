@@ -2,10 +2,10 @@
 import { el, replace } from "/static/dom.js";
 import { readArrays } from "/web/arrays.js";
 import { canDraw, Viewer } from "/web/viewer.js";
-import { cutPanel, labelled, loadMesh, NO_WEBGL, REGION_COLOURS, SIDES } from "/static/views/parts.js";
+import { cutPanel, FITTED, HELD_OUT, labelled, loadMesh, NAVIGATION, NO_WEBGL, REGION_COLOURS, SIDES } from "/static/views/parts.js";
 import { SiteEditor } from "/static/views/sites.js";
 
-const FITTED = "#0072b2", HELD_OUT = "#d55e00", DRAFT = "#cc79a7";
+const DRAFT = "#cc79a7";
 const SURFACES = { skin: { colour: "#d9a07c", opacity: 0.4 }, bone: { colour: "#e9e6dc", opacity: 1 }, layer: { colour: "#c8a13a", opacity: 0.5 } };
 const QUALITIES = {
   "": null,
@@ -56,6 +56,7 @@ class ModelView {
       el("h2", {}, "Show"), this.shown,
       el("div", { class: "row", role: "group", "aria-label": "Side of the limb" }, sides,
         el("button", { type: "button", onclick: () => this.viewer?.view.reset() }, "reset")),
+      el("p", { class: "hint" }, NAVIGATION),
       el("h2", {}, "Mesh"), el("label", { class: "row" }, this.meshBox, (this.meshTitle = el("span", {}, "mesh of the site"))), this.meshPanel);
     this.meshPanel.hidden = true;
   }
@@ -133,6 +134,7 @@ class ModelView {
 
   showSurfaces() {
     const meshed = this.meshBox.checked && this.meshOf;
+    this.shown.hidden = Boolean(meshed); // the mesh stands in place of the surfaces
     for (const [name, shape] of this.shapes) this.viewer?.showSurface(name, shape.shown && !meshed);
   }
 
@@ -211,8 +213,8 @@ class ModelView {
     }
     const { values } = this.cells[this.colour.value];
     const sorted = Float32Array.from(values).sort();
-    const high = chosen.high ?? sorted[Math.floor(0.98 * (sorted.length - 1))];
-    this.viewer.setColours({ map: this.map.value, low: chosen.low ?? 0, high, title: chosen.title });
+    const low = chosen.low ?? 0, high = chosen.high ?? sorted[Math.floor(0.98 * (sorted.length - 1))];
+    this.viewer.setColours({ map: this.map.value, low, high, beyond: [sorted[0] < low, sorted.at(-1) > high], title: chosen.title });
     this.viewer.setMoment({ on: "cells", values }, null);
   }
 

@@ -4,6 +4,8 @@ import { readArrays } from "/web/arrays.js";
 
 export const NO_WEBGL = "This browser does not draw in three dimensions (no WebGL 2). Tables, curves and settings work; pictures of the limb are in the report.";
 export const SIDES = [["anterior", 0], ["left", Math.PI / 2], ["posterior", Math.PI], ["right", -Math.PI / 2]];
+export const FITTED = "#0072b2", HELD_OUT = "#d55e00"; // as the dots of the site list
+export const NAVIGATION = "Drag turns the picture, Shift and drag moves it; the wheel enlarges once it was clicked.";
 const BETWEEN = ["#7d6a2e", "#f7efce", "#4a6472"];
 
 /** The colour of a tissue: layers, outermost first, and the core last; as in the report. */

@@ -4,7 +4,7 @@ import { readArrays } from "/web/arrays.js";
 import { shortNumber } from "/web/colours.js";
 import { nodalMeans } from "/web/volume.js";
 import { canDraw, Viewer } from "/web/viewer.js";
-import { cutPanel, labelled, loadMesh, NO_WEBGL, REGION_COLOURS } from "/static/views/parts.js";
+import { cutPanel, FITTED, HELD_OUT, labelled, loadMesh, NO_WEBGL, REGION_COLOURS } from "/static/views/parts.js";
 
 const FALLBACK = "von_mises", AT_ONCE = 3;
 
@@ -20,7 +20,7 @@ export class Player {
   }
 
   build() {
-    this.source = el("select", { onchange: () => this.load() });
+    this.source = el("select", { onchange: () => { this.wanted = this.source.value; this.load(); } });
     this.field = el("select", { onchange: () => this.readFrames() });
     this.map = el("select", { onchange: () => this.scale() }, ...["viridis", "cividis"].map((name) => el("option", { value: name }, name)));
     this.smooth = el("input", { type: "checkbox", checked: true, onchange: () => this.show(this.at) });
@@ -46,9 +46,8 @@ export class Player {
   /** Show a site: {name, position_mm, axis}, its sources, and the patient's sides. */
   async open(site, sources, frame) {
     Object.assign(this, { site, sources, frame });
-    const before = this.source.value;
     replace(this.source, ...sources.map((one) => el("option", { value: one.source }, one.title)));
-    if (sources.some((one) => one.source === before)) this.source.value = before;
+    if (sources.some((one) => one.source === this.wanted)) this.source.value = this.wanted;
     await this.load();
   }
 
@@ -73,7 +72,7 @@ export class Player {
     this.field.value = this.titles.has(before) ? before : this.titles.has(FALLBACK) ? FALLBACK : facts.fields[0]?.name;
     if (this.viewer) {
       this.viewer.setMesh(mesh, facts.regions.map((_, i) => REGION_COLOURS(i, facts.regions.length)));
-      this.viewer.setSites([{ name: this.site.name, at: this.site.position_mm, axis: this.site.axis, colour: "#d55e00", filled: true }], 1.2);
+      this.viewer.setSites([{ name: this.site.name, at: this.site.position_mm, axis: this.site.axis, colour: this.site.fitted ? FITTED : HELD_OUT, filled: this.site.fitted }], 1.2);
       this.cut.set(mesh.points, this.frame, this.site);
       this.look();
       this.style();
@@ -118,10 +117,9 @@ export class Player {
     const field = this.titles.get(this.field.value);
     const [low, high] = [Math.min(...known.map((one) => one.ends[0])), Math.max(...known.map((one) => one.ends[1]))];
     const asked = this.limits.map((input) => Number.parseFloat(input.value));
-    this.viewer.setColours({
-      map: this.map.value, low: Number.isFinite(asked[0]) ? asked[0] : low, high: Number.isFinite(asked[1]) ? asked[1] : high,
-      title: `${field.title} (${field.unit})`,
-    });
+    const ends = [Number.isFinite(asked[0]) ? asked[0] : low, Number.isFinite(asked[1]) ? asked[1] : high];
+    const beyond = [known.some((one) => one.ends[2] < ends[0]), known.some((one) => one.ends[3] > ends[1])];
+    this.viewer.setColours({ map: this.map.value, low: ends[0], high: ends[1], beyond, title: `${field.title} (${field.unit})` });
   }
 
   style() {

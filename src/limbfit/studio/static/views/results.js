@@ -2,7 +2,7 @@
 import { el, replace, table } from "/static/dom.js";
 import { Chart } from "/web/chart.js";
 import { shortNumber } from "/web/colours.js";
-import { labelled } from "/static/views/parts.js";
+import { labelled, NAVIGATION } from "/static/views/parts.js";
 import { Player } from "/static/views/player.js";
 
 const PARAMETERS = [["c_kPa", "c", "kPa"], ["m", "m", "–"], ["gamma", "γ", "–"], ["tau_s", "τ", "s"]];
@@ -28,7 +28,8 @@ class ResultsView {
     this.simulation = el("div", {});
     this.files = el("div", {});
     const side = el("div", { class: "side", tabindex: "0", role: "region", "aria-label": "Settings of the results" },
-      el("h2", {}, "Site"), labelled("site", this.site), this.simulation, el("h2", {}, "Field"), this.player.settings, this.files);
+      el("h2", {}, "Site"), labelled("site", this.site), this.simulation, el("h2", {}, "Field"), this.player.settings,
+      el("p", { class: "hint" }, NAVIGATION), this.files);
     this.curveBox = el("div", {});
     this.axis = el("select", { onchange: () => { this.against = this.axis.value; this.drawCurves(); } },
       el("option", { value: "time_s" }, "time (s)"), el("option", { value: "displacement_mm" }, "displacement (mm)"));

@@ -118,7 +118,7 @@ class TracesView {
     this.record = record;
     const [force, depth, loop] = [0, 1, 2].map(() => el("div", {}));
     this.facts = el("dl", { class: "facts", id: "trace-facts" });
-    this.reset = el("button", { type: "button", id: "trace-reset", onclick: () => this.store({ touch_down_s: null, peak_s: null }) }, "Leave both to limbfit");
+    this.reset = el("button", { type: "button", id: "trace-reset", onclick: () => this.store({ touch_down_s: null, peak_s: null }) }, "Let limbfit find both");
     replace(this.area, head, force, el("div", { class: "pair" }, depth, loop), el("div", { class: "row" }, this.reset), this.facts);
     this.charts = [
       new HandledChart(force, this.content("force_N", FORCE, true), 300),
