@@ -32,7 +32,7 @@ from .settings import Settings, micro
 
 QUIET_S = 0.05  # a command is under way for less: nothing is concluded from a pin that does not move yet
 NEAR_UM = 60  # a pin that is so near to its target has arrived
-CLAMP_ROUNDS = 12
+CLAMP_ROUNDS = 30
 SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
 STOP_PATIENCE_S = 15.0  # and so is one that has not come home by then
 

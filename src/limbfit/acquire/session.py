@@ -34,6 +34,27 @@ FIRST_S = 1.0  # the first sample may take longer than those after it
 DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making samples look late
 
 
+# What the words of a device mean; it may have others.
+_MEANINGS = {
+    "watchdog": "it heard from limbfit too late: see what else runs here, and the wire",
+    "stuck": "a driven pin does not move",
+    "power": "the actuators have no power",
+    "button": "its emergency stop was pressed",
+    "force": "over its limit there",
+    "depth": "over its limit there",
+    "speed": "over its limit there",
+    "saturated": "that force sensor is at its end",
+    "dead": "that force sensor repeats itself",
+    "stopped": "its last stop is not over: wait until all pins are home",
+    "armed": "it has a session",
+    "unknown-site": "it has no such site",
+}
+
+
+def _why(code: str) -> str:
+    return f" ({_MEANINGS[code]})" if code in _MEANINGS else ""
+
+
 @dataclass(frozen=True)
 class PhaseTold:
     """The session is in another phase; ``reason`` where it was stopped, ``cycle`` of the ramps."""
@@ -141,11 +162,11 @@ class Session:
                     self.counts.declined[code] = self.counts.declined.get(code, 0) + 1
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
-                        self.handle(Abort(f"the device declined a command: {code}"), now)
+                        self.handle(Abort(f"the device declined a command: {code}{_why(code)}"), now)
                 case Tripped(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
-                    self.handle(Abort(f"the device stopped by itself: {code}{where}"), now)
+                    self.handle(Abort(f"the device stopped by itself: {code}{where}{_why(code)}"), now)
                 case OutOfReach(pins=pins):
                     self.unreachable = tuple(k + 1 for k in range(pins.bit_length()) if pins >> k & 1)
                     self._record("unreachable", now, pins=list(self.unreachable))
@@ -307,6 +328,7 @@ def _loop(session: Session, operator: SimpleQueue[Event]) -> None:
     device, paced = session.device, session._paced
     now = 0.0 if paced else time.monotonic()
     heard = time.monotonic()
+    origin: float | None = None  # a paced device may have been running for long
     session.begin(now)
     while not session.protocol.is_over:
         try:
@@ -319,8 +341,10 @@ def _loop(session: Session, operator: SimpleQueue[Event]) -> None:
             now = wall
         if reports:
             heard = wall
-            if paced:
-                now = max([now, *(r.time_us / 1e6 for r in reports if isinstance(r, Sample))])
+            times = [report.time_us / 1e6 for report in reports if isinstance(report, Sample)]
+            if paced and times:
+                origin = times[0] if origin is None else origin
+                now = max(now, max(times) - origin)
             session.reports(reports, now)
         elif paced and wall - heard > PACED_SILENCE_S:
             session.lost(f"the device has said nothing for {PACED_SILENCE_S:g} s", now)
