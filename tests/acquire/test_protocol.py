@@ -122,7 +122,9 @@ def test_a_pin_that_stays_stuck_is_reported() -> None:
     bench.until()
     assert bench.phase is Phase.UNREACHABLE
     assert bench.session.unreachable == (1,)
-    assert "cannot bring every pin home; use the device's own release" in bench.session.protocol.reason
+    reason = bench.session.protocol.reason
+    assert "stuck, pin 1 (a driven pin does not move)" in reason
+    assert "cannot bring every pin home; use the device's own release" in reason
     others = np.delete(bench.device.motors.position_mm, 0)
     assert (others < 0.1).all()  # the others went home
 
