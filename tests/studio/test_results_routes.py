@@ -33,12 +33,16 @@ def page(study):
     return client
 
 
-def test_what_can_be_played_is_told_with_its_times(page):
+def test_what_can_be_played_is_told_with_its_times(page, study):
     played, peak = page.get("/api/results/site/1").json()["sources"]
     assert played["source"] == "simulate"
     assert played["times_s"] == [0.0, 0.5, 1.0, 1.5]
     assert (peak["source"], peak["times_s"]) == ("predict", [1.0])  # when the record is deepest
     assert page.get("/api/results/site/2").json()["sources"] == []
+    assert played["deepest"] == 3  # the newest while there is no curve yet
+    curve = study / "results" / "simulate" / "1.csv"
+    curve.write_text("time_s,displacement_mm,force_N\n0,0,0\n0.9,5,6\n1.5,1,0\n")
+    assert page.get("/api/results/site/1").json()["sources"][0]["deepest"] == 2
 
 
 @pytest.mark.parametrize("name", [*FIELDS])

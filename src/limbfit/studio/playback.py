@@ -51,7 +51,8 @@ FIELDS = {
 def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     """What can be shown of a site: every step of a simulation, or the deepest point of the prediction.
 
-    Each has ``source``, ``title``, ``times_s``, ``parameters_from``, and ``mark``, which other fields change.
+    Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
+    ``mark``, which other fields change.
     """
     found = []
     moments = _moments(folder, site)
@@ -62,6 +63,7 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
                 "source": "simulate",
                 "title": "every step, simulated",
                 "times_s": [time for time, _ in moments],
+                "deepest": _deepest(folder, site, [time for time, _ in moments]),
                 "parameters_from": origin,
                 "mark": fingerprint(file for _, file in moments),
             }
@@ -72,7 +74,8 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
             {
                 "source": "predict",
                 "title": "the deepest point, predicted",
-                "times_s": [_peak_time(folder, site)],
+                "times_s": [_peak_time(folder.artefact("predict", f"{site}.csv"))],
+                "deepest": 0,
                 "parameters_from": "identified",
                 "mark": fingerprint([predicted]),
             }
@@ -90,8 +93,16 @@ def _moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
     return [(time, file) for time, file in files if file.is_file()]
 
 
-def _peak_time(folder: StudyFolder, site: str) -> float:
-    columns = read_curves(folder.artefact("predict", f"{site}.csv"))
+def _deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
+    """The moment nearest to the deepest point; the last one while the simulation goes on."""
+    curve = folder.results / "simulate" / f"{site}.csv"
+    if not curve.is_file():
+        return len(times_s) - 1
+    return int(np.argmin(np.abs(np.array(times_s) - _peak_time(curve))))
+
+
+def _peak_time(curve: Path) -> float:
+    columns = read_curves(curve)
     return float(columns["time_s"][np.argmax(columns["displacement_mm"])])
 
 

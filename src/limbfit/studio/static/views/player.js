@@ -92,7 +92,8 @@ export class Player {
     const turn = ++this.turn, field = this.field.value, source = this.source.value;
     if (!this.mesh || !field) return;
     this.frames = this.times.map(() => null);
-    const first = Math.min(this.times.length - 1, this.at || Math.floor(this.times.length / 2));
+    const { deepest } = this.sources.find((one) => one.source === source);
+    const first = Math.min(this.times.length - 1, this.at || deepest);
     const order = [first, ...this.times.keys()].filter((at, i, all) => all.indexOf(at) === i);
     const path = `results/moment/${source}/${encodeURIComponent(this.site.name)}`;
     const read = async (at) => {
