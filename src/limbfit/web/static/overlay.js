@@ -46,7 +46,7 @@ export class Overlay {
       label.classList.toggle("lf-chosen", Boolean(site.chosen));
     }
     this.drawSides(right, above, height);
-    const length = niceLength(90 * perPixel);
+    const length = niceLength(120 * perPixel);
     this.scale.style.width = `${length / perPixel}px`;
     this.scale.textContent = `${length} mm`;
   }
