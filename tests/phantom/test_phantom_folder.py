@@ -149,4 +149,4 @@ def test_simulated_forces_are_those_of_soft_tissue(tmp_path) -> None:
     assert posterior["peak_force_N"] > 1.0
     stiffness = [site["peak_force_N"] / site["depth_mm"] for site in (tibia, posterior)]
     assert stiffness[0] > 1.5 * stiffness[1]  # thin tissue over bone is stiffer
-    assert all(site["simulation"]["element"] == "tet10" for site in truth["sites"])
+    assert all(site["simulation"]["element"] == "tet10g8p0" for site in truth["sites"])
