@@ -72,6 +72,21 @@ def test_an_animation_is_played_and_its_files_are_downloaded(study, serve, open_
     assert serious_findings(page) == []
 
 
+def test_a_hidden_view_reads_nothing_until_it_is_shown(study, serve, open_page):
+    page, asked = open_page(serve(study) + "#/model"), []
+    page.get_by_role("checkbox", name="skin").wait_for()
+    page.on("request", lambda request: asked.append(request.url))
+    page.evaluate("location.hash = '#/traces'")
+    page.locator("#trace-facts dd").first.wait_for()
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace('name = "2"', 'name = "calf"'))
+    page.locator(".view.traces .side").get_by_text("calf").wait_for()  # what is seen has followed
+    assert not [url for url in asked if "/api/model" in url]
+    page.evaluate("location.hash = '#/model'")
+    page.locator(".site-list").get_by_text("calf").wait_for()
+    assert not [url for url in asked if "/api/model/surface" in url]  # they are as they were
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("view", ["model", "results"])
