@@ -159,18 +159,44 @@ def _one_or_two(store: Store) -> str:
 
 
 def _verdict(store: Store) -> tuple[str, ...]:
+    """Which parameters the data determine, best first, and how many combinations of them."""
     uncertainty = store.calibration.get("uncertainty") or {}
     stored = uncertainty.get("verdict") or {}
     if not stored:
         return ()
-    names = {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
+    symbols = _symbols(store)
     groups: dict[str, list[str]] = {}
     for name, word in stored.items():
-        groups.setdefault(str(word), []).append(names.get(name, name))
-    words = [f"{word.capitalize()}: {', '.join(found)}." for word, found in groups.items()]
+        groups.setdefault(str(word), []).append(symbols.get(name, name))
+    best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
+    words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
     combinations = [str(sentence) for sentence in uncertainty.get("combinations") or ()]
-    told = [sentence for sentence in combinations if not sentence.endswith("not determined by these data")]
-    return (*words, *told)
+    known = sum(sentence.endswith(": determined") for sentence in combinations)
+    if not known:
+        return tuple(words)
+    return (*words, f"Determined together: {known} of {len(combinations)} products of them (see Parameters).")
+
+
+_RANKS = {"determined": 0, "weakly": 1, "not": 2}
+
+
+def _symbols(store: Store) -> dict[str, str]:
+    """Each parameter's name as people read it: ``muscle.tau_s`` is muscle τ."""
+    return {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
+
+
+def _combinations(store: Store) -> tuple[Block, ...]:
+    """What the data determine of several parameters together, best determined first."""
+    sentences = (store.calibration.get("uncertainty") or {}).get("combinations") or ()
+    if not sentences:
+        return ()
+    told = []
+    for sentence in map(str, sentences):
+        for name, symbol in _symbols(store).items():
+            sentence = sentence.replace(name, symbol)
+        told.append(sentence)
+    lead = "Products of powers of the parameters, the best determined by the data first:"
+    return Prose(lead), Bullets(tuple(told))
 
 
 def model(store: Store) -> Section:
@@ -254,6 +280,7 @@ def parameters(store: Store) -> Section:
     blocks = _blocks(*found, otherwise="No parameters have been identified yet.")
     if store.stages and not store.calibration.get("uncertainty"):
         blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
+    blocks = (*blocks, *_combinations(store))
     residuals = _residuals(store)
     if residuals:
         blocks = (*blocks, Prose(residuals))
