@@ -287,10 +287,11 @@ def simulate(job: SimulationJob) -> Simulation:
     The answer depends on the job alone: not on the process, nor on what it simulated before. The simulation
     that a job starts from is done again where this process has not kept it.
     """
-    model, parameters = job.model, to_parameters(np.array(job.parameters), job.tissues)
+    model = job.model
     if job.start is None:
         result = _solve_from_rest(model, job.tissues, job.parameters, job.sensitivities)
     else:
+        parameters = to_parameters(np.array(job.parameters), job.tissues)
         warm = _solve_from_rest(model, job.tissues, job.start)
         result = _solve(model, parameters, sensitivities=job.sensitivities, warm_start=warm, store="peak")
     times = np.array(job.times_s)

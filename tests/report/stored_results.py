@@ -314,7 +314,10 @@ def _calibration(sites: tuple) -> dict:
         },
         "correlation": {"names": NAMES, "matrix": matrix.tolist()},
         "verdict": verdict,
-        "combinations": ["The data determine c·(1 + γ) of the muscle to 2 %."],
+        "combinations": [
+            "muscle.c_kPa^0.82 · muscle.gamma^0.57: determined",
+            "skin.m^0.71 · muscle.m^-0.70: not determined by these data",
+        ],
         "residuals": {
             "sites": {row[0]: {"noise_sd_N": 0.05, "misfit_sd_N": 0.1} for row in sites if row[2]},
             "correlation": 0.2,

@@ -312,6 +312,16 @@ def test_indentations_without_records(copy: Path) -> None:
     assert "no parameters have been identified" in _section(text, "summary")
 
 
+def test_the_summary_tells_what_is_determined_best_first_and_the_parameters_each_product(report: str) -> None:
+    summary, parameters = _section(report, "summary"), _section(report, "parameters")
+    places = [summary.index(word) for word in ("Determined: ", "Weakly determined: ", "Not determined: ")]
+    assert places == sorted(places)
+    assert "Determined together: 1 of 2 products of them" in summary
+    assert "^" not in summary
+    assert "muscle c^0.82 · muscle γ^0.57: determined" in parameters
+    assert "skin m^0.71 · muscle m^-0.70: not determined by these data" in parameters
+
+
 def test_broken_summary_names_the_file(copy: Path) -> None:
     (copy / "predict" / "predict.json").write_text('{"sites": [')
     with pytest.raises(InputError, match=r"predict\.json: not readable.*run its stage again"):

@@ -112,7 +112,8 @@ def test_runs_are_kept_and_compared_on_the_page(study, serve, open_page):
     until(lambda: page.locator("option", has_text="before").count())
     page.get_by_label("beside").select_option("before")
     page.get_by_role("columnheader", name="error, before (%)").wait_for()
-    page.locator(".lf-key").get_by_text("before").wait_for()
+    until(lambda: page.locator(".lf-key").get_by_text("before").count())
+    assert page.locator(".lf-key").get_by_text("before").count() == 1
 
 
 @pytest.mark.slow

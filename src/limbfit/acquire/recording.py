@@ -240,17 +240,17 @@ def _block_before(stream: BinaryIO, offset: int, path: Path) -> _Blocks:
 def _whole(data: bytes, before: _Blocks, most: int = sys.maxsize) -> _Blocks:
     """The blocks after ``before``, which ends at its ``end`` in ``data``, up to one that is not whole."""
     parts: list[bytes] = []
-    at, crc = before.end, before.crc
+    at, crc, is_damaged = before.end, before.crc, False
     while len(parts) < most and (mark := data.find(b"\n#block ", at)) >= 0:
         part, closing = data[at : mark + 1], _CLOSING.match(data, mark + 1)
         next_crc = crc32(part, crc)
         wanted = (before.next + len(parts), len(part), next_crc)
         if closing is None or (int(closing[1]), int(closing[2]), int(closing[3], 16)) != wanted:
             is_damaged = closing is not None or data.find(b"\n", mark + 1) >= 0
-            return _Blocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
+            break
         parts.append(part)
         at, crc = closing.end(), next_crc
-    return _Blocks(b"".join(parts), at, crc, before.next + len(parts))
+    return _Blocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
 
 
 def _recording(

@@ -341,8 +341,8 @@ def _loop(session: Session, operator: SimpleQueue[Event]) -> None:
             now = wall
         if reports:
             heard = wall
-            times = [report.time_us / 1e6 for report in reports if isinstance(report, Sample)]
-            if paced and times:
+            times = [r.time_us / 1e6 for r in reports if isinstance(r, Sample)] if paced else []
+            if times:
                 origin = times[0] if origin is None else origin
                 now = max(now, max(times) - origin)
             session.reports(reports, now)

@@ -41,7 +41,7 @@ RECORD, VERDICT = "record.csv", "verdict.json"
 
 def waiting_sites(study: Study) -> list[Site]:
     """Sites whose record is yet to be made."""
-    return [site for site in study.sites if site.trace is None or not study.path(site.trace).is_file()]
+    return [site for site in study.sites if not study.is_recorded(site)]
 
 
 def acquire_site(

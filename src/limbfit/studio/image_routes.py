@@ -11,10 +11,11 @@ import SimpleITK as sitk  # noqa: N813
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
-from ..anatomy.imaging import LabelMap, Volume, check_image, read_volume
+from ..anatomy.imaging import LabelMap, Volume
 from ..anatomy.labelfiles import colour_of
 from ..anatomy.surfaces import read_surface
 from ..errors import InputError, RunError
+from ..pipeline.stages.inputs import plain_image
 from ..study import Study
 from .corrected import LABELS, labels_of, save_labels, shown_labels
 from .processes import running
@@ -134,10 +135,7 @@ def _study_volume(study: Study) -> Volume:
     """The image as it is; what ``segment`` asks of it besides, one limb, is for that stage to say."""
     if study.image is None:
         raise InputError("the study has no image", file=study.file, place="image")
-    path = study.path(study.image.path)
-    volume = read_volume(path, study.image.series)
-    check_image(volume, path)
-    return volume
+    return plain_image(study)
 
 
 def _nifti(grid: Volume | LabelMap) -> Response:

@@ -57,13 +57,14 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     found = []
     moments = _moments(folder, site)
     if moments:
+        times_s = [time for time, _ in moments]
         origin = stored(folder.results / "simulate" / f"{site}.json").get("parameters_from")
         found.append(
             {
                 "source": "simulate",
                 "title": "every step, simulated",
-                "times_s": [time for time, _ in moments],
-                "deepest": _deepest(folder, site, [time for time, _ in moments]),
+                "times_s": times_s,
+                "deepest": _deepest(folder, site, times_s),
                 "parameters_from": origin,
                 "mark": fingerprint(file for _, file in moments),
             }

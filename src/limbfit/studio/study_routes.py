@@ -46,7 +46,7 @@ def get_study(folder: Folder) -> dict[str, Any]:
             {
                 **site.model_dump(mode="json", exclude={"trace"}),
                 "has_trace": site.trace is not None,
-                "is_recorded": site.trace is not None and study.path(site.trace).is_file(),
+                "is_recorded": study.is_recorded(site),
             }
             for site in study.sites
         ],

@@ -41,7 +41,7 @@ def get_records(folder: Folder) -> dict[str, Any]:
     records: dict[str, dict[str, Any]] = {}
     for site in study.sites:
         row: dict[str, Any] = {"site": site.name, "region": site.region, "fitted": site.fitted, "error": None}
-        if site.trace is not None and study.path(site.trace).is_file():
+        if study.is_recorded(site):
             try:
                 records[site.name] = _read(study, site)
             except InputError as error:

@@ -92,6 +92,10 @@ class Study(Table):
         """A path of the study file as a path of this machine."""
         return self.folder / relative
 
+    def is_recorded(self, site: Site) -> bool:
+        """Whether the record that a site names has been made."""
+        return site.trace is not None and self.path(site.trace).is_file()
+
     def site(self, name: str) -> Site:
         for site in self.sites:
             if site.name == name:

@@ -20,12 +20,18 @@ from ..corrections import hand_labels
 
 def study_image(study: Study) -> Volume:
     """The study's image; of one limb, unless its labels are given too."""
-    assert study.image is not None
-    volume = _image(study.path(study.image.path), study.image.series)
+    volume = plain_image(study)
     if not study.segmentation.is_given:
+        assert study.image is not None
         with naming(study.path(study.image.path)):
             check_one_limb(volume)
     return volume
+
+
+def plain_image(study: Study) -> Volume:
+    """The study's image, however many limbs it shows."""
+    assert study.image is not None
+    return _image(study.path(study.image.path), study.image.series)
 
 
 def marked_image(study: Study) -> Volume | None:
