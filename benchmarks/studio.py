@@ -1,6 +1,6 @@
 """Memory of the studio over hours: its server, its page, and the script's own heap.
 
-    python benchmarks/studio.py STUDY [--minutes 120] [--every 30] [--json studio.json]
+    python benchmarks/studio.py STUDY [--minutes 120] [--every 30] [--json studio.json] [--detached]
 
 Works on a copy of STUDY, whose meshes are stored.  The server is started as its command starts it, its
 page opened in Chromium (software WebGL; LIMBFIT_CHROMIUM names another program), and a calibration
@@ -9,7 +9,14 @@ that a run goes on all the time.  The views are opened in turn, each once a minu
 is done: another site, its mesh, its fields.  Every ``--every`` seconds the resident memory of the server,
 of the page's renderer and of the process that draws is read, and the heap and the nodes of the page's
 scripts; every ten minutes the heap once more after garbage was collected.  All of it is in the JSON,
-which is written after each reading.  Printed at the end: the first value, the medians of the first and of
+which is written after each reading.
+
+Developer tools keep what a page has loaded, so with ``--detached`` the page is opened by a browser of its
+own and goes from view to view by a script of its own; the tools are attached for a moment at the beginning
+and at the end, and memory is read from outside.  STUDY itself is watched, not a copy, and nothing in it is
+started or changed: let something run on it meanwhile, such as ``limbfit run STUDY``.
+
+Printed at the end: the first value, the medians of the first and of
 the last quarter, and the slope after the first quarter.
 """
 
@@ -58,7 +65,8 @@ def start_server(study: Path) -> tuple[psutil.Process, str]:
 class Page:
     """The studio's page in a browser, and what it is made to do."""
 
-    def __init__(self, browser: Any, address: str, study: Path) -> None:
+    def __init__(self, playwright: Any, program: str, address: str, study: Path) -> None:
+        browser = self.chromium = playwright.chromium.launch(executable_path=program, args=list(WITH_WEBGL))
         self.study, self.runs, self.turn, self.errors = study, 0, 0, []
         self.page = browser.new_page(viewport={"width": 1280, "height": 800})
         self.page.set_default_timeout(180_000)
@@ -124,29 +132,108 @@ class Page:
             "nodes": self.devtools.send("Memory.getDOMCounters")["nodes"],
         }
 
+    def watch(self, server: psutil.Process, options: argparse.Namespace, keep: Callable) -> None:
+        """Open views, keep runs going and take readings until the time is over."""
+        start = time.monotonic()
+        due = dict.fromkeys(("reading", "view", "run"), start) | {"collect": start + COLLECT_S}
+        while (now := time.monotonic()) < start + 60 * options.minutes:
+            if now >= due["run"]:
+                due["run"] = now + 5.0
+                if not self.is_running():
+                    self.run()
+            if now >= due["view"]:
+                due["view"] = now + STAY_S
+                self.next()
+            if now >= due["reading"]:
+                due["reading"] = now + options.every
+                row = {"minutes": (now - start) / 60, "runs": self.runs}
+                row |= {"server": server.memory_info().rss / 1e6} | self.reading()
+                if now >= due["collect"]:
+                    due["collect"] = now + COLLECT_S
+                    self.collect()
+                    row["heap_collected"] = self.heap()
+                keep(row)
+            self.page.wait_for_timeout(500)
 
-def watch(page: Page, server: psutil.Process, options: argparse.Namespace, keep: Callable) -> None:
-    """Open views, keep runs going and take readings until the time is over."""
-    start = time.monotonic()
-    due = dict.fromkeys(("reading", "view", "run"), start) | {"collect": start + COLLECT_S}
-    while (now := time.monotonic()) < start + 60 * options.minutes:
-        if now >= due["run"]:
-            due["run"] = now + 5.0
-            if not page.is_running():
-                page.run()
-        if now >= due["view"]:
-            due["view"] = now + STAY_S
-            page.next()
-        if now >= due["reading"]:
-            due["reading"] = now + options.every
-            row = {"minutes": (now - start) / 60, "runs": page.runs, "server": server.memory_info().rss / 1e6}
-            row |= page.reading()
-            if now >= due["collect"]:
-                due["collect"] = now + COLLECT_S
-                page.collect()
-                row["heap_collected"] = page.heap()
-            keep(row)
-        page.page.wait_for_timeout(500)
+    def close(self) -> None:
+        stop(StudyFolder(self.study / "study.toml"))
+        self.chromium.close()
+
+
+# The tour of a page that nobody drives: another view in every turn, another site in every round.
+TOUR = """([views, stay]) => {
+  window.tour = { turn: 0, errors: [] };
+  addEventListener("error", (event) => tour.errors.push(event.message));
+  addEventListener("unhandledrejection", (event) => tour.errors.push(String(event.reason)));
+  setInterval(() => {
+    const view = views[tour.turn % views.length], round = Math.floor(tour.turn / views.length);
+    tour.turn += 1;
+    location.hash = `#/${view}`;
+    setTimeout(() => {
+      const sites = document.querySelectorAll(`.view.${view} .side button.site`);
+      if (sites.length) sites[round % sites.length].click();
+      const choice = view === "results" ? document.querySelector(".view.results .side select") : null;
+      if (choice) {
+        choice.selectedIndex = round % choice.options.length;
+        choice.dispatchEvent(new Event("change"));
+      }
+    }, 2000);
+  }, 1000 * stay);
+}"""
+
+
+class Alone:
+    """The page in a browser of its own, with developer tools attached in `said` and in the beginning only."""
+
+    def __init__(self, playwright: Any, program: str, address: str, place: Path, stay_s: float) -> None:
+        arguments = ["--headless=new", "--remote-debugging-port=0", f"--user-data-dir={place}", *WITH_WEBGL]
+        self.process = psutil.Popen(
+            [program, *arguments, "--window-size=1280,800", address],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self.chromium, self.errors = playwright.chromium, []
+        note = place / "DevToolsActivePort"
+        while not note.exists():
+            time.sleep(0.2)
+        self.port = int(note.read_text().split()[0])
+        self._attached(lambda page: page.evaluate(TOUR, [list(VIEWS), stay_s]))
+
+    def _attached(self, do: Callable[[Any], Any]) -> Any:
+        browser = self.chromium.connect_over_cdp(f"http://127.0.0.1:{self.port}")
+        try:
+            page = next(p for p in browser.contexts[0].pages if "127.0.0.1" in p.url)
+            page.set_default_timeout(180_000)
+            page.locator("#tabs").wait_for()
+            return do(page)
+        finally:
+            browser.close()  # lets go of it; the browser goes on
+
+    def reading(self) -> dict[str, float]:
+        """Resident memory, MB."""
+        kinds: dict[str, float] = dict.fromkeys(("renderer", "gpu-process"), 0.0)
+        for child in self.process.children(recursive=True):
+            with suppress(psutil.Error):
+                found = re.search(r"--type=(\S+)", " ".join(child.cmdline()))
+                if found and found.group(1) in kinds:
+                    kinds[found.group(1)] += child.memory_info().rss / 1e6
+        return {"renderer": kinds["renderer"], "drawing": kinds["gpu-process"]}
+
+    def said(self) -> None:
+        """Take the errors that the page's scripts have met."""
+        self.errors = self._attached(lambda page: page.evaluate("window.tour.errors"))
+
+    def watch(self, server: psutil.Process, options: argparse.Namespace, keep: Callable) -> None:
+        """Take readings until the time is over."""
+        start = time.monotonic()
+        while (now := time.monotonic()) < start + 60 * options.minutes:
+            keep({"minutes": (now - start) / 60, "server": server.memory_info().rss / 1e6} | self.reading())
+            time.sleep(options.every)
+        self.said()
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(30)
 
 
 def stop(folder: StudyFolder) -> None:
@@ -179,6 +266,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--every", type=float, default=30.0, help="seconds between readings")
     parser.add_argument("--json", type=Path, default=Path("studio.json"))
+    parser.add_argument("--detached", action="store_true", help="watch STUDY itself without developer tools")
+    parser.add_argument("--stay", type=float, default=STAY_S, help="seconds in each view, detached")
     options = parser.parse_args()
     program = os.environ.get("LIMBFIT_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     rows: list[dict[str, float]] = []
@@ -187,21 +276,24 @@ def main() -> None:
         rows.append(row)
         options.json.write_text(json.dumps({"readings": rows, "errors": page.errors}, indent=1) + "\n")
 
+    page: Page | Alone
     with tempfile.TemporaryDirectory() as place, sync_playwright() as playwright:
-        study = shutil.copytree(options.study, Path(place) / "study")
+        study = options.study if options.detached else shutil.copytree(options.study, Path(place) / "study")
         server, address = start_server(study)
-        browser = playwright.chromium.launch(executable_path=program, args=list(WITH_WEBGL))
         try:
-            page = Page(browser, address, study)
-            watch(page, server, options, keep)
+            if options.detached:
+                page = Alone(playwright, program, address, Path(place), options.stay)
+            else:
+                page = Page(playwright, program, address, study)
+            try:
+                page.watch(server, options, keep)
+            finally:
+                page.close()
         finally:
-            stop(StudyFolder(study / "study.toml"))
-            browser.close()
             server.terminate()
             server.wait(30)
-    print(
-        f"{rows[-1]['minutes']:.0f} minutes, {rows[-1]['runs']} runs, {len(page.errors)} errors of the page"
-    )
+    runs = "" if options.detached else f", {rows[-1]['runs']} runs"
+    print(f"{rows[-1]['minutes']:.0f} minutes{runs}, {len(page.errors)} errors of the page")
     for name in UNITS:
         print(told(rows, name))
 

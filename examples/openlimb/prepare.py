@@ -27,9 +27,9 @@ bones = { tibia = "surfaces/tibia.stl", fibula = "surfaces/fibula.stl" }
 [geometry]
 skin_layer_mm = 3.0
 
-[mesh]                          # about 14,400 nodes a site, of FEBio's density (20,000)
+[mesh]                          # about 20,000 nodes a site, as FEBio's
 element = "tet10"
-edge_near_mm = 4.0
+edge_near_mm = 3.6
 edge_far_mm = 16.0
 near_radius_mm = 14.0
 growth = 0.5
@@ -45,6 +45,9 @@ flatness = 1.6
 shape = "square"
 width_mm = 20.0
 edge_radius_mm = 2.0
+
+[calibration]
+relative_tolerance = 0.01
 
 [solver]                        # how far FEBio's punch sinks in: its penalty in the mean (docs/contact.md)
 penalty_per_mm = 12.5

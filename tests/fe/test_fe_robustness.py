@@ -84,6 +84,13 @@ def test_drawn_cases_complete_and_keep_to_the_laws(robustness, number):
     assert (outcome.outcome, outcome.broken) == ("completed", []), outcome.reason
 
 
+@pytest.mark.slow
+def test_folds_of_a_soft_skin_on_a_stiff_muscle_are_gone_through(robustness):
+    """Directions that only a small part of can be used: it did not get past a fifth of the way undamped."""
+    outcome = robustness.run_case(0, 6, "tet10p0")
+    assert outcome.outcome == "completed", outcome.reason
+
+
 def test_what_is_not_reached_is_said(robustness):
     """One iteration and no cut: rest alone is a result, with its reason and no peak."""
     result = solve(punch("tet10", 2, 1), StepControl(max_iterations=1, max_cuts=0), store="all")

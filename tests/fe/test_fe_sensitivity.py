@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from blocks import punch
 
-from limbfit.fe import StepControl, solve
+from limbfit.fe import Indenter, StepControl, solve, stepping
 
 TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-9)
 
@@ -30,3 +30,15 @@ def test_sensitivities_equal_central_differences(cell_type, element):
         difference = (forces[0] - forces[1]) / (2 * step)
         error = np.abs(difference - centre.force_sensitivity[:, j]).max()
         assert error <= 1e-4 * np.abs(difference).max(), (region, name)
+
+
+def test_an_edge_taken_as_flat_on_the_way_changes_no_answer(monkeypatch):
+    """Rounded edges are left out of the tangent of every closed point, but near the equilibrium."""
+    rounded = Indenter(axis=(0, 0, -1), centre=(0.0, 0.0, 1.0), edge_radius=3.0)
+    problem = punch("tet10", 2, 1, indenter=rounded)
+    usual = solve(problem, TIGHT, sensitivities=True)
+    monkeypatch.setattr(stepping, "STEEP_PRESSURE", 1e-6)
+    flat = solve(problem, TIGHT, sensitivities=True)
+    assert np.abs(flat.force - usual.force).max() <= 1e-8 * usual.peak_force
+    error = np.abs(flat.force_sensitivity - usual.force_sensitivity).max(axis=0)
+    assert (error <= 1e-5 * np.abs(usual.force_sensitivity).max(axis=0)).all()

@@ -119,11 +119,12 @@ def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, X, u, centre, frame, kernel, penalty, anchors, tangent, positions, residual, data,
-    advance, gaps, normals, blocks,
+    faces, N, areas, X, u, centre, frame, kernel, penalty, flat_from, anchors, tangent, positions, residual,
+    data, advance, gaps, normals, blocks,
 ):  # fmt: skip
     """Add the contact energy's gradient to ``residual`` and, with ``tangent``, its hessian to ``data``.
 
+    ``flat_from``: penetration from which a point's tangent leaves the indenter's curvature out (mm).
     ``anchors``: which points stick (f, q), where (f, q, 3) and in which plane, as the normal (f, q, 3) to it,
     in the indenter's frame.  ``advance (n, 3)`` receives the mixed derivative with respect to displacement
     and indenter advance (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals
@@ -161,7 +162,7 @@ def contact(  # type: ignore[no-untyped-def]
                 for i in range(3):
                     t[i] = w * phi * g[i]
                     for j in range(3):
-                        h[i, j] = w * (g[i] * g[j] + phi * bend[i, j])
+                        h[i, j] = w * (g[i] * g[j] + (phi * bend[i, j] if phi > -flat_from else 0.0))
             if held[f, q]:
                 energy += _stick(local, places[f, q], planes[f, q], w, t, h)
             elif phi >= 0.0:

@@ -7,6 +7,8 @@ solution.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,14 +22,19 @@ Bools = NDArray[np.bool_]
 SWEEPS, ROUNDS = 12, 4
 
 
-def newton_direction(system: System, at: Evaluation, factor: Factor, tolerance: float) -> Array:
+def newton_direction(
+    system: System, at: Evaluation, factor: Factor, tolerance: float, damping: float = 0.0
+) -> Array:
     """Direction (n, 3) that solves the linear model within ``tolerance``, relative to the residual.
 
+    ``damping``: share of each tissue's shear stiffness that is added to the tangent.
     Where the model is not convex it is only a direction of descent.
     """
     b = -at.residual.ravel()[system.free][:, None]
     if not factor.ready and factor.lasting:
         _begin(system, at, factor)
+    if damping:
+        at = replace(at, data=factor.stiffened(at.tangent, damping))
     if at.touch is None:
         if not factor.lasting:
             factor.factorise(at.tangent)

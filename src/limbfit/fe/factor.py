@@ -140,14 +140,16 @@ class Factor:
         self._costs = [0.0]
         self.seconds["factor"] += time.perf_counter() - started
 
+    def stiffened(self, data: Array, share: float) -> Array:
+        """The entries ``data`` of a tangent with a share of each tissue's own shear stiffness added."""
+        if self._shear is None:
+            self._shear = shear_stiffness(self._system, self._moduli)
+        return data + share * self._shear
+
     def _factorised(self, data: Array, shift: float) -> bool:
         self.counts["factorisations" if self.lasting else "multigrids"] += 1
-        if shift:
-            if self._shear is None:
-                self._shear = shear_stiffness(self._system, self._moduli)
-            data = data + shift * self._shear
         try:
-            self._solver.factorise(data)
+            self._solver.factorise(self.stiffened(data, shift) if shift else data)
         except NotPositiveDefiniteError:
             return False
         return True

@@ -1,11 +1,20 @@
-"""Equilibrium of one step: Newton's method on the incremental potential with a line search."""
+"""Equilibrium of one step: Newton's method on the incremental potential with a line search.
+
+Where the search can use a small part of a direction only, the model that gave it is not to be trusted that
+far: the next ones are damped by the stiffness of shear (`convexity`), more after every short step and less
+after every full one, as in a trust region (Levenberg 1944, Marquardt 1963).
+
+A guess lies deep in the indenter, and a rounded edge that presses on it that hard makes a tangent of large
+negative eigenvalues, pressure over radius, which say nothing of the equilibrium.  So far from it the edge is
+taken as flat there (`Increment.flat_from`).
+"""
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,25 +26,31 @@ from .linear import NotPositiveDefiniteError
 from .system import Evaluation, Increment, System
 
 Array = NDArray[np.float64]
+# A shorter step damps the next directions, at first by this share of each tissue's own shear modulus; it is
+# changed by a factor, and less than the smallest is none.
+SHORT_STEP, FIRST_DAMPING, DAMPING_CHANGE, LEAST_DAMPING = 0.3, 0.1, 4.0, 0.02
+NEAR = 0.1  # residual over reactions from which the tangent is the exact one
 
 
 @dataclass(frozen=True)
 class NewtonControl:
-    """Tolerance of the residual relative to the reactions, and limits."""
+    """Tolerance of the residual relative to the reactions, limits, and the damping to begin with."""
 
     tolerance: float = 3e-5
     max_iterations: int = 30
     max_backtracks: int = 12
+    damping: float = 0.0
 
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """Where Newton stopped: ``reason`` is empty at equilibrium."""
+    """Where Newton stopped: ``reason`` is empty at equilibrium; ``damped``: it had to shorten a step much."""
 
     u: Array
     at: Evaluation
     iterations: int
     reason: str = ""
+    damped: bool = False
 
 
 def equilibrate(
@@ -51,30 +66,42 @@ def equilibrate(
     u, here = _lowest(evaluate, guesses, deep)
     if not np.isfinite(here.energy):
         return Equilibrium(u, here, 0, "an element is inverted at the start of the step")
-    last = np.inf
+    last, damping, damped = np.inf, control.damping, False
     for iteration in range(control.max_iterations):
         norm = residual_norm(system, here)
         scale = reaction_scale(system, here, floor)
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
         if norm <= control.tolerance * scale or rounding:
-            return Equilibrium(u, here, iteration)
+            return Equilibrium(u, here, iteration, damped=damped)
         if not np.isfinite(norm):
             return Equilibrium(u, here, iteration, "the residual is not finite")
         if here.data is None:
             here = evaluate(u)
         forcing = min(0.02, max(0.1 * norm / scale, 0.3 * control.tolerance * scale / norm))
         try:
-            direction = newton_direction(system, here, factor, forcing)
+            direction = newton_direction(system, here, factor, forcing, damping)
         except NotPositiveDefiniteError:
             return Equilibrium(u, here, iteration, "the tangent cannot be factorised")
         last = norm
+        if norm <= NEAR * scale:
+            evaluate.exactly()
         found = _line_search(evaluate, u, here, direction, control)
         if found is None:
             if norm <= 100 * control.tolerance * scale:
-                return Equilibrium(u, here, iteration)
+                return Equilibrium(u, here, iteration, damped=damped)
             return Equilibrium(u, here, iteration, "the line search found no lower energy")
-        u, here = found
+        u, here, step = found
+        damping, damped = _damped(damping, step), damped or step < SHORT_STEP
     return Equilibrium(u, here, control.max_iterations, "Newton's method did not converge")
+
+
+def _damped(damping: float, step: float) -> float:
+    """The damping after a step of this length."""
+    if step < SHORT_STEP:
+        return max(DAMPING_CHANGE * damping, FIRST_DAMPING)
+    if step >= 1.0:
+        damping /= DAMPING_CHANGE
+    return damping if damping >= LEAST_DAMPING else 0.0
 
 
 def _lowest(evaluate: _Evaluator, guesses: Sequence[Array], deep: float) -> tuple[Array, Evaluation]:
@@ -107,6 +134,10 @@ class _Evaluator:
     ) -> None:
         self._system, self._laws, self._increment, self._seconds = system, laws, increment, seconds
 
+    def exactly(self) -> None:
+        """From here on with the indenter's curvature everywhere."""
+        self._increment = replace(self._increment, flat_from=np.inf)
+
     def __call__(self, u: Array, tangent: bool = True) -> Evaluation:
         started = time.perf_counter()
         at = self._system.evaluate(u, self._laws, self._increment, tangent)
@@ -116,8 +147,11 @@ class _Evaluator:
 
 def _line_search(
     evaluate: _Evaluator, u: Array, here: Evaluation, direction: Array, control: NewtonControl
-) -> tuple[Array, Evaluation] | None:
-    """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005)."""
+) -> tuple[Array, Evaluation, float] | None:
+    """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005).
+
+    The displacement, its evaluation and the step along ``direction``.
+    """
     slope = float((here.residual * direction).sum())
     if not slope < 0.0:
         return None
@@ -138,7 +172,7 @@ def _line_search(
 
 def _expanded(
     evaluate: _Evaluator, u: Array, there: Evaluation, direction: Array, step: float, slope: float, end: float
-) -> tuple[Array, Evaluation]:
+) -> tuple[Array, Evaluation, float]:
     """A step of a shifted tangent is too short: it is doubled while the energy goes on falling as fast."""
     while end < 0.5 * slope:
         further = evaluate(u + 2.0 * step * direction, tangent=False)
@@ -146,4 +180,4 @@ def _expanded(
             break
         step, there = 2.0 * step, further
         end = float((there.residual * direction).sum())
-    return u + step * direction, there
+    return u + step * direction, there, step

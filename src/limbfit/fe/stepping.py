@@ -21,7 +21,7 @@ from .factor import Factor
 from .history import Memory
 from .indenter import Indenter
 from .laws import Laws
-from .newton import Equilibrium, NewtonControl, equilibrate, reaction_scale
+from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .problem import History, Problem, ProblemError
 from .result import Result, State, Step
 from .sensitivity import MemoryDerivative
@@ -32,6 +32,8 @@ from .threads import single_threaded_numpy
 Array = NDArray[np.float64]
 # Residual of the sensitivities' linear systems, relative to their right-hand sides.
 SENSITIVITY_TOLERANCE = 1e-5
+# Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
+STEEP_PRESSURE = 15.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class StepControl:
     times: tuple[float, ...] | None = None
     tolerance: float = 3e-5
     max_iterations: int = 60
-    most_iterations: int = 600
+    most_iterations: int = 1500
     max_cuts: int = 8
     penetration: float = 0.01
     penalty: float | None = None
@@ -123,6 +125,7 @@ class Simulation:
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
+        self.damping = 0.0  # to begin a step with, after one that needed it
         self.anchors: Anchors | None = None
         if problem.friction == "sticky" and self.system.surface is not None:
             self.anchors = Anchors.none(self.system.surface, self.laws.count if sensitivities else 0)
@@ -173,7 +176,7 @@ class Simulation:
             increment = self.memory.increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
             )
-            increment = replace(increment, anchors=anchors)
+            increment = replace(increment, anchors=anchors, flat_from=STEEP_PRESSURE / stiffness)
             found = self._equilibrate(increment, u)
             if found.reason:
                 return found.reason
@@ -202,14 +205,14 @@ class Simulation:
                 increment,
                 tried,
                 self.factor,
-                self.control.newton,
+                replace(self.control.newton, damping=self.damping),
                 self.floor,
                 self.deepest,
                 self.seconds,
             )
             self.counts["newton_iterations"] += found.iterations
-            if not found.reason or self.counts["newton_iterations"] > self.control.most_iterations:
-                break
+            if not found.reason or found.iterations >= self.control.max_iterations:
+                break  # from elsewhere it would take as many
         return found
 
     def _predict(self, t: float, displacement: float) -> Array:
@@ -224,8 +227,9 @@ class Simulation:
         u, at = found.u, found.at
         after = self.memory.advanced(self.system, self.laws, u, dt)
         worn = self.slopes.worn()
-        if at.data is None and (worn or self.slope is not None):
-            at = self.system.evaluate(u, self.laws, increment)
+        inexact = at.data is None or at.penetration > increment.flat_from
+        if inexact and (worn or self.slope is not None):
+            at = self.system.evaluate(u, self.laws, replace(increment, flat_from=np.inf))
             found = replace(found, at=at)
         if worn:
             renew(at, self.slopes)
@@ -237,6 +241,7 @@ class Simulation:
         if increment.anchors is not None:
             self.anchors = increment.anchors.after(*self._tool(increment), u, du)
         self.memory, self.stiffness = after, stiffness
+        self.damping = FIRST_DAMPING if found.damped else 0.0
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
         state = State(increment.time, increment.displacement, u, stiffness, du, after)
         self.states = [*self.states[-2:], state]

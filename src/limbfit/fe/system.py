@@ -34,7 +34,8 @@ class Increment:
     """What is constant while one step is solved.
 
     ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; ``anchors``
-    hold the points that stick, where contact is sticky.
+    hold the points that stick, where contact is sticky; points deeper than ``flat_from`` (mm) have the
+    tangent of a flat indenter.
     """
 
     time: float
@@ -43,6 +44,7 @@ class Increment:
     history: Array
     penalty: float
     anchors: Anchors | None = None
+    flat_from: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -221,8 +223,8 @@ class System:
         centre = np.asarray(self.indenter.centre) + increment.displacement * frame[2]
         return contact(
             surface.faces, surface.N, surface.areas, self.points, u, centre, frame, self.indenter.kernel,
-            increment.penalty, (anchors.held, anchors.places, anchors.normals), tangent, self.face_positions,
-            pushed, data, advance, *points,
+            increment.penalty, increment.flat_from, (anchors.held, anchors.places, anchors.normals), tangent,
+            self.face_positions, pushed, data, advance, *points,
         )  # fmt: skip
 
     def with_springs(self, data: Array, blocks: Array) -> Array:

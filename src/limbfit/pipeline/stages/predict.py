@@ -49,7 +49,8 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         simulations.append(simulation)
         context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
     n = len(records)
-    ours, simple, coarse = simulations[:n], simulations[n : len(found) * n], simulations[len(found) * n :]
+    ours, others = simulations[:n], simulations[n:]
+    coarse, simple = ([], others) if study.mesh.coarse is None else (others[:n], others[n:])
     if coarse:
         simple = [
             s if record.site.fitted else _fine_force(s, fine, rough)
@@ -84,11 +85,11 @@ def _jobs(
     best: Array,
     simple: tuple[Array, Array | None] | None,
 ) -> list[SimulationJob]:
-    """Every record with all materials, then with one (unless None), then on coarse meshes where there are.
+    """Every record with all materials, then so on coarse meshes where there are, then with one (unless None).
 
     At the fitted sites the calibration has simulated the one material already. With coarse meshes derivatives
-    are theirs, and so is the one material's force at held-out sites; without, its simulation there starts
-    from that with all, which has just been done.
+    are theirs, and so is the one material's force at held-out sites. Its simulation there starts from that
+    with all materials and derivatives, which has just been done.
     """
     one, guess = (None, None) if simple is None else simple
     if context.study.mesh.coarse is None:
@@ -101,10 +102,15 @@ def _jobs(
         return jobs
     coarse = [site_record(context, record.site, coarse=True) for record in records]
     jobs = [record.job(best, sensitivities=False) for record in records]
+    jobs += [record.job(best) for record in coarse]
     if one is not None:
-        pairs = zip(records, coarse, strict=True)
-        jobs += [(fine if fine.site.fitted else rough).job(one, sensitivities=False) for fine, rough in pairs]
-    return jobs + [record.job(best) for record in coarse]
+        jobs += [
+            fine.job(one, sensitivities=False)
+            if fine.site.fitted
+            else rough.job(one, sensitivities=False, start=best)
+            for fine, rough in zip(records, coarse, strict=True)
+        ]
+    return jobs
 
 
 def _with_derivatives(fine: Simulation, coarse: Simulation) -> Simulation:
