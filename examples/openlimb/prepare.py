@@ -27,7 +27,7 @@ bones = { tibia = "surfaces/tibia.stl", fibula = "surfaces/fibula.stl" }
 [geometry]
 skin_layer_mm = 3.0
 
-[mesh]                          # about 20,000 nodes a site, as FEBio's
+[mesh]                          # about 15,000 nodes a site (FEBio's have 20,000)
 element = "tet10"
 edge_near_mm = 3.6
 edge_far_mm = 16.0
