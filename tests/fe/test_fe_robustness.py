@@ -100,6 +100,14 @@ def test_what_is_not_reached_is_said(robustness):
     assert np.isfinite(result.force_at(np.linspace(0.0, 12.5, 5))).all()
 
 
+def test_iterations_in_all_are_bounded_though_every_step_converges():
+    result = solve(punch("tet10", 2, 1), StepControl(most_iterations=10), store="all")
+    assert not result.completed
+    assert result.reason.endswith("s of 12.5 s: no more than 10 Newton iterations were allowed")
+    assert len(result.times) > 1
+    assert 10 <= result.statistics["newton_iterations"] < 10 + StepControl().max_iterations
+
+
 @pytest.mark.parametrize(("element", "folded"), [("tet10", True), ("tet10v", False)])
 def test_elements_that_fold_in_their_corners_are_told(element, folded):
     """One node of a cube's top pushed in by 6 of 10 mm: points inside the elements do not see them fold."""

@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limbfit.identify.plausibility import UNITS, RecordFacts, implausible, layer_factor
+from limbfit.identify.plausibility import (
+    UNITS,
+    Flag,
+    RecordFacts,
+    explained,
+    implausible,
+    layer_factor,
+)
 
 RADIUS = 20 / np.sqrt(np.pi)
 THICKNESS = (24.0, 8.0, 40.0, 20.0, 35.0, 12.0)
@@ -114,3 +121,19 @@ def test_flags_say_what_why_and_what_to_do():
     for part in ("s0", "times", "likely", "convert"):
         assert part in told["text"]
     assert told["evidence"]["modulus_ratio"] > 4
+
+
+def test_a_unit_that_the_record_shows_is_the_only_cause_told():
+    """A displacement in cm looks like ten times the force to the model."""
+    facts = study()
+    facts[3] = recorded(facts[3], 1.0, 0.1, 1.0)
+    in_records = implausible(facts)
+    missed = [
+        Flag((site,), "unit", "predicted far too soft", {}, "force in kgf", "convert the force to N")
+        for site in ("s3", "s4")
+    ]
+    told = explained(missed, in_records)
+    assert [flag.sites for flag in in_records] == [("s3",)]
+    assert (told[0].cause, told[0].remedy) == (in_records[0].cause, in_records[0].remedy)
+    assert "displacement" in told[0].cause
+    assert told[1] == missed[1]

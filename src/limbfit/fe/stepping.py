@@ -143,24 +143,27 @@ class Simulation:
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
         targets = list(schedule(self.problem.history, self.control))
-        cuts = 0
+        cuts, why = 0, ""
         while targets:
-            now = self.states[-1].time
+            now, spent = (
+                self.states[-1].time,
+                self.counts["newton_iterations"] >= self.control.most_iterations,
+            )
+            if spent:
+                bound = f"no more than {self.control.most_iterations} Newton iterations were allowed"
+                why = f"{why}; {bound}" if why else bound
+            if spent or cuts > self.control.max_cuts:
+                self.reason = f"stopped at {now:.4g} s of {targets[-1]:.4g} s: {why}"
+                return
             with single_threaded_numpy():
                 found = self._attempt(targets[0])
             if not isinstance(found, str):
-                cuts = max(cuts - 1, 0)
+                cuts, why = max(cuts - 1, 0), ""
                 targets.pop(0)
                 yield found
                 continue
             self.counts["cuts"] += 1
-            cuts += 1
-            if self.counts["newton_iterations"] > self.control.most_iterations:
-                found = f"{found}; no more than {self.control.most_iterations} Newton iterations were allowed"
-                cuts = self.control.max_cuts + 1
-            if cuts > self.control.max_cuts:
-                self.reason = f"stopped at {now:.4g} s of {targets[-1]:.4g} s: {found}"
-                return
+            cuts, why = cuts + 1, found
             targets.insert(0, 0.5 * (now + targets[0]))
 
     def _attempt(self, t: float) -> Step | str:

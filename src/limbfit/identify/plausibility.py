@@ -79,6 +79,20 @@ class Flag:
         return {**asdict(self), "sites": list(self.sites), "evidence": dict(self.evidence), "text": self.text}
 
 
+def explained(found: Sequence[Flag], in_records: Sequence[Flag]) -> list[Flag]:
+    """Flags against the model; where a record itself shows a wrong unit, that is their cause, and no other.
+
+    The model compares forces, and takes a wrong displacement for a wrong force.
+    """
+    units = {flag.sites: flag for flag in in_records if flag.kind == "unit"}
+    return [
+        replace(flag, cause=units[flag.sites].cause, remedy=units[flag.sites].remedy)
+        if flag.sites in units
+        else flag
+        for flag in found
+    ]
+
+
 @dataclass(frozen=True)
 class RecordFacts:
     """A site and its record in numbers; what is not known (yet) is None.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...identify.objective import Measured, SiteResponse
 from ...identify.outliers import Exchange, FirstOrder, as_driven, find_outliers
+from ...identify.plausibility import explained
 from ...indentation import Simulation, SimulationJob
 from ..context import Context
 from ..simulations import SimulationCache
@@ -62,7 +63,8 @@ def outlier_record(
     )
     left_out = [{**asdict(entry), "standardised": entry.standardised} for entry in found.left_out]
     flags = [flag.to_dict() | {"found": "in the record"} for flag in plain]
-    flags += [flag.to_dict() | {"found": "against the model"} for flag in found.flags]
+    against = explained(found.flags, plain)
+    flags += [flag.to_dict() | {"found": "against the model"} for flag in against]
     return {"flags": flags, "left_out": left_out}
 
 
