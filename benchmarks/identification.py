@@ -70,22 +70,22 @@ class Study:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        made = make_study(folder / "study")
-        run_study(load_study(made), until="mesh", listener=quiet)
+        self.made = make_study(folder / "study")
+        run_study(load_study(self.made), until="mesh", listener=quiet)
 
     def clean(self) -> Path:
         """A copy that is run to the end."""
-        copy = self.copy("clean", "study")
+        copy = self.copy("clean", self.made)
         run_study(load_study(copy), until="predict", listener=quiet)
         return copy
 
-    def copy(self, name: str, of: str) -> Path:
-        """A copy of ``study`` or ``clean``; one that was begun is gone on with."""
+    def copy(self, name: str, of: Path) -> Path:
+        """A copy of one of the two; one that was begun is gone on with."""
         place = self.folder / name
         if not place.is_dir():
             draft = self.folder / f".{name}"
             shutil.rmtree(draft, ignore_errors=True)
-            shutil.copytree(self.folder / of, draft)
+            shutil.copytree(of, draft)
             draft.rename(place)
         return place
 
@@ -126,10 +126,9 @@ def run_wrong(study: Study, case: Case) -> Record:
     """A case: flags of the check and of the prediction, or the words in which it was refused."""
     began = cpu_s()
     name = case.name.replace(" ", "-")
-    study.clean()
-    copy = study.folder / name
+    clean, copy = study.clean(), study.folder / name
     if not copy.is_dir():
-        draft = study.copy(f"{name}.begun", "clean")
+        draft = study.copy(f"{name}.begun", clean)
         sites = true_sites()
         case.change(draft, sites)
         write_study(draft, sites)
@@ -326,7 +325,7 @@ def summary_failing(cases: Sequence[Record]) -> Record:
 def run_start(study: Study, number: int, count: int, seed: int) -> Record:
     """The identification from one of the starts; the first is the paper's."""
     began = cpu_s()
-    copy = study.copy(f"start-{seed}-{number}", "clean" if number == 0 else "study")
+    copy = study.copy(f"start-{seed}-{number}", study.made if number else study.clean())
     start = random_starts(unknowns(load_study(copy)), count, seed)[number]
     values = to_parameters(start, ("skin", "muscle"))["skin"]
     table = ", ".join(f"{name} = {value!r}" for name, value in values.items())
