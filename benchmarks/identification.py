@@ -241,7 +241,7 @@ def run_failing(study: Study, rate: float, seed: int) -> Record:
     """The identification with failures, beside that of ``clean``: parameters, and forces at all sites."""
     began = cpu_s()
     clean = study.clean()
-    copy = study.copy(f"failures-{rate:g}-{seed}", "study")
+    copy = study.copy(f"failures-{rate:g}-{seed}", study.made)
     told: Record = {"case": f"{100 * rate:g} % fail, draw {seed}", "refused": ""}
     try:
         with sharing(Failing(rate, seed)):

@@ -195,6 +195,8 @@ class Alone:
         self.chromium, self.errors = playwright.chromium, []
         note = place / "DevToolsActivePort"
         while not note.exists():
+            if self.process.poll() is not None:
+                raise SystemExit(f"the browser did not start; it ended with {self.process.poll()}")
             time.sleep(0.2)
         self.port = int(note.read_text().split()[0])
         self._attached(lambda page: page.evaluate(TOUR, [list(VIEWS), stay_s]))
@@ -230,6 +232,7 @@ class Alone:
             keep({"minutes": (now - start) / 60, "server": server.memory_info().rss / 1e6} | self.reading())
             time.sleep(options.every)
         self.said()
+        keep({"minutes": options.minutes, "server": server.memory_info().rss / 1e6} | self.reading())
 
     def close(self) -> None:
         self.process.terminate()
