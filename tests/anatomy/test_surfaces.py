@@ -11,7 +11,7 @@ import pytest
 import pyvista as pv
 from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
 
-from limbfit.anatomy.extraction import fine_surface
+from limbfit.anatomy.extraction import fine_surface, untangled
 from limbfit.anatomy.imaging import LabelMap, read_volume
 from limbfit.anatomy.surfaces import (
     Anatomy,
@@ -190,6 +190,19 @@ def test_smoothing_and_coarse_triangles_keep_the_volume(edge):
     volume = labels.mask("tibia").sum() * labels.voxel_mm3
     assert fine_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
     assert extract_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
+
+
+def test_folded_triangles_are_untangled():
+    surface = ball(centre=(0, 0, 0))
+    points = surface.points.copy()
+    first, second = points[0], points[np.argsort(np.linalg.norm(points - points[0], axis=1))[12]]
+    points[0] = first + 1.3 * (second - first)  # beyond its neighbours: their triangles lie over others
+    folded = Surface(points, surface.faces)
+    assert len(self_intersections(folded)) > 0
+    mended = untangled(folded)
+    assert len(self_intersections(mended)) == 0
+    assert np.median(np.linalg.norm(mended.points - surface.points, axis=1)) == 0
+    assert np.abs(np.linalg.norm(mended.points, axis=1) - 50).max() < 3
 
 
 def test_only_the_largest_body_is_kept():

@@ -18,7 +18,7 @@ from scipy.ndimage import label as connected
 
 from ..errors import LabelError
 from .grid import Grid, LabelMap, Volume
-from .triangles import Surface, bodies, from_pyvista
+from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -29,6 +29,7 @@ _SIGMA_VOXELS = 0.7
 _TAUBIN_SKIN, _TAUBIN_BONE = (80, 0.008), (40, 0.03)
 _MARGIN_MM = 4.0
 _REMESH_PASSES = 8
+_MOST_RELAXED = 20
 
 
 def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -> Surface:
@@ -51,7 +52,7 @@ def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -
         Where there is nothing to extract.
     """
     fine = fine_surface(labels, which, edge_mm)
-    return keep_volume(remesh(fine, edge_mm), fine.volume)
+    return untangled(keep_volume(untangled(remesh(fine, edge_mm)), fine.volume))
 
 
 def fine_surface(labels: LabelMap, which: str | None, edge_mm: float) -> Surface:
@@ -156,6 +157,27 @@ def remesh(
         feature_edges=None if creases is None else creases.astype(np.int32),
     )
     return Surface(points, faces)
+
+
+def untangled(surface: Surface) -> Surface:
+    """Without faces that cross: their points go half-way to the mean of their neighbours, until none do.
+
+    Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at the patella's rim.
+    What still crosses after that is left to the check of the anatomy.
+    """
+    edges = half_edges(surface.faces)
+    for _ in range(_MOST_RELAXED):
+        crossing = self_intersections(surface)
+        if not len(crossing):
+            break
+        moved = np.unique(surface.faces[np.unique(crossing)])
+        means = np.zeros_like(surface.points)
+        np.add.at(means, edges[:, 0], surface.points[edges[:, 1]])
+        means /= np.bincount(edges[:, 0], minlength=len(means))[:, None]
+        points = surface.points.copy()
+        points[moved] = 0.5 * (points[moved] + means[moved])
+        surface = Surface(points, surface.faces)
+    return surface
 
 
 def keep_volume(surface: Surface, volume: float) -> Surface:
