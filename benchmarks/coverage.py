@@ -6,10 +6,11 @@
 The truth is the study's identified model, on the emulator that ``limbfit uncertainty`` made of its solver.
 Every repeat records the true forces as the robot does (500 Hz, noise of 0.05 N), regularises them as the
 stage ``traces`` does (with the penalty that suits the site best: to find it anew by cross-validation takes
-twenty times as long), calibrates on the emulator and estimates the uncertainty as the stage ``calibrate``
-does. A touch-down that is off by as much as the study states of its own moves each curve. The noise that is
-left after regularising is correlated from point to point. With ``--misfit`` the model is wrong as well: a
-smooth error of so many percent of the largest force, of another shape than the one that the method assumes.
+twenty times as long), calibrates on the emulator, estimates the uncertainty as the stage ``calibrate`` does,
+and samples the posterior as ``limbfit uncertainty`` does (``--steps 0``: not). A touch-down that is off by
+as much as the study states of its own moves each curve. The noise that is left after regularising is
+correlated from point to point. With ``--misfit`` the model is wrong as well: a smooth error of so many
+percent of the largest force, of another shape than the one that the method assumes.
 """
 
 from __future__ import annotations
@@ -24,19 +25,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from limbfit import load_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify import Measured, SiteNoise, record_noise
+from limbfit.identify import Emulator, Measured, SiteNoise, SiteResponse, Unknowns, record_noise
 from limbfit.identify.coverage import Coverage, coverage_study
-from limbfit.identify.noise import loading_slope
+from limbfit.identify.noise import depth_slope
 from limbfit.phantom.record import RATE_HZ
 from limbfit.pipeline.context import Context
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.pipeline.stages.calibrate import unknowns
 from limbfit.pipeline.stages.traces import SiteRecord, site_record
 from limbfit.pipeline.store import Store
-from limbfit.traces import TouchDown, Trace, regularise
+from limbfit.traces import Regularised, TouchDown, Trace, regularise
 
 Array = NDArray[np.float64]
 BEFORE_S = 0.3  # in the air
@@ -45,7 +47,7 @@ SMOOTHINGS = tuple(10.0**k for k in range(-4, 4))  # s^3
 
 @dataclass(frozen=True)
 class Robot:
-    """Makes records of true forces at the sites of a study.
+    """Makes records of the true ``forces`` at the sites of a study.
 
     ``noise_N`` at 500 Hz with ``autocorrelation`` of neighbours; ``touch_down_mm`` (sites,) is the standard
     deviation of a touch-down, ``smoothing`` (sites,) the penalty on roughness; ``misfit`` is the error of the
@@ -53,6 +55,7 @@ class Robot:
     """
 
     records: tuple[SiteRecord, ...]
+    forces: tuple[Array, ...]
     touch_down_mm: tuple[float, ...]
     smoothing: tuple[float, ...]
     noise_N: float
@@ -60,18 +63,18 @@ class Robot:
     misfit: float
     seed: int
 
-    def __call__(self, repeat: int, forces: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
+    def __call__(self, repeat: int, smoothed: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
         random = np.random.default_rng([self.seed, repeat])
         measured, noise = [], []
-        sites = zip(self.records, forces, self.touch_down_mm, self.smoothing, strict=True)
-        for record, force, sd, smoothing in sites:
+        sites = zip(self.records, self.forces, smoothed, self.touch_down_mm, self.smoothing, strict=True)
+        for record, force, answer, sd, smoothing in sites:
             true = force + self._wrong(random, record.times_s, force)
-            true = true + sd * random.standard_normal() * loading_slope(record.displacement_mm, force)
-            curve, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
+            true = true + sd * random.standard_normal() * depth_slope(record.displacement_mm, force)
+            smooth, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
+            curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
             measured.append(Measured(record.site.name, curve))
-            noise.append(
-                record_noise(record.site.name, record.times_s, residual, curve, record.displacement_mm, sd)
-            )
+            site = record.site.name, record.times_s, residual, answer, record.displacement_mm, sd
+            noise.append(record_noise(*site, smooth.curve.response(record.times_s)))
         return measured, noise
 
     def _wrong(self, random: np.random.Generator, times: Array, force: Array) -> Array:
@@ -86,8 +89,8 @@ class Robot:
 
     def regularised(
         self, random: np.random.Generator, record: SiteRecord, force: Array, smoothing: float
-    ) -> tuple[Array, Array]:
-        """The curve at the record's times, and what was smoothed away."""
+    ) -> tuple[Regularised, Array]:
+        """The smoothed record, from touch-down on, and what was smoothed away."""
         end = record.times_s[-1]
         time = np.arange(0.0, BEFORE_S + end + 1e-9, 1 / RATE_HZ)
         since = time - BEFORE_S
@@ -97,9 +100,13 @@ class Robot:
         depth = np.interp(since, record.times_s, record.displacement_mm)
         touch = TouchDown(BEFORE_S, 0.0, 0.0, 1.0, 0.0, False)
         smooth = regularise(Trace(time, depth, raw), touch, smoothing)
-        curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
         inside = since >= 0
-        return curve, raw[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+        return smooth, raw[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+
+    def response(self, record: SiteRecord, force: Array, smoothing: float) -> Array:
+        """What smoothing makes of forces (n, n); it depends on the times and the penalty alone."""
+        smooth, _ = self.regularised(np.random.default_rng(self.seed), record, force, smoothing)
+        return smooth.curve.response(record.times_s)
 
     def _noise(self, random: np.random.Generator, n: int) -> Array:
         white = random.standard_normal(n)
@@ -110,10 +117,25 @@ class Robot:
         return self.noise_N * noise
 
 
+@dataclass(frozen=True)
+class Smoothed:
+    """An emulator whose forces are smoothed, by a matrix (n, n) per site, as their records are."""
+
+    emulator: Emulator
+    responses: tuple[Array, ...]
+
+    def __call__(self, parameters: Array) -> list[SiteResponse]:
+        found = zip(self.responses, self.emulator(parameters), strict=True)
+        return [SiteResponse(S @ r.force_N, S @ r.jacobian) for S, r in found]
+
+    def forces(self, parameters: Array) -> Array:
+        return self.emulator.forces(parameters) @ block_diag(*self.responses).T
+
+
 def study_robot(
     study_file: Path, noise_N: float, autocorrelation: float, misfit: float, seed: int
-) -> tuple[Robot, Array, Any, Any]:
-    """The robot of a study, the truth (p,), the emulator and the unknowns."""
+) -> tuple[Robot, Array, Smoothed, Unknowns]:
+    """The robot of a study, the truth (p,), what is fitted to its records, and the unknowns."""
     study = load_study(study_file)
     store = Store(study.results)
     context = Context(study, store, SerialExecutor(), lambda progress: None)
@@ -123,10 +145,12 @@ def study_robot(
     records = tuple(site_record(context, site) for site in study.fitted)
     touch = tuple(float(traces[site.name]["touch_down_uncertainty_mm"]) for site in study.fitted)
     emulator = read_emulator(store["uncertainty"] / EMULATOR)
-    robot = Robot(records, touch, (0.0,) * len(records), noise_N, autocorrelation, misfit, seed)
-    forces = [response.force_N for response in emulator(truth)]
+    forces = tuple(response.force_N for response in emulator(truth))
+    robot = Robot(records, forces, touch, (0.0,) * len(records), noise_N, autocorrelation, misfit, seed)
     smoothing = tuple(best_smoothing(robot, *pair) for pair in zip(records, forces))
-    return replace(robot, smoothing=smoothing), truth, emulator, unknowns(study)
+    robot = replace(robot, smoothing=smoothing)
+    responses = tuple(robot.response(*site) for site in zip(records, forces, smoothing))
+    return robot, truth, Smoothed(emulator, responses), unknowns(study)
 
 
 def best_smoothing(robot: Robot, record: SiteRecord, force: Array) -> float:
@@ -134,26 +158,21 @@ def best_smoothing(robot: Robot, record: SiteRecord, force: Array) -> float:
 
     def error(smoothing: float) -> float:
         random = np.random.default_rng(robot.seed)
-        curves = [robot.regularised(random, record, force, smoothing)[0] for _ in range(3)]
+        found = [robot.regularised(random, record, force, smoothing)[0] for _ in range(3)]
+        curves = [np.interp(record.times_s, one.time_s, one.force_N) for one in found]
         return float(np.mean([np.mean((curve - force) ** 2) for curve in curves]))
 
     return min(SMOOTHINGS, key=error)
 
 
-def summary(found: Coverage, robot: Robot) -> dict[str, Any]:
+def summary(found: Coverage) -> dict[str, Any]:
     low, high = found.limits()
     return {
-        "repeats": len(found.deviations),
-        "noise_N": robot.noise_N,
-        "autocorrelation": robot.autocorrelation,
-        "misfit_percent": 100 * robot.misfit,
-        "coverage_determined_percent": 100 * found.share,
+        "determined_percent": 100 * found.share,
         "determined_per_repeat": float(found.determined.sum(axis=1).mean()),
-        "coverage_by_combination_percent": (100 * found.by_combination).tolist(),
+        "by_combination_percent": (100 * found.by_combination).tolist(),
         "binomial_limits_percent": [100 * low, 100 * high],
-        "coverage_by_parameter_percent": (100 * found.by_parameter).tolist(),
-        "estimated_misfit_percent": float(np.median(found.misfit_percent)),
-        "cpu_seconds": resource.getrusage(resource.RUSAGE_SELF).ru_utime,
+        "by_parameter_percent": (100 * found.by_parameter).tolist(),
     }
 
 
@@ -161,6 +180,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("study", type=Path)
     parser.add_argument("--repeats", type=int, default=200)
+    parser.add_argument(
+        "--steps", type=int, default=1500, help="of the sampler; 0: linearised intervals only"
+    )
     parser.add_argument("--noise", type=float, default=0.05, help="N, standard deviation at 500 Hz")
     parser.add_argument("--autocorrelation", type=float, default=0.0, help="of neighbouring samples")
     parser.add_argument("--misfit", type=float, default=0.0, help="percent of the largest force")
@@ -170,7 +192,17 @@ def main() -> None:
     robot, truth, emulator, free = study_robot(
         given.study, given.noise, given.autocorrelation, given.misfit / 100, given.seed
     )
-    told = summary(coverage_study(emulator, truth, free, robot, given.repeats), robot)
+    found = coverage_study(emulator, truth, free, robot, given.repeats, given.steps)
+    told = {
+        "repeats": given.repeats,
+        "noise_N": robot.noise_N,
+        "autocorrelation": robot.autocorrelation,
+        "misfit_percent": 100 * robot.misfit,
+        "estimated_misfit_percent": float(np.median(found.linearised.misfit_percent)),
+        "linearised": summary(found.linearised),
+        "sampled": None if found.sampled is None else summary(found.sampled),
+        "cpu_seconds": resource.getrusage(resource.RUSAGE_SELF).ru_utime,
+    }
     print(json.dumps(told, indent=1))
     if given.json:
         given.json.write_text(json.dumps(told, indent=1))

@@ -6,6 +6,7 @@ G(t) = 1 + gamma exp(-t / tau): it starts with slack, is pushed in at constant s
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from scipy.io import savemat
 
 from limbfit.errors import TraceError
 from limbfit.traces import Trace, check_trace, find_touch_down, read_trace, regularise, touch_down_at
+from limbfit.traces.regularise import _spline
 
 SHARED = Path(__file__).parents[1] / ".." / "shared"
 OPENLIMB = SHARED / "reference" / "openlimb-study"
@@ -329,6 +331,29 @@ def test_coarse_and_clean_records_are_not_blurred():
     curve = regularise(trace, touch)
     assert curve.peak_force_N == pytest.approx(truth(5.4 / 0.96), rel=0.01)
     assert np.abs(curve.force_N - truth(curve.time_s + touch.time_s)).max() < 0.08 * curve.peak_force_N
+
+
+def test_what_smoothing_does_to_another_force_is_known():
+    noisy, _ = record(noise_N=0.05)
+    touch = find_touch_down(noisy)
+    smooth = regularise(noisy, touch, 0.1)
+    times = smooth.resample(80).time_s
+    force = 8 * np.sin(np.pi * times / times[-1]) ** 0.7
+    smoothed = smooth.curve.response(times) @ force
+    raw = np.interp(noisy.time_s - touch.time_s, times, force)
+    other, clean = dataclasses.replace(noisy, force_N=raw), dataclasses.replace(touch, baseline_N=0.0)
+    again = regularise(other, clean, 0.1)
+    assert np.interp(times, again.time_s, again.force_N) == pytest.approx(smoothed, abs=1e-3)
+    assert np.abs(smoothed - force).max() > 0.02  # the steep start is blunted
+
+
+def test_the_penalty_of_cross_validation_is_found_out():
+    x = np.linspace(0, 3, 150)
+    y, w = np.sin(2 * x) + 0.1 * np.random.default_rng(3).standard_normal(150), np.full(150, 4.0)
+    chosen, penalty = _spline(x, y, w, None, {0.0: np.array(0.0)})
+    given, _ = _spline(x, y, w, penalty, {0.0: np.array(0.0)})
+    assert penalty > 0
+    assert given(x) == pytest.approx(chosen(x), abs=1e-7)
 
 
 def test_resampling_keeps_corners_peak_and_ends():

@@ -10,7 +10,8 @@ from limbfit.identify import SiteResponse, calibrate, estimate_uncertainty, sepa
 from limbfit.identify.coverage import coverage_study
 from limbfit.identify.explore import ExploreSettings, explore
 from limbfit.identify.noise import curve_noise
-from limbfit.identify.parameters import search_space
+from limbfit.identify.parameters import search_space, shared
+from limbfit.identify.posterior import Posterior, principal_axes
 from limbfit.identify.sources import Gain
 
 SPACE = search_space(PAPER, separate(NAMES))
@@ -84,10 +85,29 @@ def test_coverage_of_whole_calibrations():
         left = [d.force_N - f for d, f in zip(data, forces)]
         return data, [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
 
-    found = coverage_study(simulate, TRUTH, PAPER, record, repeats=20)
+    found = coverage_study(simulate, TRUTH, PAPER, record, repeats=20).linearised
     assert found.determined.all()
     assert 0.88 < found.share <= 1.0
     low, high = found.limits()
     assert low == pytest.approx(0.85)
     assert high == pytest.approx(1.0)
     assert found.by_parameter.mean() > 0.85
+
+
+def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
+    rng = np.random.default_rng(0)
+    along = rng.normal(0, 0.6, 4000)
+    logs = np.log(TRUTH) + 0.02 * rng.standard_normal((4000, TRUTH.size))
+    logs[:, 0] += along
+    logs[:, 1] += 0.5 * along**2
+    posterior = Posterior(NAMES, np.exp(logs), np.ones(4000), 0.3, 1.0, 4000.0, True)
+    axes = principal_axes(posterior, SPACE)
+    assert axes @ axes.T == pytest.approx(np.eye(TRUTH.size), abs=1e-12)
+    widths = (np.log(posterior.draws) @ axes.T).std(axis=0)
+    assert (np.diff(widths) > 0).all()
+    assert widths[-2] == pytest.approx(np.sqrt(0.5) * 0.6**2, rel=0.1)  # of half the square
+    assert abs(axes[-2, 1]) > 0.95
+    tied = search_space(PAPER, shared(NAMES))
+    rows = principal_axes(posterior, tied)
+    assert rows.shape == (4, TRUTH.size)
+    assert rows[:, :4] == pytest.approx(rows[:, 4:])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.identify.noise import block_covariance, curve_noise, loading_slope, record_noise
+from limbfit.identify.noise import block_covariance, curve_noise, depth_slope, record_noise
 
 
 def drift(rng, n, lag):
@@ -38,11 +38,20 @@ def test_a_record_tells_its_noise():
 def test_a_doubtful_touch_down_moves_the_whole_curve():
     depth = np.r_[np.linspace(0, 4, 20), np.linspace(4, 0, 20)[1:]]
     force = depth**2
-    slope = loading_slope(depth, force)
+    slope = depth_slope(depth, force)
     assert slope == pytest.approx(2 * depth, abs=0.25)
     sure = record_noise("a", np.arange(39.0), np.zeros(400), force, depth)
     doubtful = record_noise("a", np.arange(39.0), np.zeros(400), force, depth, 0.05)
     assert doubtful.covariance - sure.covariance == pytest.approx(0.05**2 * np.outer(slope, slope))
+
+
+def test_a_tissue_that_has_let_go_does_not_feel_the_touch_down():
+    depth = np.r_[np.linspace(0, 4, 20), np.linspace(4, 0, 20)[1:]]
+    relaxed = np.r_[np.linspace(0, 4, 20) ** 2, np.maximum(np.linspace(4, -2, 20)[1:], 0.0) ** 2]
+    slope = depth_slope(depth, relaxed)
+    assert (slope[relaxed == 0][1:] == 0).all()
+    half = np.r_[relaxed[:20], relaxed[:19][::-1] / 2]
+    assert depth_slope(depth, half)[20:-1] == pytest.approx(slope[1:19][::-1] / 2)
 
 
 def test_scatter_of_a_curve_is_told_from_its_bend():

@@ -162,7 +162,7 @@ def remesh(
 def untangled(surface: Surface) -> Surface:
     """Without faces that cross: their points go half-way to the mean of their neighbours, until none do.
 
-    Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at the patella's rim.
+    Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at a patella's rim.
     What still crosses after that is left to the check of the anatomy.
     """
     edges = half_edges(surface.faces)

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from scipy.special import bdtr
 
 from .calibration import CalibrationSettings, calibrate
+from .likelihood import Likelihood, StandIn
 from .noise import SiteNoise
-from .objective import Measured, Simulate
-from .parameters import Unknowns, separate
-from .uncertainty import DETERMINED, estimate_uncertainty
+from .objective import Measured
+from .parameters import Unknowns, search_space, separate
+from .posterior import Posterior, principal_axes, sample_posterior
+from .uncertainty import DETERMINED, Uncertainty, estimate_uncertainty, verdict_of
 
 Array = NDArray[np.float64]
 
@@ -58,27 +60,80 @@ class Coverage:
         return float(np.argmax(below >= 0.025)) / n, float(np.argmax(below >= 0.975)) / n
 
 
+@dataclass(frozen=True)
+class CoverageStudy:
+    """Of the linearised intervals of a calibration, and of those sampled from the posterior, if they were."""
+
+    linearised: Coverage
+    sampled: Coverage | None
+
+
+# Of one repeat: deviations (k,), what is determined (k,), and whether each parameter is held (p,).
+Judged = tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]
+
+
 def coverage_study(
-    simulate: Simulate, truth: Array, unknowns: Unknowns, record: Recording, repeats: int
-) -> Coverage:
+    simulate: StandIn, truth: Array, unknowns: Unknowns, record: Recording, repeats: int, steps: int = 0
+) -> CoverageStudy:
     """Calibrate and judge ``repeats`` records of the forces at ``truth`` (p,), each with noise of its own.
 
     Each calibration starts about a tenth off the truth.
-    Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty``.
+    Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty``, and
+    with ``steps`` of the sampler the posterior around it.
     """
     clean = [response.force_N for response in simulate(truth)]
     settings = CalibrationSettings(relative_tolerance=1e-4, max_iterations=60)
-    deviations, determined, held, misfit = [], [], [], []
+    linear, sampled, misfit = [], [], []
     for repeat in range(repeats):
         measured, noise = record(repeat, clean)
         off_truth = np.random.default_rng(repeat).normal(0.0, _START_SD, truth.size)
         start = unknowns.from_start(truth * np.exp(off_truth))
         found = calibrate(simulate, measured, start, settings, stages=(separate(unknowns.names),))
         u = estimate_uncertainty(found.parameters, found.responses, measured, unknowns, noise)
-        off = np.log(found.parameters / truth)
-        deviations.append([c.weights @ off / np.log(c.factor_95) for c in u.combinations])
-        determined.append([c.verdict == DETERMINED for c in u.combinations])
-        low, high = u.intervals_95.T
-        held.append((low <= truth) & (truth <= high))
+        linear.append(_linearised(u, truth))
         misfit.append(100 * u.residual_model.misfit_elsewhere)
-    return Coverage(np.array(deviations), np.array(determined), np.array(held), np.array(misfit))
+        if steps:
+            sampled.append(_sampled(_posterior(simulate, measured, u, unknowns, steps), unknowns, truth))
+    return CoverageStudy(_coverage(linear, misfit), _coverage(sampled, misfit) if steps else None)
+
+
+def _coverage(judged: Sequence[Judged], misfit_percent: Sequence[float]) -> Coverage:
+    deviations, determined, held = (np.array(column) for column in zip(*judged))
+    return Coverage(deviations, determined, held, np.array(misfit_percent))
+
+
+def _linearised(known: Uncertainty, truth: Array) -> Judged:
+    off = np.log(known.parameters / truth)
+    deviations = [c.weights @ off / np.log(c.factor_95) for c in known.combinations]
+    low, high = known.intervals_95.T
+    determined = [c.verdict == DETERMINED for c in known.combinations]
+    return np.array(deviations), np.array(determined), (low <= truth) & (truth <= high)
+
+
+def _posterior(
+    simulate: StandIn, measured: Sequence[Measured], known: Uncertainty, unknowns: Unknowns, steps: int
+) -> Posterior:
+    """Sampled from the most probable parameters on, as ``explore`` does."""
+    space = search_space(unknowns, separate(unknowns.names))
+    likelihood = Likelihood(simulate, measured, known.residual_model, unknowns, space)
+    starts = (known.parameters, known.centre)
+    found = [likelihood.optimum(space.reduce(np.log(start))) for start in starts]
+    best = min(found, key=lambda one: one.minus_2_log)
+    point = likelihood.point(best.z)
+    assert point is not None
+    bounds = np.diag(12.0 / (space.upper - space.lower) ** 2)
+    covariance = np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)
+    return sample_posterior(likelihood, best.z, covariance, steps=steps)
+
+
+def _sampled(posterior: Posterior, unknowns: Unknowns, truth: Array) -> Judged:
+    axes = principal_axes(posterior, search_space(unknowns, separate(unknowns.names)))
+    drawn = np.log(posterior.draws) @ axes.T
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    half = (high - low) / 2
+    prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
+    shares = drawn.std(axis=0) / np.linalg.norm(axes * prior_sd, axis=1)
+    determined = [verdict_of(float(np.exp(h)), s) == DETERMINED for h, s in zip(half, shares)]
+    least, most = posterior.intervals_95.T
+    off = ((high + low) / 2 - axes @ np.log(truth)) / half
+    return off, np.array(determined), (least <= truth) & (truth <= most)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .discrepancy import ResidualModel
-from .emulator import Emulator
 from .objective import Measured, SiteResponse
 from .parameters import Space, Unknowns
 from .trust_region import Point, minimise
@@ -23,6 +23,18 @@ Array = NDArray[np.float64]
 _ITERATIONS = 60
 _TOLERANCE = 1e-5
 FACTORS = (0.2, 5.0)  # of the misfit
+
+
+class StandIn(Protocol):
+    """What answers fast enough for thousands of questions: an `Emulator`, or what is made of one."""
+
+    def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
+        """Force (n,) and derivatives (n, p) of every site at parameters (p,)."""
+        ...
+
+    def forces(self, parameters: Array) -> Array:
+        """Forces (m, N) of all sites, one after the other, at parameters (m, p)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -42,7 +54,7 @@ class Likelihood:
 
     def __init__(
         self,
-        emulator: Emulator,
+        emulator: StandIn,
         measured: Sequence[Measured],
         model: ResidualModel,
         unknowns: Unknowns,

@@ -42,6 +42,7 @@ def record_noise(
     force_N: Array,
     displacement_mm: Array,
     touch_down_sd_mm: float = 0.0,
+    smoothing: Array | None = None,
 ) -> SiteNoise:
     """Noise of a record with ``residual_N`` (samples,), raw minus smoothed force.
 
@@ -49,12 +50,14 @@ def record_noise(
     ----------
     times_s, force_N, displacement_mm : the compared curve (n,).
     touch_down_sd_mm : a depth counted from elsewhere moves the whole curve along its own slope.
+    smoothing : (n, n) of the curve, which that slope passes too; by default none.
     """
     residual = residual_N - residual_N.mean()
     n, sd = len(times_s), float(residual.std())
     lag = _lag_one(residual)
     samples = max(round(residual.size / n), 1)
-    slope = touch_down_sd_mm * loading_slope(displacement_mm, force_N)
+    slope = touch_down_sd_mm * depth_slope(displacement_mm, force_N)
+    slope = slope if smoothing is None else smoothing @ slope
     floor = (_LEAST_SHARE * force_N.max()) ** 2
     covariance = block_covariance(sd, lag, samples, n) + np.outer(slope, slope) + floor * np.eye(n)
     return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm)
@@ -82,11 +85,15 @@ def block_covariance(sd: float, autocorrelation: float, samples: int, n: int) ->
     return sd**2 * toeplitz(row)
 
 
-def loading_slope(displacement_mm: Array, force_N: Array) -> Array:
-    """dF/dd (n,) N/mm at every point, taken at its depth on the way in."""
+def depth_slope(displacement_mm: Array, force_N: Array) -> Array:
+    """dF/dd (n,) N/mm at every point: on the way in, its own; on the way out that of the same depth on the
+    way in, as much smaller as the force is there, and none where the tissue has let go."""
     top = int(np.argmax(displacement_mm)) + 1
-    depth, slope = displacement_mm[:top], np.gradient(force_N[:top], displacement_mm[:top])
-    return np.interp(displacement_mm, depth, slope)
+    depth, force = displacement_mm[:top], force_N[:top]
+    slope = np.interp(displacement_mm, depth, np.gradient(force, depth))
+    entering = np.interp(displacement_mm, depth, force)
+    share = np.clip(force_N / np.maximum(entering, 1e-6 * force_N.max()), 0.0, 1.0)
+    return np.where(np.arange(len(slope)) < top, slope, share * slope)
 
 
 def _lag_one(residual: Array) -> float:

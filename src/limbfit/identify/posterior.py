@@ -6,7 +6,6 @@ misfit is sampled along. The sampler is emcee's ensemble (Goodman and Weare 2010
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .likelihood import FACTORS, Likelihood
+from .parameters import Space
 
 if TYPE_CHECKING:
     import emcee
@@ -130,6 +130,15 @@ def _told(sampler: emcee.EnsembleSampler, likelihood: Likelihood, k: int, steps:
     )
 
 
-def widths(posterior: Posterior, weights: Sequence[Array]) -> Array:
-    """Standard deviation of the logarithm of products of powers of the parameters, by the draws."""
-    return np.array([float((np.log(posterior.draws) @ w).std(ddof=1)) for w in weights])
+def principal_axes(posterior: Posterior, space: Space) -> Array:
+    """The independent combinations of the parameters (k, p), best known first, of a search space.
+
+    A row holds the weights of logarithms: a combination is ``exp(weights @ log(parameters))``.  The axes are
+    those of the draws, not of a linearised covariance: where the draws lie along a bend, the narrowest
+    direction at its middle is not the narrowest of all of them.
+    """
+    members = space.tie.sum(axis=0)
+    own = np.log(posterior.draws) @ (space.tie / members)
+    _, vectors = np.linalg.eigh(np.atleast_2d(np.cov(own.T)))
+    signs = np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(len(vectors))])
+    return np.asarray((space.tie @ ((vectors * signs) / members[:, None])).T)

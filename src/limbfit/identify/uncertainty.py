@@ -286,11 +286,11 @@ def _combinations(
         factor = float(np.exp(linear.half_width(axis)))
         verdict = verdict_of(factor, sd / float(np.linalg.norm(axis * prior.sd)))
         weights = space.tie @ (axis / members)
-        found.append(Combination(weights, sd, factor, _product(weights, names), verdict))
+        found.append(Combination(weights, sd, factor, product_text(weights, names), verdict))
     return tuple(found)
 
 
-def _product(weights: Array, names: tuple[str, ...]) -> str:
+def product_text(weights: Array, names: tuple[str, ...]) -> str:
     """The combination in words: entries below a tenth are left out."""
     order = [k for k in np.argsort(-np.abs(weights)) if abs(weights[k]) >= 0.1]
     return " · ".join(f"{names[k]}^{weights[k]:.2f}" for k in order)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 
 def noise_level(values: Array) -> float:
@@ -22,3 +23,12 @@ def bins(x: Array, y: Array, most: int) -> tuple[Array, Array, Array]:
     edges = np.unique(np.linspace(0, len(x), min(most, len(x)) + 1).astype(int))
     n = np.diff(edges).astype(float)
     return np.add.reduceat(x, edges[:-1]) / n, np.add.reduceat(y, edges[:-1]) / n, n
+
+
+def straight(at: Array, knots: Array) -> Array:
+    """The matrix (m, n) that takes values at ``knots`` (n,) to those at ``at`` (m,), straight in between."""
+    k = np.clip(np.searchsorted(knots, at) - 1, 0, len(knots) - 2)
+    share = np.clip((at - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
+    rows, matrix = np.arange(len(at)), np.zeros((len(at), len(knots)))
+    matrix[rows, k], matrix[rows, k + 1] = 1.0 - share, share
+    return matrix

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
 from .displacement import BrokenLine, broken_line
-from .numerics import Array, bins, rms
+from .numerics import Array, Bools, bins, rms, straight
 from .record import Trace
 from .touchdown import TouchDown
 
@@ -24,7 +24,7 @@ class Regularised:
     ``knots_s`` and ``knots_mm`` are the corners of the displacement (start, peak, end; more for a hold or a
     speed that changes); ``corners_s`` are the ends of the parts that were smoothed apart. ``noise_N`` and
     ``noise_mm`` are standard deviations of what was smoothed away. ``speed_unload_mm_s`` is nan where nothing
-    was unloaded.
+    was unloaded. ``curve`` is the force as the splines that it is made of.
     """
 
     time_s: Array
@@ -37,6 +37,7 @@ class Regularised:
     noise_mm: float
     speed_load_mm_s: float
     speed_unload_mm_s: float
+    curve: SmoothCurve = field(repr=False)
 
     @property
     def peak_index(self) -> int:
@@ -65,6 +66,7 @@ class Regularised:
             self.noise_mm,
             self.speed_load_mm_s,
             self.speed_unload_mm_s,
+            self.curve,
         )
 
 
@@ -97,7 +99,7 @@ def regularise(
     parts = [(trace.time_s >= a) & (trace.time_s <= b) for a, b in pairwise(corners)]
     if parts[0].sum() < 8:
         raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
-    curve = _smooth_force(trace.time_s, force, parts, corners, smoothing)
+    curve = SmoothCurve(trace.time_s - start, force, parts, corners - start, smoothing)
     inside = (trace.time_s >= start) & (trace.time_s <= corners[-1])
     knots = np.union1d(corners, line.times[(line.times > start) & (line.times < corners[-1])])
     knots_mm = line(knots) - touch_down.displacement_mm
@@ -106,14 +108,15 @@ def regularise(
     return Regularised(
         time_s=time - start,
         displacement_mm=np.interp(time, knots, knots_mm),
-        force_N=np.maximum(curve(time), 0.0),  # a dry indenter cannot pull
+        force_N=np.maximum(curve(time - start), 0.0),  # a dry indenter cannot pull
         knots_s=knots - start,
         knots_mm=knots_mm,
         corners_s=corners - start,
-        noise_N=rms(force[inside] - curve(trace.time_s[inside])),
+        noise_N=rms(force[inside] - curve(trace.time_s[inside] - start)),
         noise_mm=rms(trace.displacement_mm[inside] - line(trace.time_s[inside])),
         speed_load_mm_s=float(speeds[0]),
         speed_unload_mm_s=float(-speeds[-1]) if line.unloads else float("nan"),
+        curve=curve,
     )
 
 
@@ -127,40 +130,78 @@ def _corners(line: BrokenLine, start: float, touch_mm: float) -> Array:
     return np.array(corners)
 
 
-def _smooth_force(
-    time: Array, force: Array, parts: list[NDArray[np.bool_]], corners: Array, smoothing: float | None
-) -> Callable[[Array], Array]:
-    """Splines per part that meet at the corners; the first starts from zero at touch-down."""
-    data = [bins(time[part], force[part], _BINS) for part in parts if part.sum() >= 5]
-    corners = corners[: len(data) + 1]
-    free = [_spline(*d, smoothing, {}) for d in data]
-    shared = {float(corners[0]): 0.0}
-    # The way up to a corner is smooth; the way from it starts with the fastest relaxation, which a spline
-    # blunts.
-    shared |= {float(at): float(before(at)) for at, before in zip(corners[1:], free)}
-    splines = []
-    for k, d in enumerate(data):
-        ends = {float(c): shared[float(c)] for c in corners[k : k + 2]}
-        splines.append(_spline(*d, smoothing, ends))
+class SmoothCurve:
+    """Force over time: smoothing splines per part that meet at the corners; the first starts from zero.
 
-    def curve(at: Array) -> Array:
-        part = np.clip(np.searchsorted(corners, at, side="left") - 1, 0, len(splines) - 1)
-        return np.choose(part, [spline(at) for spline in splines])
+    Called with times (n,) s from touch-down on it gives forces (n,) N.  Once the penalties are chosen it is
+    linear in the record: ``response`` says what the same smoothing makes of another force.
+    """
 
-    return curve
+    def __init__(
+        self, time: Array, force: Array, parts: list[Bools], corners: Array, smoothing: float | None
+    ) -> None:
+        self._bins = [bins(time[part], force[part], _BINS) for part in parts if part.sum() >= 5]
+        self._corners = corners[: len(self._bins) + 1]
+        given = [(smoothing, smoothing)] * len(self._bins)
+        self._splines, self._penalties = self._fitted([averages for _, averages, _ in self._bins], given)
+
+    def __call__(self, at: Array) -> Array:
+        return np.choose(self._part(at), [spline(at) for spline in self._splines])
+
+    def response(self, at: Array) -> Array:
+        """What smoothing makes of a force given at times (n,) s, straight between: a matrix (n, n).
+
+        That force is averaged over the same times as the samples of the record, and smoothed by as much.
+        """
+        given = [straight(x, at) for x, _, _ in self._bins]
+        splines, _ = self._fitted(given, self._penalties)
+        return np.stack([splines[k](t) for k, t in zip(self._part(at), at)])
+
+    def _part(self, at: Array) -> NDArray[np.int64]:
+        part = np.searchsorted(self._corners, at, side="left") - 1
+        return np.clip(part, 0, len(self._bins) - 1)
+
+    def _fitted(
+        self, values: list[Array], penalties: Sequence[tuple[float | None, float | None]]
+    ) -> tuple[list[BSpline], list[tuple[float, float]]]:
+        """Splines of averages (bins of a part, ...) per part; their penalties, free and with ends given."""
+        data = [(x, y, w) for (x, _, w), y in zip(self._bins, values)]
+        free = [_spline(*d, penalty, {}) for d, (penalty, _) in zip(data, penalties)]
+        ends = dict.fromkeys(map(float, self._corners), np.zeros(values[0].shape[1:]))
+        # The way up to a corner is smooth; the way from it starts with the fastest relaxation, which a spline
+        # blunts.
+        ends |= {float(at): before(at) for at, (before, _) in zip(self._corners[1:], free)}
+        pinned = []
+        for k, (d, (_, penalty)) in enumerate(zip(data, penalties)):
+            own = {float(c): ends[float(c)] for c in self._corners[k : k + 2]}
+            pinned.append(_spline(*d, penalty, own))
+        return [spline for spline, _ in pinned], [(f, p) for (_, f), (_, p) in zip(free, pinned)]
 
 
-def _spline(time: Array, force: Array, weight: Array, smoothing: float | None, pinned: dict) -> BSpline:
+def _spline(
+    time: Array, values: Array, weight: Array, penalty: float | None, pinned: dict[float, Array]
+) -> tuple[BSpline, float]:
+    """A smoothing spline of values (n, ...) and its penalty; cross-validation chooses it where it is None."""
     keep = ~np.isin(time, list(pinned))
     x = np.r_[time[keep], list(pinned)]
-    y = np.r_[force[keep], list(pinned.values())]
+    y = np.concatenate([values[keep], *(np.asarray(v)[None] for v in pinned.values())])
     w = np.r_[weight[keep], np.full(len(pinned), _PINNED * weight.sum())]
     order = np.argsort(x)
+    x, y, w = x[order], y[order], w[order]
     try:
-        return make_smoothing_spline(x[order], y[order], w=w[order], lam=smoothing)
+        spline = make_smoothing_spline(x, y, w=w, lam=penalty)
     except ValueError:
         what = "cross-validation finds no smoothing for so short or so rough a record"
         raise TraceError(what, remedy="give traces.smoothing in the study") from None
+    return spline, _penalty(spline, x, y, w) if penalty is None else penalty
+
+
+def _penalty(spline: BSpline, x: Array, y: Array, w: Array) -> float:
+    """The penalty of a smoothing spline: what makes its misfit and its roughness stationary along itself."""
+    bend = spline.derivative(2)(x)
+    rough = float(np.sum(np.diff(x) * (bend[1:] ** 2 + bend[1:] * bend[:-1] + bend[:-1] ** 2))) / 3.0
+    smooth = spline(x)
+    return max(float(np.sum(w * smooth * (y - smooth))), 0.0) / max(rough, 1e-300)
 
 
 def _grid(corners: Array, points: int) -> Array:

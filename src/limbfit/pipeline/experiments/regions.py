@@ -131,7 +131,8 @@ def _row(
     fitted, mine = chosen
     records = [site_record(context, site) for site in fitted]
     measured = [_measured(record) for record in records]
-    noise = [site_noise(study, record) for record in records]
+    pairs = zip(records, found.responses, strict=True)
+    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
     known = estimate_uncertainty(
         found.parameters, found.responses, measured, unknowns(study), noise, groupings(study)[-1]
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +60,9 @@ class FittedSites:
             record.job(point, start=self._first_guess(point)) for point in points for record in self.searched
         ]
         found: list[SiteResponse] = []
-        for simulation in self.cache.run(jobs, self.context.executor):
-            jacobian = simulation.jacobian
-            assert jacobian is not None
-            found.append(SiteResponse(simulation.force_N, jacobian, simulation.completed, simulation.reason))
+        done = self.cache.run(jobs, self.context.executor)
+        for record, simulation in zip(cycle(self.records), done):
+            found.append(record.respond(simulation))
             self.context.tell(NAME, len(found), len(jobs), f"site {simulation.site}")
         n = len(self.searched)
         return [self._corrected(found[i : i + n]) for i in range(0, len(found), n)]
@@ -81,7 +81,7 @@ class FittedSites:
         if failed:
             raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
         n = len(self.records)
-        forces = [end.force_N for end in ends]
+        forces = [record.respond(end).force_N for record, end in zip(cycle(self.records), ends)]
         return Anchor(best, tuple(forces[:n]), tuple(forces[n:]))
 
     def _corrected(self, responses: list[SiteResponse]) -> list[SiteResponse]:
@@ -130,7 +130,8 @@ def _linearised(context: Context, sites: FittedSites, best: Array) -> Uncertaint
     failed = [record.site.name for record, r in zip(sites.records, responses) if not r.completed]
     if failed:
         raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
-    noise = [site_noise(study, record) for record in sites.records]
+    pairs = zip(sites.records, responses, strict=True)
+    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
     return estimate_uncertainty(best, responses, sites.measured, unknowns(study), noise, groupings(study)[-1])
 
 
@@ -180,5 +181,5 @@ def _predicted(context: Context, sites: FittedSites, best: Array) -> list[Predic
             continue
         scale = float(force.force_N @ derived.force_N / (derived.force_N @ derived.force_N))
         response = SiteResponse(force.force_N, scale * derived.jacobian)
-        found.append(Predicted(record, response, site_noise(study, record)))
+        found.append(Predicted(record, response, site_noise(study, record, response.force_N)))
     return found

@@ -16,8 +16,16 @@ from ...identify.explore import Explored
 from ...identify.noise import SiteNoise
 from ...identify.objective import SiteResponse
 from ...identify.parameters import Unknowns
+from ...identify.posterior import principal_axes
 from ...identify.sources import Gain
-from ...identify.uncertainty import DETERMINED, GIVEN, UNDETERMINED, Uncertainty, verdict_of
+from ...identify.uncertainty import (
+    DETERMINED,
+    GIVEN,
+    UNDETERMINED,
+    Uncertainty,
+    product_text,
+    verdict_of,
+)
 from ..stages.traces import SiteRecord, write_curves
 from ..store import write_json
 from ..tabular import write_table
@@ -137,26 +145,28 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
 
 
 def _combinations(found: Found) -> list[dict[str, Any]]:
-    """The principal axes of the linearised covariance, as the posterior and the sources see them."""
-    logs = np.log(found.explored.posterior.draws)
+    """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
+    known, explored = found.known, found.explored
+    logs = np.log(explored.posterior.draws)
     prior_sd = np.log(found.unknowns.upper / found.unknowns.lower) / np.sqrt(12.0)
     rows = []
-    for one in found.known.combinations:
-        drawn = logs @ one.weights
+    for weights in principal_axes(explored.posterior, explored.likelihood.space):
+        drawn = logs @ weights
         low, high = np.quantile(drawn, [0.025, 0.975])
         sd = float(drawn.std(ddof=1))
-        sources = float(np.sqrt(one.weights @ found.source_covariance @ one.weights))
+        linear = float(np.sqrt(weights @ known.covariance @ weights))
+        sources = float(np.sqrt(weights @ found.source_covariance @ weights))
         factor = float(np.exp((high - low) / 2))
         total = float(np.hypot(sd, sources))
         wider = float(factor ** (total / max(sd, 1e-300)))
         rows.append(
             {
-                "text": one.text,
-                "weights": one.weights.tolist(),
-                "linearised_factor_95": one.factor_95,
+                "text": product_text(weights, known.names),
+                "weights": weights.tolist(),
+                "linearised_factor_95": float(np.exp(min(NORMAL_95 * linear, 50.0))),
                 "posterior_factor_95": factor,
                 "with_sources_factor_95": wider,
-                "verdict": verdict_of(wider, total / float(np.linalg.norm(one.weights * prior_sd))),
+                "verdict": verdict_of(wider, total / float(np.linalg.norm(weights * prior_sd))),
             }
         )
     return rows

@@ -16,7 +16,7 @@ from ...identify.multistart import Multistart, describe, multistart
 from ...identify.objective import Measured, SiteResponse
 from ...identify.parameters import Grouping, Prior, Unknowns, constrained, two_stages
 from ...identify.uncertainty import Uncertainty, estimate_uncertainty
-from ...indentation import Parameters, Simulation, SimulationJob, flat_names, to_parameters, to_vector
+from ...indentation import Parameters, SimulationJob, flat_names, to_parameters, to_vector
 from ...study import Site, Study
 from ..context import Context
 from ..simulations import SimulationCache
@@ -115,8 +115,9 @@ class Laboratory:
     def _run(self, jobs: Sequence[SimulationJob], what: str, again: bool = False) -> list[SiteResponse]:
         found = []
         self.warnings = {}
-        for simulation in self.cache.run(jobs, self.context.executor, again):
-            found.append(_response(simulation))
+        done = self.cache.run(jobs, self.context.executor, again)
+        for record, simulation in zip(self.records, done, strict=True):
+            found.append(record.respond(simulation))
             if simulation.warnings:
                 self.warnings[simulation.site] = list(simulation.warnings)
             self.context.tell(self.title, 0, 0, f"{what}, site {simulation.site}")
@@ -170,7 +171,8 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     tried = multistart(run, unknowns(study), table.starts, table.seed)
     found = tried.best
-    noise = [site_noise(study, record) for record in laboratory.records]
+    pairs = zip(laboratory.records, found.responses, strict=True)
+    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
     known = estimate_uncertainty(
         found.parameters, found.responses, laboratory.measured, unknowns(study), noise, stages[-1]
     )
@@ -184,12 +186,6 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     }
     write_json(folder / "calibration.json", content)
     return {}
-
-
-def _response(simulation: Simulation) -> SiteResponse:
-    none = np.zeros((simulation.force_N.size, 0))
-    jacobian = none if simulation.jacobian is None else simulation.jacobian
-    return SiteResponse(simulation.force_N, jacobian, simulation.completed, simulation.reason)
 
 
 def settings(study: Study) -> CalibrationSettings:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...identify.noise import SiteNoise, record_noise
 from ...study import Study
 from .traces import SiteRecord, read_site_trace
 
+Array = NDArray[np.float64]
 
-def site_noise(study: Study, record: SiteRecord) -> SiteNoise:
-    """Noise of a site's record at the times of comparison, its touch-down included."""
+
+def site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
+    """Noise of a site's record at the times of comparison, its touch-down included.
+
+    ``force_N`` (n,) is the simulated one: what a wrong touch-down does is told by its slope, which is smooth.
+    """
     trace, smooth, facts = read_site_trace(study, record.site)
     since = trace.time_s - facts["touch_down_s"]
     inside = (since >= 0) & (since <= smooth.time_s[-1])
@@ -19,7 +25,8 @@ def site_noise(study: Study, record: SiteRecord) -> SiteNoise:
         record.site.name,
         record.times_s,
         residual,
-        record.force_N,
+        force_N,
         record.displacement_mm,
         facts["touch_down_uncertainty_mm"],
+        record.smoothing,
     )

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TraceError
-from ...indentation import SimulationJob, SiteModel
+from ...identify.objective import SiteResponse
+from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Site, Study
 from ...traces import Regularised, Trace, find_touch_down, read_trace, regularise, touch_down_at
 from ..context import Context
@@ -18,6 +19,7 @@ from ..simulations import CURVE_POINTS, recorded_model
 from ..store import write_json
 
 Array = NDArray[np.float64]
+SMOOTHING = "{}-smoothing.npy"  # of a site's record, as a matrix
 
 
 def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[str, Any]]:
@@ -68,6 +70,7 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
             displacement_mm=even.displacement_mm,
             force_N=even.force_N,
         )
+        np.save(folder / SMOOTHING.format(site.name), smooth.curve.response(even.time_s))
     write_json(folder / "traces.json", {"sites": facts})
     return {}
 
@@ -86,7 +89,12 @@ def read_curves(file: Path) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class SiteRecord:
-    """A site with its record: what a simulation needs, and the forces it is compared with."""
+    """A site with its record: what a simulation needs, and the forces it is compared with.
+
+    ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
+    before parameters are judged by their difference (``respond``): else the corner at the peak, which it
+    blunts, would be taken for an error of the model.
+    """
 
     site: Site
     tissues: tuple[str, ...]
@@ -94,6 +102,15 @@ class SiteRecord:
     times_s: Array
     displacement_mm: Array
     force_N: Array
+    smoothing: Array
+
+    def respond(self, simulation: Simulation) -> SiteResponse:
+        """What this record would show of a simulation."""
+        derivatives = np.zeros((len(self.smoothing), 0))
+        if simulation.jacobian is not None:
+            derivatives = self.smoothing @ simulation.jacobian
+        force = self.smoothing @ simulation.force_N
+        return SiteResponse(force, derivatives, simulation.completed, simulation.reason)
 
     def job(self, parameters: Array, sensitivities: bool = True, start: Array | None = None) -> SimulationJob:
         """The simulation with these parameters; ``start``: those whose simulation gives first guesses."""
@@ -112,4 +129,5 @@ def site_record(context: Context, site: Site, coarse: bool = False) -> SiteRecor
         times_s=curves["time_s"],
         displacement_mm=curves["displacement_mm"],
         force_N=curves["force_N"],
+        smoothing=np.load(context.store["traces"] / SMOOTHING.format(site.name)),
     )
