@@ -86,8 +86,11 @@ def block_covariance(sd: float, autocorrelation: float, samples: int, n: int) ->
 
 
 def depth_slope(displacement_mm: Array, force_N: Array) -> Array:
-    """dF/dd (n,) N/mm at every point: on the way in, its own; on the way out that of the same depth on the
-    way in, as much smaller as the force is there, and none where the tissue has let go."""
+    """dF/dd (n,) N/mm at every point.
+
+    On the way out it is that of the same depth on the way in, as much smaller as the force is, and none where
+    the tissue has let go.
+    """
     top = int(np.argmax(displacement_mm)) + 1
     depth, force = displacement_mm[:top], force_N[:top]
     slope = np.interp(displacement_mm, depth, np.gradient(force, depth))

@@ -120,7 +120,8 @@ def _indentations(store: Store) -> str:
         "under it "
         "unless the study states one. Touch-down was found in each record; from there on displacement was "
         "made "
-        "piecewise linear and force smoothed, loading and unloading apart so that the peak is kept. "
+        "piecewise linear and force smoothed, loading and unloading apart so that the peak is kept; where "
+        "parameters are searched and judged, the simulated force is smoothed in the same way. "
         f"Depths are {_range(facts, 'depth_mm', 2)} mm, largest forces {_range(facts, 'peak_force_N', 2)} N, "
         f"loading speeds {_range(facts, 'speed_load_mm_s', 2)} mm/s"
         + (f", noise of the force {fixed(min(noise), 3)} to {fixed(max(noise), 3)} N." if noise else ".")
