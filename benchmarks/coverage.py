@@ -50,14 +50,15 @@ class Robot:
     """Makes records of the true ``forces`` at the sites of a study.
 
     ``noise_N`` at 500 Hz with ``autocorrelation`` of neighbours; ``touch_down_mm`` (sites,) is the standard
-    deviation of a touch-down, ``smoothing`` (sites,) the penalty on roughness; ``misfit`` is the error of the
-    model over the largest force.
+    deviation of a touch-down, ``smoothing`` (sites,) the penalty on roughness and ``responses``, (n, n) per
+    site, what such smoothing makes of a force; ``misfit`` is the error of the model over the largest force.
     """
 
     records: tuple[SiteRecord, ...]
     forces: tuple[Array, ...]
     touch_down_mm: tuple[float, ...]
     smoothing: tuple[float, ...]
+    responses: tuple[Array, ...]
     noise_N: float
     autocorrelation: float
     misfit: float
@@ -66,15 +67,16 @@ class Robot:
     def __call__(self, repeat: int, smoothed: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
         random = np.random.default_rng([self.seed, repeat])
         measured, noise = [], []
-        sites = zip(self.records, self.forces, smoothed, self.touch_down_mm, self.smoothing, strict=True)
-        for record, force, answer, sd, smoothing in sites:
+        how = zip(self.touch_down_mm, self.smoothing, self.responses, strict=True)
+        sites = zip(self.records, self.forces, smoothed, how, strict=True)
+        for record, force, answer, (sd, smoothing, response) in sites:
             true = force + self._wrong(random, record.times_s, force)
             true = true + sd * random.standard_normal() * depth_slope(record.displacement_mm, force)
             smooth, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
             curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
             measured.append(Measured(record.site.name, curve))
             site = record.site.name, record.times_s, residual, answer, record.displacement_mm, sd
-            noise.append(record_noise(*site, smooth.curve.response(record.times_s)))
+            noise.append(record_noise(*site, response))
         return measured, noise
 
     def _wrong(self, random: np.random.Generator, times: Array, force: Array) -> Array:
@@ -146,10 +148,10 @@ def study_robot(
     touch = tuple(float(traces[site.name]["touch_down_uncertainty_mm"]) for site in study.fitted)
     emulator = read_emulator(store["uncertainty"] / EMULATOR)
     forces = tuple(response.force_N for response in emulator(truth))
-    robot = Robot(records, forces, touch, (0.0,) * len(records), noise_N, autocorrelation, misfit, seed)
+    robot = Robot(records, forces, touch, (), (), noise_N, autocorrelation, misfit, seed)
     smoothing = tuple(best_smoothing(robot, *pair) for pair in zip(records, forces))
-    robot = replace(robot, smoothing=smoothing)
     responses = tuple(robot.response(*site) for site in zip(records, forces, smoothing))
+    robot = replace(robot, smoothing=smoothing, responses=responses)
     return robot, truth, Smoothed(emulator, responses), unknowns(study)
 
 

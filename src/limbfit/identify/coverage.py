@@ -116,14 +116,8 @@ def _posterior(
     """Sampled from the most probable parameters on, as ``explore`` does."""
     space = search_space(unknowns, separate(unknowns.names))
     likelihood = Likelihood(simulate, measured, known.residual_model, unknowns, space)
-    starts = (known.parameters, known.centre)
-    found = [likelihood.optimum(space.reduce(np.log(start))) for start in starts]
-    best = min(found, key=lambda one: one.minus_2_log)
-    point = likelihood.point(best.z)
-    assert point is not None
-    bounds = np.diag(12.0 / (space.upper - space.lower) ** 2)
-    covariance = np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)
-    return sample_posterior(likelihood, best.z, covariance, steps=steps)
+    best = likelihood.best((known.parameters, known.centre))
+    return sample_posterior(likelihood, best.z, likelihood.covariance(best.z), steps=steps)
 
 
 def _sampled(posterior: Posterior, unknowns: Unknowns, truth: Array) -> Judged:

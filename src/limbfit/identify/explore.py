@@ -187,7 +187,7 @@ class _Exploration:
         model = self.known.residual_model
         self.likelihood = Likelihood(self.emulator, self.measured, model, self.unknowns, self.space)
         self.best = self._best()
-        self.covariance = self._covariance()
+        self.covariance = self.likelihood.covariance(self.best.z)
         self.posterior = self._sample(_SHORT_CHAIN)
         draws = self.posterior.draws[:: max(len(self.posterior.draws) // _LOOKED_AT, 1)]
         stated = np.array([self.emulator.error_percent(p) for p in draws])
@@ -205,16 +205,7 @@ class _Exploration:
             range(len(self.points)),
             key=lambda i: self.likelihood.at_responses(self.responses[i], self.points[i]),
         )
-        starts = (self.known.parameters, self.known.centre, self.points[simulated])
-        found = [self.likelihood.optimum(self.space.reduce(np.log(start))) for start in starts]
-        return min(found, key=lambda one: one.minus_2_log)
-
-    def _covariance(self) -> Array:
-        """Of z at the optimum, linearised on the emulator; what the bounds say keeps it finite."""
-        point = self.likelihood.point(self.best.z)
-        assert point is not None
-        bounds = np.diag(12.0 / (self.space.upper - self.space.lower) ** 2)
-        return np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)
+        return self.likelihood.best((self.known.parameters, self.known.centre, self.points[simulated]))
 
     def _sample(self, steps: int) -> Posterior:
         seed = self.settings.seed

@@ -136,3 +136,15 @@ class Likelihood:
             for step in steps:
                 z[free] = step.point.z
         return Optimum(z, self.parameters(z)[0], float(self.minus_2_log(z, factor)[0]))
+
+    def best(self, starts: Sequence[Array]) -> Optimum:
+        """The most probable of the optima from several full parameters (p,)."""
+        found = [self.optimum(self.space.reduce(np.log(start))) for start in starts]
+        return min(found, key=lambda one: one.minus_2_log)
+
+    def covariance(self, z: Array) -> Array:
+        """Of z (k,) there, linearised (k, k); what the bounds say keeps it finite."""
+        point = self.point(z)
+        assert point is not None
+        bounds = np.diag(12.0 / (self.space.upper - self.space.lower) ** 2)
+        return np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
@@ -146,7 +145,7 @@ class SmoothCurve:
         self._splines, self._penalties = self._fitted([averages for _, averages, _ in self._bins], given)
 
     def __call__(self, at: Array) -> Array:
-        return np.choose(self._part(at), [spline(at) for spline in self._splines])
+        return self._joined(self._splines, at)
 
     def response(self, at: Array) -> Array:
         """What smoothing makes of a force given at times (n,) s, straight between: a matrix (n, n).
@@ -155,11 +154,13 @@ class SmoothCurve:
         """
         given = [straight(x, at) for x, _, _ in self._bins]
         splines, _ = self._fitted(given, self._penalties)
-        return np.stack([splines[k](t) for k, t in zip(self._part(at), at)])
+        return self._joined(splines, at)
 
-    def _part(self, at: Array) -> NDArray[np.int64]:
-        part = np.searchsorted(self._corners, at, side="left") - 1
-        return np.clip(part, 0, len(self._bins) - 1)
+    def _joined(self, splines: Sequence[BSpline], at: Array) -> Array:
+        """At each of the times (n,) the spline of its part (n, ...)."""
+        part = np.clip(np.searchsorted(self._corners, at, side="left") - 1, 0, len(splines) - 1)
+        values: Array = np.stack([spline(at) for spline in splines])
+        return values[part, np.arange(len(at))]
 
     def _fitted(
         self, values: list[Array], penalties: Sequence[tuple[float | None, float | None]]

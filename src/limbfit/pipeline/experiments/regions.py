@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 
 from ...errors import InputError, StudyError
 from ...identify.calibration import Calibration
-from ...identify.objective import Measured, SiteResponse
+from ...identify.objective import SiteResponse
 from ...identify.parameters import Unknowns
 from ...identify.regions import Region, RegionFit, fit_regions, mean_percent
-from ...identify.uncertainty import estimate_uncertainty
 from ...indentation import flat_names, to_parameters, to_vector
 from ...study import Site
 from ..context import Context
 from ..simulations import SimulationCache, experiment_cache
-from ..stages.calibrate import Laboratory, groupings, unknowns
-from ..stages.record_noise import site_noise
+from ..stages.calibrate import Laboratory, groupings, linearised, unknowns
 from ..stages.traces import SiteRecord, site_record
 from ..store import write_json
 from ..tabular import write_table
@@ -103,11 +101,7 @@ def _region(context: Context, cache: SimulationCache, fitted: Sequence[Site], mi
     def simulate(parameters: Array) -> list[SiteResponse]:
         return _forces(context, cache, records, parameters)
 
-    return Region(identify, simulate, tuple(map(_measured, records)))
-
-
-def _measured(record: SiteRecord) -> Measured:
-    return Measured(record.site.name, record.force_N, record.site.weight)
+    return Region(identify, simulate, tuple(record.measured for record in records))
 
 
 def _forces(
@@ -130,12 +124,7 @@ def _row(
     study, found = context.study, fit.calibration
     fitted, mine = chosen
     records = [site_record(context, site) for site in fitted]
-    measured = [_measured(record) for record in records]
-    pairs = zip(records, found.responses, strict=True)
-    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
-    known = estimate_uncertainty(
-        found.parameters, found.responses, measured, unknowns(study), noise, groupings(study)[-1]
-    )
+    known = linearised(study, records, found.parameters, found.responses)
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, key), limits in zip(flat_names(study.tissues), known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits

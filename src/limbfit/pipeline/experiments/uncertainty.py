@@ -19,11 +19,11 @@ from ...identify.likelihood import Likelihood
 from ...identify.objective import Measured, SiteResponse
 from ...identify.parameters import search_space, shared
 from ...identify.sources import Gain
-from ...identify.uncertainty import Uncertainty, estimate_uncertainty
+from ...identify.uncertainty import Uncertainty
 from ...indentation import Parameters, to_vector
 from ..context import Context
 from ..simulations import experiment_cache
-from ..stages.calibrate import groupings, stage_titles, unknowns
+from ..stages.calibrate import groupings, linearised, stage_titles, unknowns
 from ..stages.record_noise import site_noise
 from ..stages.traces import site_record
 from .uncertainty_record import Found, Predicted, write_results
@@ -52,7 +52,7 @@ class FittedSites:
 
     @property
     def measured(self) -> list[Measured]:
-        return [Measured(record.site.name, record.force_N, record.site.weight) for record in self.records]
+        return [record.measured for record in self.records]
 
     def simulate(self, points: Sequence[Array]) -> list[list[SiteResponse]]:
         """Responses of all sites at several parameters (p,)."""
@@ -125,14 +125,11 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
 
 
 def _linearised(context: Context, sites: FittedSites, best: Array) -> Uncertainty:
-    study = context.study
     responses = sites.simulate([best])[0]
     failed = [record.site.name for record, r in zip(sites.records, responses) if not r.completed]
     if failed:
         raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
-    pairs = zip(sites.records, responses, strict=True)
-    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
-    return estimate_uncertainty(best, responses, sites.measured, unknowns(study), noise, groupings(study)[-1])
+    return linearised(context.study, sites.records, best, responses)
 
 
 def _earlier_points(context: Context, calibration: dict[str, Any]) -> dict[tuple[float, ...], Array | None]:

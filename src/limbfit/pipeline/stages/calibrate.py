@@ -23,7 +23,7 @@ from ..simulations import SimulationCache
 from ..store import write_json
 from .plausible import stored_flags
 from .record_noise import site_noise
-from .traces import site_record
+from .traces import SiteRecord, site_record
 
 Array = NDArray[np.float64]
 NEAR = 1.5  # in logarithms of parameters: as far as another simulation's states save work as first guesses
@@ -58,7 +58,7 @@ class Laboratory:
 
     @property
     def measured(self) -> list[Measured]:
-        return [Measured(record.site.name, record.force_N, record.site.weight) for record in self.records]
+        return [record.measured for record in self.records]
 
     def search(self, parameters: Array) -> list[SiteResponse]:
         """Force and derivatives where parameters are searched."""
@@ -171,11 +171,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     tried = multistart(run, unknowns(study), table.starts, table.seed)
     found = tried.best
-    pairs = zip(laboratory.records, found.responses, strict=True)
-    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
-    known = estimate_uncertainty(
-        found.parameters, found.responses, laboratory.measured, unknowns(study), noise, stages[-1]
-    )
+    known = linearised(study, laboratory.records, found.parameters, found.responses)
     rounds = rounds_of[tried.number]
     laboratory.answer(found.parameters)
     content = _calibration_record(context, found, known, laboratory)
@@ -186,6 +182,16 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     }
     write_json(folder / "calibration.json", content)
     return {}
+
+
+def linearised(
+    study: Study, records: Sequence[SiteRecord], parameters: Array, responses: Sequence[SiteResponse]
+) -> Uncertainty:
+    """What fitted records tell about ``parameters`` (p,), whose responses are given."""
+    pairs = zip(records, responses, strict=True)
+    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
+    measured = [record.measured for record in records]
+    return estimate_uncertainty(parameters, responses, measured, unknowns(study), noise, groupings(study)[-1])
 
 
 def settings(study: Study) -> CalibrationSettings:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TraceError
-from ...identify.objective import SiteResponse
+from ...identify.objective import Measured, SiteResponse
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Site, Study
 from ...traces import Regularised, Trace, find_touch_down, read_trace, regularise, touch_down_at
@@ -103,6 +103,11 @@ class SiteRecord:
     displacement_mm: Array
     force_N: Array
     smoothing: Array
+
+    @property
+    def measured(self) -> Measured:
+        """What the calibration compares with."""
+        return Measured(self.site.name, self.force_N, self.site.weight)
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
