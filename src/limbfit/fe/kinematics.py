@@ -1,4 +1,4 @@
-"""Compiled kinematics of one point: deformation gradient, principal stretches, push-forward.
+"""Compiled kinematics of one point, and of many side by side (`lanes`): F, principal stretches, push-forward.
 
 Symmetric tensors are six numbers in the order xx, yy, zz, xy, yz, zx (tensor components, not engineering).
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+
+from .lanes import COMPILED, LANES
 
 
 @njit(cache=True)
@@ -125,3 +127,72 @@ def mean_dilatation(grad, weights, u, F):  # type: ignore[no-untyped-def]
         current += J * weights[q]
         reference += weights[q]
     return current / reference
+
+
+@njit(**COMPILED)
+def invert(p):  # type: ignore[no-untyped-def]
+    """Determinant, inverse transpose and ``b = F F^T`` of the deformation gradients of a POINT."""
+    for l in range(LANES):
+        x0, x1, x2 = p.F[0, 0, l], p.F[0, 1, l], p.F[0, 2, l]
+        y0, y1, y2 = p.F[1, 0, l], p.F[1, 1, l], p.F[1, 2, l]
+        z0, z1, z2 = p.F[2, 0, l], p.F[2, 1, l], p.F[2, 2, l]
+        c0, c1, c2 = y1 * z2 - y2 * z1, y2 * z0 - y0 * z2, y0 * z1 - y1 * z0
+        J = x0 * c0 + x1 * c1 + x2 * c2
+        r = 1.0 / J
+        p.J[l] = J
+        p.inverse[0, 0, l], p.inverse[0, 1, l], p.inverse[0, 2, l] = r * c0, r * c1, r * c2
+        p.inverse[1, 0, l] = r * (x2 * z1 - x1 * z2)
+        p.inverse[1, 1, l] = r * (x0 * z2 - x2 * z0)
+        p.inverse[1, 2, l] = r * (x1 * z0 - x0 * z1)
+        p.inverse[2, 0, l] = r * (x1 * y2 - x2 * y1)
+        p.inverse[2, 1, l] = r * (x2 * y0 - x0 * y2)
+        p.inverse[2, 2, l] = r * (x0 * y1 - x1 * y0)
+        p.b[0, l] = x0 * x0 + x1 * x1 + x2 * x2
+        p.b[1, l] = y0 * y0 + y1 * y1 + y2 * y2
+        p.b[2, l] = z0 * z0 + z1 * z1 + z2 * z2
+        p.b[3, l] = x0 * y0 + x1 * y1 + x2 * y2
+        p.b[4, l] = y0 * z0 + y1 * z1 + y2 * z2
+        p.b[5, l] = z0 * x0 + z1 * x1 + z2 * x2
+
+
+@njit(forceinline=True, **COMPILED)
+def _rotate(p, i, j, ij, ki, kj):  # type: ignore[no-untyped-def]
+    """One Jacobi rotation of ``b`` in the plane ij, in all lanes; where there is nothing to turn, by zero."""
+    for l in range(LANES):
+        x, d = p.b[ij, l], p.b[j, l] - p.b[i, l]
+        t = 2.0 * x / (abs(d) + np.sqrt(d * d + 4.0 * x * x + 1e-300))
+        t = t if d >= 0.0 else -t
+        c = 1.0 / np.sqrt(t * t + 1.0)
+        s = t * c
+        p.b[i, l] -= t * x
+        p.b[j, l] += t * x
+        p.b[ij, l] = 0.0
+        y, z = p.b[ki, l], p.b[kj, l]
+        p.b[ki, l] = c * y - s * z
+        p.b[kj, l] = s * y + c * z
+        for r in range(3):
+            y, z = p.n[r, i, l], p.n[r, j, l]
+            p.n[r, i, l] = c * y - s * z
+            p.n[r, j, l] = s * y + c * z
+
+
+@njit(**COMPILED)
+def principal_axes(p):  # type: ignore[no-untyped-def]
+    """Make ``b`` of a POINT diagonal: squared stretches in ``b[:3]``, their directions columns of ``n``.
+
+    By Jacobi rotations as in `principal`, sweep by sweep until every lane is done.
+    """
+    for l in range(LANES):
+        for i in range(3):
+            for j in range(3):
+                p.n[i, j, l] = 1.0 if i == j else 0.0
+    for _ in range(12):
+        unfinished = 0
+        for l in range(LANES):
+            off = abs(p.b[3, l]) + abs(p.b[4, l]) + abs(p.b[5, l])
+            unfinished += 1 if off > 1e-17 * (p.b[0, l] + p.b[1, l] + p.b[2, l]) else 0
+        if unfinished == 0:
+            break
+        _rotate(p, 0, 1, 3, 5, 4)
+        _rotate(p, 0, 2, 5, 3, 4)
+        _rotate(p, 1, 2, 4, 3, 5)

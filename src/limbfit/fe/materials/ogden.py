@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ..lanes import COMPILED, LANES, exponential, logarithm
+
 
 @njit(cache=True)
 def sinhc(x: float) -> float:
@@ -59,6 +61,58 @@ def ogden(terms, c2, e, beta, slope, quotient):  # type: ignore[no-untyped-def]
         # (c2_j - c2_k) = 2 (e_j - e_k) sqrt(c2_j c2_k) sinhc(e_j - e_k)
         quotient[i] /= 2.0 * np.sqrt(c2[j] * c2[k]) * sinhc(e[j] - e[k])
     return energy
+
+
+@njit(forceinline=True, **COMPILED)
+def _mean_exponential(xi, xj, half):  # type: ignore[no-untyped-def]
+    """``(x_i - x_j)/(ln x_i - ln x_j)`` from ``half = (ln x_i - ln x_j)/2``; its series as in `sinhc`."""
+    y = half * half
+    near = y < 0.01
+    series = 1.0 + y * (1.0 / 42.0) * (1.0 + y * (1.0 / 72.0))
+    series = 1.0 + y * (1.0 / 6.0) * (1.0 + y * (1.0 / 20.0) * series)
+    return np.sqrt(xi * xj) * series if near else 0.5 * (xi - xj) / (1.0 if near else half)
+
+
+@njit(**COMPILED)
+def ogden_lanes(p, terms):  # type: ignore[no-untyped-def]
+    """`ogden` in all lanes of a POINT whose ``b`` is diagonal, with a TERM for each of the law's.
+
+    Fills ``e, energy, beta, slope, quotient``.
+    """
+    for l in range(LANES):
+        x, y, z = 0.5 * logarithm(p.b[0, l]), 0.5 * logarithm(p.b[1, l]), 0.5 * logarithm(p.b[2, l])
+        mean = (x + y + z) / 3.0
+        p.e[0, l], p.e[1, l], p.e[2, l] = x - mean, y - mean, z - mean
+        p.energy[l] = 0.0
+        for i in range(3):
+            p.beta[i, l] = p.slope[i, l] = p.quotient[i, l] = 0.0
+    for k in range(terms.shape[0]):
+        term = terms[k]
+        for l in range(LANES):
+            c, m = term.c[l], term.m[l]
+            e0, e1, e2 = p.e[0, l], p.e[1, l], p.e[2, l]
+            x0, x1, x2 = exponential(m * e0), exponential(m * e1), exponential(m * e2)
+            cm, half = c / m, 0.5 * m
+            p.energy[l] += cm / m * (x0 + x1 + x2 - 3.0)
+            p.beta[0, l] += cm * x0
+            p.beta[1, l] += cm * x1
+            p.beta[2, l] += cm * x2
+            p.slope[0, l] += c * x0
+            p.slope[1, l] += c * x1
+            p.slope[2, l] += c * x2
+            p.quotient[0, l] += c * _mean_exponential(x1, x2, half * (e1 - e2))
+            p.quotient[1, l] += c * _mean_exponential(x2, x0, half * (e2 - e0))
+            p.quotient[2, l] += c * _mean_exponential(x0, x1, half * (e0 - e1))
+    for l in range(LANES):
+        e0, e1, e2 = p.e[0, l], p.e[1, l], p.e[2, l]
+        x0, x1, x2 = p.b[0, l], p.b[1, l], p.b[2, l]
+        mean = (p.beta[0, l] + p.beta[1, l] + p.beta[2, l]) / 3.0
+        p.beta[0, l] -= mean
+        p.beta[1, l] -= mean
+        p.beta[2, l] -= mean
+        p.quotient[0, l] /= 2.0 * _mean_exponential(x1, x2, e1 - e2)
+        p.quotient[1, l] /= 2.0 * _mean_exponential(x2, x0, e2 - e0)
+        p.quotient[2, l] /= 2.0 * _mean_exponential(x0, x1, e0 - e1)
 
 
 @njit(cache=True)
