@@ -202,7 +202,7 @@ def test_relaxation_equals_the_integrated_convolution(law):
 @every_law
 def test_every_parameter_of_a_simulation_has_its_sensitivity(law):
     problem = punch("tet4", 2, 1, materials={"skin": law, "muscle": SAMPLES["paper"]})
-    control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-9)
+    control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-11)
     centre = solve(problem, control, sensitivities=True, store="all")
     values = np.array(law.parameters)
     for j in range(len(values)):

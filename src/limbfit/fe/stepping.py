@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..mesh import node_jacobians
 from .contact import ContactSurface
-from .direction import renew, solve_at
+from .direction import renew
 from .factor import Factor
 from .history import Memory
 from .indenter import Indenter
@@ -24,14 +24,12 @@ from .laws import Laws
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .problem import History, Problem, ProblemError
 from .result import Result, State, Step
-from .sensitivity import MemoryDerivative
+from .sensitivity import MemoryDerivative, solve_with_adjoint
 from .sticky import Anchors
 from .system import Evaluation, Increment, System
 from .threads import single_threaded_numpy
 
 Array = NDArray[np.float64]
-# Residual of the sensitivities' linear systems, relative to their right-hand sides.
-SENSITIVITY_TOLERANCE = 1e-5
 # Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
 STEEP_PRESSURE = 15.0
 
@@ -272,11 +270,10 @@ class Simulation:
         weights = extrapolation(self.states, increment.displacement)
         guess = sum(w * s.sensitivity for w, s in zip(weights, self.states) if s.sensitivity is not None)
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
+        advance = np.zeros(u.size) if at.advance is None else at.advance.ravel()
         du = np.zeros((u.size, laws.count))
-        du[system.free] = solve_at(at, self.slopes, b, x, SENSITIVITY_TOLERANCE)
-        d_force = at.force * d_penalty + d_reaction
-        if at.advance is not None:
-            d_force = d_force - at.advance.ravel() @ du
+        du[system.free], advanced = solve_with_adjoint(at, self.slopes, b, x, advance[system.free])
+        d_force = at.force * d_penalty + d_reaction - advanced
         return du.reshape(*u.shape, laws.count), d_force
 
 
