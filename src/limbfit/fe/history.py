@@ -41,19 +41,10 @@ class Memory:
             K += (gamma * decay)[of, l][:, None, None] * self.prony[l]
         return Increment(time, displacement, 1.0 + (gamma * ramp).sum(axis=1), K, penalty)
 
-    def advanced(self, system: System, laws: Laws, u: Array, dt: float) -> Memory:
-        """The memory at the end of a step of ``dt`` s that ended at displacement ``u``."""
+    def advanced(self, system: System, laws: Laws, elastic: Array, dt: float) -> Memory:
+        """The memory at the end of a step of ``dt`` s that ended with the elastic stress ``elastic``."""
         decay, ramp, *_ = prony_factors(dt, laws.prony[..., 1])
         of = system.regions
-        elastic = np.empty_like(self.elastic)
-
-        def part(cells: slice) -> None:
-            elastic_stress(
-                system.cells[cells], system.gradients[cells], system.regions[cells], laws.terms, u,
-                elastic[cells],
-            )  # fmt: skip
-
-        system.over_cells(part)
         prony = np.empty_like(self.prony)
         for l in range(len(prony)):
             change = ramp[of, l][:, None, None] * (elastic - self.elastic)
@@ -61,9 +52,22 @@ class Memory:
         return Memory(elastic, prony)
 
 
+def elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
+    """Deviatoric second Piola-Kirchhoff stress ``Se (m, q, 6)`` of the elastic law at ``u (n, 3)``, MPa."""
+    stress = np.empty((*system.weights.shape, 6))
+
+    def part(cells: slice) -> None:
+        elastic_stress(
+            system.cells[cells], system.gradients[cells], system.regions[cells], laws.terms, u, stress[cells]
+        )
+
+    system.over_cells(part)
+    return stress
+
+
 @njit(cache=True, nogil=True)
 def elastic_stress(cells, grads, regions, terms, u, out):  # type: ignore[no-untyped-def]
-    """Deviatoric second Piola-Kirchhoff stress ``Se (m, q, 6)`` of the elastic law at ``u (n, 3)``."""
+    """The kernel of `elastic_stresses`."""
     m, k = cells.shape
     ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
     F, A, N = matrix[0], matrix[1], matrix[2]

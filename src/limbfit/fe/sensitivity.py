@@ -8,6 +8,7 @@ explicit derivative and that of the history, which is carried along at the quadr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -16,7 +17,13 @@ from numpy.typing import NDArray
 from .direction import solve_at
 from .factor import Factor
 from .history import Memory
-from .kinematics import deformation_gradient, from_principal, logarithmic_stretches, principal
+from .kinematics import (
+    deformation_gradient,
+    from_principal,
+    logarithmic_stretches,
+    mean_dilatation,
+    principal,
+)
 from .laws import Laws
 from .materials import prony_factors
 from .materials.ogden import ogden, ogden_derivative
@@ -27,6 +34,24 @@ Array = NDArray[np.float64]
 # Residual of the linear systems, relative to their right-hand sides: what is left then in the force is of
 # second order, but what the history hands on is not.
 TOLERANCE = 3e-4
+
+
+@dataclass(frozen=True)
+class Explicit:
+    """What the parameters change in a step at fixed displacement.
+
+    Parameters
+    ----------
+    forces : (n, 3, p) derivative of the internal forces, N; no contact in it.
+    elastic : (m, q, 6, p) derivative of the elastic stress Se.
+    stress : (m, q, 6) Se itself, MPa.
+    moduli : (m, q, 6, 9) derivative of Se with respect to the deformation gradient, column by column, MPa.
+    """
+
+    forces: Array
+    elastic: Array
+    stress: Array
+    moduli: Array
 
 
 @dataclass(frozen=True)
@@ -41,49 +66,50 @@ class MemoryDerivative:
         shape = (*system.weights.shape, 6, laws.count)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
 
-    def residual(
+    def explicit(
         self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
-    ) -> Array:
-        """Derivative (n, 3, p) of the internal forces at fixed displacement ``u``; no contact in it."""
-        derivatives = laws.d_terms, laws.d_kappa, laws.parameter_index
+    ) -> Explicit:
+        """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
+        bends = laws.d_terms.any(axis=(2, 3))  # parameters of the elastic law
+        derivatives = laws.d_terms, bends, laws.d_kappa, laws.parameter_index
         coefficients = _step_coefficients(laws, dt)
+        elastic, stress = np.zeros_like(self.elastic), np.empty_like(memory.elastic)
+        moduli = np.empty((*stress.shape, 9))
+        before = (a.reshape(*a.shape[:-2], -1) for a in (self.elastic, self.prony))
+        d_elastic, d_prony = before
 
         def part(cells: slice) -> Array:
-            out = np.zeros((*u.shape, laws.count))
-            explicit_forces(
+            forces = np.zeros((*u.shape, laws.count))
+            explicit_derivatives(
                 system.cells[cells], system.gradients[cells], system.weights[cells],
                 system.element.mean_dilatation, system.regions[cells], laws.tables, derivatives,
                 increment.scale, coefficients, memory.elastic[cells], memory.prony[:, cells],
-                self.elastic[cells], self.prony[:, cells], u, out,
+                d_elastic[cells], d_prony[:, cells], u,
+                forces, elastic[cells], stress[cells], moduli[cells],
             )  # fmt: skip
-            return out
+            return forces
 
-        return np.asarray(sum(system.over_cells(part)))
+        return Explicit(np.asarray(sum(system.over_cells(part))), elastic, stress, moduli)
 
     def advanced(
-        self, system: System, laws: Laws, before: Memory, after: Memory, u: Array, du: Array, dt: float
+        self, system: System, laws: Laws, before: Memory, step: Explicit, du: Array, dt: float
     ) -> MemoryDerivative:
-        """The derivative of the memory after the step, given ``du (n, 3, p)``."""
-        elastic = np.empty_like(self.elastic)
+        """The derivative of the memory after the step, given ``du (n, 3, p)``; uses up ``step.elastic``."""
+        decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
+        d_tau = laws.d_prony[..., 1]
+        factors = decay, ramp, d_tau * d_decay[:, None], d_tau * d_ramp[:, None]
+        prony = np.empty_like(self.prony)
 
         def part(cells: slice) -> None:
-            elastic_stress_derivative(
-                system.cells[cells], system.gradients[cells], system.regions[cells], laws.terms,
-                laws.d_terms, laws.parameter_index, u, du, elastic[cells],
+            advance(
+                system.cells[cells], system.gradients[cells], system.regions[cells], factors,
+                laws.parameter_index, step.moduli[cells], step.stress[cells] - before.elastic[cells],
+                before.prony[:, cells], self.elastic[cells], self.prony[:, cells], du,
+                step.elastic[cells], prony[:, cells],
             )  # fmt: skip
 
         system.over_cells(part)
-        decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
-        of, prony = system.regions, np.empty_like(self.prony)
-        for l in range(len(prony)):
-            prony[l] = decay[of, l][:, None, None, None] * self.prony[l]
-            prony[l] += ramp[of, l][:, None, None, None] * (elastic - self.elastic)
-            for r, p in zip(*np.nonzero(laws.d_prony[:, :, l, 1])):
-                d_tau, cells = laws.d_prony[r, p, l, 1], of == r
-                change = d_decay[r, l] * before.prony[l][cells]
-                change += d_ramp[r, l] * (after.elastic - before.elastic)[cells]
-                prony[l][cells, :, :, laws.parameter_index[r, p]] += d_tau * change
-        return MemoryDerivative(elastic, prony)
+        return MemoryDerivative(step.elastic, prony)
 
 
 def solve_with_adjoint(
@@ -114,24 +140,67 @@ def _step_coefficients(laws: Laws, dt: float) -> tuple[Array, ...]:
     return on_prony, on_elastic, d_on_prony, d_scale
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def explicit_forces(  # type: ignore[no-untyped-def]
-    cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u, out
-):
-    """Internal forces of the stress ``dS/dp`` at fixed displacement, added to ``out (n, 3, p)``.
+_KERNEL: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+_SHEAR = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # place of each entry of a symmetric tensor in its six numbers
 
-    ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``; the kernel of `MemoryDerivative.residual`.
+
+@njit(cache=True, fastmath={"contract"})
+def elastic_moduli(beta, slope, quotient, c2, N, F, scratch, out):  # type: ignore[no-untyped-def]
+    """Derivative (6, 9) of the elastic stress Se with respect to ``F``, column by column.
+
+    ``dSe/dC`` is that of principal stresses ``beta_i/c2_i`` with axes ``N``; ``scratch (3, 6, 6)``.
+    """
+    v, w, C = scratch[0], scratch[1], scratch[2]
+    total = (slope[0] + slope[1] + slope[2]) / 9.0
+    for t in range(6):
+        x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
+        for i in range(3):
+            j, h = (i + 1) % 3, (i + 2) % 3
+            v[i, t] = N[x, i] * N[y, i] / c2[i]
+            v[3 + i, t] = N[x, j] * N[y, h] + N[x, h] * N[y, j]
+    for i in range(3):
+        j, h = (i + 1) % 3, (i + 2) % 3
+        x = 0.5 * ((c2[j] + c2[h]) * quotient[i] - beta[j] - beta[h]) / (c2[j] * c2[h])
+        y = slope[i] - 2.0 * beta[i]
+        for t in range(6):
+            rest = (total - slope[i] / 3.0) * (v[0, t] + v[1, t] + v[2, t])
+            rest -= (slope[0] * v[0, t] + slope[1] * v[1, t] + slope[2] * v[2, t]) / 3.0
+            w[i, t] = y * v[i, t] + rest
+            w[3 + i, t] = x * v[3 + i, t]
+    for s in range(6):
+        for t in range(s + 1):
+            C[s, t] = v[0, s] * w[0, t] + v[1, s] * w[1, t] + v[2, s] * w[2, t]
+            C[s, t] += v[3, s] * w[3, t] + v[4, s] * w[4, t] + v[5, s] * w[5, t]
+            C[t, s] = C[s, t]
+    for t in range(6):
+        for j in range(3):
+            x, y, z = C[t, _SHEAR[j][0]], C[t, _SHEAR[j][1]], C[t, _SHEAR[j][2]]
+            for i in range(3):
+                out[t, 3 * j + i] = x * F[i, 0] + y * F[i, 1] + z * F[i, 2]
+
+
+@njit(**_KERNEL)
+def explicit_derivatives(  # type: ignore[no-untyped-def]
+    cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u,
+    forces, elastic, stress, moduli
+):  # fmt: skip
+    """The kernel of `MemoryDerivative.explicit`; adds to ``forces`` and to ``elastic``.
+
+    The forces are those of ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``.  Rows of the work arrays hold
+    three components of all parameters and are padded to whole vectors.
     """
     terms, _, law = tables
-    d_terms, d_kappa, index = d_tables
+    d_terms, bends, d_kappa, index = d_tables
     on_prony, on_elastic, d_on_prony, d_scale = coefficients
     m, k = cells.shape
-    P = out.shape[2]
-    ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
+    P = forces.shape[2]
+    row = 16 * ((3 * P + 15) // 16)
+    ue, matrix, vector, scratch = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((6, 3)), np.empty((3, 6, 6))
     F, A, N = matrix[0], matrix[1], matrix[2]
-    c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
-    d_beta, value = vector[5], vector[6]
-    S, part, fe, FS = np.empty((6, P)), np.empty(6), np.empty((k, 3, P)), np.empty((3, P))
+    c2, e, beta, slope, quotient, value = vector[0], vector[1], vector[2], vector[3], vector[4], vector[5]
+    S, part, inverse = np.empty((6, P)), np.empty(6), np.empty(6)
+    flat = S.reshape(6 * P)
+    fe, FS = np.empty((k, row)), np.zeros((3, row))
     for el in range(m):
         for a in range(k):
             for i in range(3):
@@ -140,127 +209,105 @@ def explicit_forces(  # type: ignore[no-untyped-def]
         fe[:] = 0.0
         ratio = 1.0
         if mean:
-            current = 0.0
-            for q in range(grads.shape[1]):
-                current += weights[el, q] * deformation_gradient(grads[el, q], ue, F)
-            ratio = current / weights[el].sum()
+            ratio = mean_dilatation(grads[el], weights[el], ue, F)
         for q in range(grads.shape[1]):
             J = deformation_gradient(grads[el, q], ue, F)
+            if not mean:
+                ratio = J
             principal(F, A, c2, N)
             logarithmic_stretches(c2, e)
             ogden(terms[region], c2, e, beta, slope, quotient)
-            for t in range(6):
-                for p in range(P):
-                    S[t, p] = on_elastic[region] * dSe[el, q, t, p]
-                for l in range(H.shape[0]):
-                    for p in range(P):
-                        S[t, p] += on_prony[region, l] * dH[l, el, q, t, p]
+            elastic_moduli(beta, slope, quotient, c2, N, F, scratch, moduli[el, q])
+            for i in range(3):
+                value[i] = 1.0 / c2[i]
+                beta[i] /= c2[i]
+            from_principal(value, N, inverse)
+            from_principal(beta, N, stress[el, q])
+            for c in range(6 * P):
+                flat[c] = on_elastic[region] * dSe[el, q, c]
+            for l in range(H.shape[0]):
+                for c in range(6 * P):
+                    flat[c] += on_prony[region, l] * dH[l, el, q, c]
             for j in range(index.shape[1]):
                 p = index[region, j]
                 if p < 0:
                     continue
-                ogden_derivative(terms[region], d_terms[region, j], e, d_beta)
-                d_JU = volumetric(law[region], d_kappa[region, j], ratio if mean else J)[1]
-                if mean:
-                    d_JU *= J / ratio
-                for i in range(3):
-                    value[i] = d_scale[region, j] * beta[i] + scale[region] * d_beta[i] + d_JU
-                    value[i] /= c2[i]
-                from_principal(value, N, part)
+                part[:] = 0.0
+                if bends[region, j]:
+                    ogden_derivative(terms[region], d_terms[region, j], e, value)
+                    for i in range(3):
+                        value[i] /= c2[i]
+                    from_principal(value, N, part)
+                d_JU = 0.0
+                if d_kappa[region, j] != 0.0:
+                    d_JU = volumetric(law[region], d_kappa[region, j], ratio)[1] * J / ratio
                 for t in range(6):
-                    total = part[t] - d_scale[region, j] * Se[el, q, t]
+                    total = scale[region] * part[t] + d_JU * inverse[t]
+                    total += d_scale[region, j] * (stress[el, q, t] - Se[el, q, t])
                     for l in range(H.shape[0]):
                         total += d_on_prony[region, j, l] * H[l, el, q, t]
+                    elastic[el, q, t, p] += part[t]
                     S[t, p] += total
             for i in range(3):
                 x, y, z = weights[el, q] * F[i, 0], weights[el, q] * F[i, 1], weights[el, q] * F[i, 2]
                 for p in range(P):
-                    FS[0, p] = x * S[0, p] + y * S[3, p] + z * S[5, p]
-                    FS[1, p] = x * S[3, p] + y * S[1, p] + z * S[4, p]
-                    FS[2, p] = x * S[5, p] + y * S[4, p] + z * S[2, p]
-                for a in range(k):
-                    x, y, z = grads[el, q, 0, a], grads[el, q, 1, a], grads[el, q, 2, a]
-                    for p in range(P):
-                        fe[a, i, p] += x * FS[0, p] + y * FS[1, p] + z * FS[2, p]
+                    FS[0, i * P + p] = x * S[0, p] + y * S[3, p] + z * S[5, p]
+                    FS[1, i * P + p] = x * S[3, p] + y * S[1, p] + z * S[4, p]
+                    FS[2, i * P + p] = x * S[5, p] + y * S[4, p] + z * S[2, p]
+            for a in range(k):
+                x, y, z = grads[el, q, 0, a], grads[el, q, 1, a], grads[el, q, 2, a]
+                for c in range(row):
+                    fe[a, c] += x * FS[0, c] + y * FS[1, c] + z * FS[2, c]
         for a in range(k):
             for i in range(3):
                 for p in range(P):
-                    out[cells[el, a], i, p] += fe[a, i, p]
+                    forces[cells[el, a], i, p] += fe[a, i * P + p]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def elastic_stress_derivative(cells, grads, regions, terms, d_terms, index, u, du, out):  # type: ignore[no-untyped-def]
-    """Total derivative (m, q, 6, p) of Se: explicit in the parameters, and through ``du (n, 3, p)``."""
+@njit(**_KERNEL)
+def advance(  # type: ignore[no-untyped-def]
+    cells, grads, regions, factors, index, moduli, change, H, dSe, dH, du, elastic, prony
+):
+    """The kernel of `MemoryDerivative.advanced`: adds to ``elastic`` what ``du`` does, and fills ``prony``.
+
+    ``change (m, q, 6)`` is that of Se in the step.
+    """
+    decay, ramp, d_decay, d_ramp = factors
     m, k = cells.shape
     P = du.shape[2]
-    ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
-    F, A, N = matrix[0], matrix[1], matrix[2]
-    c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
-    d_beta = vector[5]
-    half, dFN, dC, dS = np.empty((3, 3, P)), np.empty((3, 3, P)), np.empty((3, 3, P)), np.empty((3, 3, P))
-    FN, GN, shear, local = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, P))
+    row = 16 * ((3 * P + 15) // 16)
+    due, dF = np.zeros((k, row)), np.empty((3, row))
     for el in range(m):
         for a in range(k):
             for i in range(3):
-                ue[i, a] = u[cells[el, a], i]
+                for p in range(P):
+                    due[a, i * P + p] = du[cells[el, a], i, p]
         region = regions[el]
         for q in range(grads.shape[1]):
-            deformation_gradient(grads[el, q], ue, F)
-            principal(F, A, c2, N)
-            logarithmic_stretches(c2, e)
-            ogden(terms[region], c2, e, beta, slope, quotient)
-            total = (slope[0] + slope[1] + slope[2]) / 9.0
-            local[:] = 0.0
-            for j in range(index.shape[1]):
-                if index[region, j] >= 0:
-                    ogden_derivative(terms[region], d_terms[region, j], e, d_beta)
-                    for i in range(3):
-                        local[i, index[region, j]] = d_beta[i] / c2[i]
-            for i in range(3):
-                j, h = (i + 1) % 3, (i + 2) % 3
-                shear[i] = 0.5 * ((c2[j] + c2[h]) * quotient[i] - beta[j] - beta[h]) / (c2[j] * c2[h])
-                for p in range(3):
-                    FN[p, i] = F[p, 0] * N[0, i] + F[p, 1] * N[1, i] + F[p, 2] * N[2, i]
-            dFN[:] = 0.0  # dF in columns along the principal directions
+            dF[:] = 0.0
             for a in range(k):
-                for j in range(3):
-                    GN[j] = 0.0
-                    for r in range(3):
-                        GN[j] += grads[el, q, r, a] * N[r, j]
-                for i in range(3):
-                    for j in range(3):
-                        g = GN[j]
-                        for p in range(P):
-                            dFN[i, j, p] += g * du[cells[el, a], i, p]
-            for i in range(3):  # half of dC in the principal frame
-                for j in range(3):
-                    for p in range(P):
-                        half[i, j, p] = (
-                            FN[0, i] * dFN[0, j, p] + FN[1, i] * dFN[1, j, p] + FN[2, i] * dFN[2, j, p]
-                        )
-            for i in range(3):
-                for j in range(3):
-                    for p in range(P):
-                        dC[i, j, p] = half[i, j, p] + half[j, i, p]
-            for i in range(3):
-                j, h = (i + 1) % 3, (i + 2) % 3
-                for p in range(P):
-                    dS[i, i, p] = local[i, p]
-                    dS[j, h, p] = shear[i] * dC[j, h, p]
-                    dS[h, j, p] = dS[j, h, p]
-                for r in range(3):
-                    moduli = (
-                        total - (slope[i] + slope[r]) / 3.0 + (slope[i] - 2.0 * beta[i] if i == r else 0.0)
-                    )
-                    moduli /= 2.0 * c2[r] * c2[i]
-                    for p in range(P):
-                        dS[i, i, p] += moduli * dC[r, r, p]
+                x, y, z = grads[el, q, 0, a], grads[el, q, 1, a], grads[el, q, 2, a]
+                for c in range(row):
+                    dF[0, c] += x * due[a, c]
+                    dF[1, c] += y * due[a, c]
+                    dF[2, c] += z * due[a, c]
             for t in range(6):
-                x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
+                D = moduli[el, q, t]
+                d0, d1, d2, d3, d4, d5, d6, d7, d8 = D[0], D[1], D[2], D[3], D[4], D[5], D[6], D[7], D[8]
                 for p in range(P):
-                    out[el, q, t, p] = 0.0
-                for i in range(3):
-                    for j in range(3):
-                        g = N[x, i] * N[y, j]
-                        for p in range(P):
-                            out[el, q, t, p] += g * dS[i, j, p]
+                    elastic[el, q, t, p] += (
+                        d0 * dF[0, p] + d1 * dF[0, P + p] + d2 * dF[0, 2 * P + p]
+                        + d3 * dF[1, p] + d4 * dF[1, P + p] + d5 * dF[1, 2 * P + p]
+                        + d6 * dF[2, p] + d7 * dF[2, P + p] + d8 * dF[2, 2 * P + p]
+                    )  # fmt: skip
+            for l in range(H.shape[0]):
+                x, y = decay[region, l], ramp[region, l]
+                for t in range(6):
+                    for p in range(P):
+                        prony[l, el, q, t, p] = x * dH[l, el, q, t, p]
+                        prony[l, el, q, t, p] += y * (elastic[el, q, t, p] - dSe[el, q, t, p])
+                for j in range(index.shape[1]):
+                    x, y = d_decay[region, j, l], d_ramp[region, j, l]
+                    if index[region, j] >= 0 and (x != 0.0 or y != 0.0):
+                        for t in range(6):
+                            prony[l, el, q, t, index[region, j]] += x * H[l, el, q, t] + y * change[el, q, t]

@@ -18,13 +18,13 @@ from ..mesh import node_jacobians
 from .contact import ContactSurface
 from .direction import renew
 from .factor import Factor
-from .history import Memory
+from .history import Memory, elastic_stresses
 from .indenter import Indenter
 from .laws import Laws
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .problem import History, Problem, ProblemError
 from .result import Result, State, Step
-from .sensitivity import MemoryDerivative, solve_with_adjoint
+from .sensitivity import Explicit, MemoryDerivative, solve_with_adjoint
 from .sticky import Anchors
 from .system import Evaluation, Increment, System
 from .threads import single_threaded_numpy
@@ -226,7 +226,6 @@ class Simulation:
     def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
         started = time.perf_counter()
         u, at = found.u, found.at
-        after = self.memory.advanced(self.system, self.laws, u, dt)
         worn = self.slopes.worn()
         inexact = at.data is None or at.penetration > increment.flat_from
         if inexact and (worn or self.slope is not None):
@@ -236,9 +235,14 @@ class Simulation:
             renew(at, self.slopes)
         self.slopes.next_step()
         du = force_slope = None
-        if self.slope is not None:
-            du, force_slope = self._differentiate(self.slope, found, increment, dt, stiffness)
-            self.slope = self.slope.advanced(self.system, self.laws, self.memory, after, u, du, dt)
+        if self.slope is None:
+            stress = elastic_stresses(self.system, self.laws, u)
+        else:
+            explicit = self.slope.explicit(self.system, self.laws, self.memory, increment, u, dt)
+            stress = explicit.stress
+            du, force_slope = self._differentiate(explicit, found, increment)
+            self.slope = self.slope.advanced(self.system, self.laws, self.memory, explicit, du, dt)
+        after = self.memory.advanced(self.system, self.laws, stress, dt)
         if increment.anchors is not None:
             self.anchors = increment.anchors.after(*self._tool(increment), u, du)
         self.memory, self.stiffness = after, stiffness
@@ -254,14 +258,12 @@ class Simulation:
         )  # fmt: skip
 
     def _differentiate(
-        self, slope: MemoryDerivative, found: Equilibrium, increment: Increment, dt: float, stiffness: float
+        self, explicit: Explicit, found: Equilibrium, increment: Increment
     ) -> tuple[Array, Array]:
         """Derivatives (n, 3, p) of the displacement and (p,) of the force at equilibrium."""
         system, laws, at, u = self.system, self.laws, found.at, found.u
-        change = slope.residual(system, laws, self.memory, increment, u, dt)
         d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
-        pushed = system.contact_force(u, increment)
-        change += pushed[..., None] * d_penalty
+        change = explicit.forces + system.contact_force(u, increment)[..., None] * d_penalty
         d_reaction = np.zeros(laws.count)
         if increment.anchors is not None:
             forces, d_reaction = increment.anchors.explicit(*self._tool(increment), u, increment.penalty)
