@@ -15,6 +15,8 @@ from blocks import SKIN, block, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
+from limbfit.fe.pace import Pace
+from limbfit.fe.result import Step, slipped
 from limbfit.study import PARAMETERS, MaterialTable
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -89,6 +91,75 @@ def test_folds_of_a_soft_skin_on_a_stiff_muscle_are_gone_through(robustness):
     """Directions that only a small part of can be used: undamped it was not done after 120 s."""
     outcome = robustness.run_case(0, 6, "tet10p0")
     assert outcome.outcome == "completed", outcome.reason
+
+
+@pytest.mark.slow
+def test_a_soft_skin_does_not_slip_past_a_penalty_that_is_too_small(robustness):
+    """The penalty is raised as soon as it is seen to be too small: 103 iterations, where it was not."""
+    problem = robustness.problem_of(robustness.draw(0, 32), 0)
+    depth, peak = problem.history.displacement.max(), problem.history.times[1]
+    times = tuple(peak * np.arange(1, 5) / 10)
+    result = solve(problem, StepControl(times=times))
+    assert result.displacement[-1] == pytest.approx(0.4 * depth)
+    assert result.peak_force == pytest.approx(21.1, rel=0.01)
+    assert result.statistics["newton_iterations"] < 60
+    assert not result.warnings
+
+
+def paced(hard: Callable[[float, float, int], int]) -> list[tuple[float, int, str]]:
+    """Times tried on the way to 0.5 and 1 s, the patience and what came of it, where iterations are made up.
+
+    ``hard``: how many iterations a step from one time to another takes, and with which patience.
+    """
+    pace, now, tried = Pace(60), 0.0, []
+    while now < 1.0 and pace.cuts <= 5:
+        t = pace.next_time(now, 0.5 if now < 0.5 else 1.0)
+        needed, patience = hard(now, t, pace.patience), pace.patience
+        tried.append((t, patience, "cut" if needed > patience else "done"))
+        if needed > patience:
+            pace.cut(now, t)
+        else:
+            pace.done(now, t, needed)
+            now = t
+    return tried
+
+
+def test_short_steps_where_long_ones_fail_and_long_ones_again_after():
+    tried = paced(lambda now, t, _: 99 if t - now > 0.1 and now < 0.4 else 8)
+    assert [what for *_, what in tried[:3]] == ["cut", "cut", "done"]
+    ends = [t for t, _, what in tried if what == "done"]
+    assert ends[0] == pytest.approx(0.045)
+    assert np.diff(ends).min() > 0.04
+    assert np.diff(ends)[-1] > 0.15
+    assert {0.5, 1.0} <= set(ends)
+
+
+def test_an_equilibrium_that_ends_is_left_with_patience():
+    """Every step across 0.7 s takes 200 iterations, however short it is."""
+    tried = paced(lambda now, t, _: 200 if now < 0.7 <= t else 8)
+    cuts = [(t, patience) for t, patience, what in tried if what == "cut"]
+    assert [patience for _, patience in cuts] == [60, 60]
+    across = next((t, patience) for t, patience, what in tried if what == "done" and t >= 0.7)
+    assert across[1] == 300
+    assert tried[-1][0] == 1.0
+
+
+def test_a_step_that_never_converges_is_given_up():
+    tried = paced(lambda *_: 10**6)
+    assert [what for *_, what in tried] == ["cut"] * 6
+    assert tried[-1][0] == pytest.approx(0.5 * 0.3**5)
+
+
+def test_a_force_that_falls_while_the_indenter_advances_is_told(result):
+    """A force record with a tenth of it lost between two steps of loading, and one that only relaxes."""
+    rows = [
+        Step(t, d, f, 0.0, 1.0, 5, None, result.states[0])
+        for t, d, f in [(1.0, 1.0, 2.0), (2.0, 2.0, 5.0), (3.0, 3.0, 4.0), (4.0, 3.0, 2.0), (5.0, 2.0, 0.5)]
+    ]
+    (warning,) = slipped(rows)
+    assert warning.startswith("the force falls from 5 N to 4 N while the indenter advances from 2 to 3 mm")
+    assert not slipped([rows[0], rows[1], replace(rows[2], force=4.8), *rows[3:]])
+    assert not slipped([])
 
 
 def test_what_is_not_reached_is_said(robustness):

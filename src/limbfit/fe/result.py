@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -16,6 +16,8 @@ from .history import Memory
 from .problem import Problem
 
 Array = NDArray[np.float64]
+
+SLIP = 0.9  # force over the one before, in an advancing step, that is no relaxation
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,20 @@ class Step:
     newton_iterations: int
     force_sensitivity: Array | None
     state: State
+
+
+def slipped(rows: Sequence[Step]) -> tuple[str, ...]:
+    """A warning where the force falls while the indenter advances: the tissue has lost its equilibrium."""
+    deepest = max((row.displacement for row in rows), default=0.0)
+    for before, row in pairwise(rows):
+        advance = row.displacement - before.displacement
+        if advance > 1e-2 * deepest and row.force < SLIP * before.force:
+            return (
+                f"the force falls from {before.force:.3g} N to {row.force:.3g} N while the indenter advances "
+                f"from {before.displacement:.3g} to {row.displacement:.3g} mm: tissue folds, or slips past "
+                "the indenter between contact points; use a finer mesh there",
+            )
+    return ()
 
 
 @dataclass(frozen=True)

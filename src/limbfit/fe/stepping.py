@@ -22,8 +22,9 @@ from .history import Memory, elastic_stresses
 from .indenter import Indenter
 from .laws import Laws
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
+from .pace import Pace
 from .problem import History, Problem, ProblemError
-from .result import Result, State, Step
+from .result import Result, State, Step, slipped
 from .sensitivity import Explicit, MemoryDerivative, solve_with_adjoint
 from .sticky import Anchors
 from .system import Evaluation, Increment, System
@@ -44,7 +45,7 @@ class StepControl:
     times : (k,) s, instead of the two numbers: exactly these steps (rest at 0 left out).
     tolerance : residual over reactions at equilibrium.
     max_iterations, most_iterations : of Newton's method in a step, and in all.
-    max_cuts : how often a step may be halved.
+    max_cuts : how often a step may be cut, to 0.3 of it each time.
     penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
     penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
     linear_solver : name in the solver table, multigrid (``tet10`` only), or auto.
@@ -57,7 +58,7 @@ class StepControl:
     tolerance: float = 3e-5
     max_iterations: int = 60
     most_iterations: int = 1500
-    max_cuts: int = 8
+    max_cuts: int = 5
     penetration: float = 0.01
     penalty: float | None = None
     linear_solver: str = "auto"
@@ -141,7 +142,7 @@ class Simulation:
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
         targets = list(schedule(self.problem.history, self.control))
-        cuts, why = 0, ""
+        pace, why = Pace(self.control.max_iterations), ""
         while targets:
             now, spent = (
                 self.states[-1].time,
@@ -150,22 +151,29 @@ class Simulation:
             if spent:
                 bound = f"no more than {self.control.most_iterations} Newton iterations were allowed"
                 why = f"{why}; {bound}" if why else bound
-            if spent or cuts > self.control.max_cuts:
+            if spent or pace.cuts > self.control.max_cuts:
                 self.reason = f"stopped at {now:.4g} s of {targets[-1]:.4g} s: {why}"
                 return
+            t = pace.next_time(now, targets[0])
+            before = self.counts["newton_iterations"]
             with single_threaded_numpy():
-                found = self._attempt(targets[0])
-            if not isinstance(found, str):
-                cuts, why = max(cuts - 1, 0), ""
-                targets.pop(0)
-                yield found
+                found = self._attempt(t, pace.patience)
+            if isinstance(found, str):
+                self.counts["cuts"] += 1
+                pace.cut(now, t)
+                why = found
                 continue
-            self.counts["cuts"] += 1
-            cuts, why = cuts + 1, found
-            targets.insert(0, 0.5 * (now + targets[0]))
+            pace.done(now, t, self.counts["newton_iterations"] - before)
+            why = ""
+            if t == targets[0]:
+                targets.pop(0)
+            yield found
 
-    def _attempt(self, t: float) -> Step | str:
-        """The step to time ``t``, or why there is none; nothing is changed unless it is accepted."""
+    def _attempt(self, t: float, patience: int) -> Step | str:
+        """The step to time ``t``, or why there is none; nothing is changed unless it is accepted.
+
+        ``patience``: iterations that are allowed for one equilibrium.
+        """
         before = self.states[-1]
         displacement, dt = float(self.problem.history.at(t)), t - before.time
         warm = self.warm.get(round(t, 9))
@@ -178,7 +186,7 @@ class Simulation:
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
             )
             increment = replace(increment, anchors=anchors, flat_from=STEEP_PRESSURE / stiffness)
-            found = self._equilibrate(increment, u)
+            found = self._equilibrate(increment, u, patience)
             if found.reason:
                 return found.reason
             kept, deep = anchors, found.at.penetration > self.deepest
@@ -195,7 +203,7 @@ class Simulation:
         assert self.system.indenter is not None
         return self.system.surface, self.system.indenter.moved(increment.displacement)
 
-    def _equilibrate(self, increment: Increment, guess: Array) -> Equilibrium:
+    def _equilibrate(self, increment: Increment, guess: Array, patience: int) -> Equilibrium:
         """From the predicted displacement or the last one; from the last one where that fails."""
         guesses = [self.system.impose(u, increment.displacement) for u in (guess, self.states[-1].u)]
         found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
@@ -206,13 +214,13 @@ class Simulation:
                 increment,
                 tried,
                 self.factor,
-                replace(self.control.newton, damping=self.damping),
+                replace(self.control.newton, damping=self.damping, max_iterations=patience),
                 self.floor,
                 self.deepest,
                 self.seconds,
             )
             self.counts["newton_iterations"] += found.iterations
-            if not found.reason or found.iterations >= self.control.max_iterations:
+            if not found.reason or found.iterations >= patience:
                 break  # from elsewhere it would take as many
         return found
 
@@ -407,7 +415,7 @@ def _result(
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
-        warnings=(*_folded(problem, kept), *_inexact(run)),
+        warnings=(*_folded(problem, kept), *slipped(rows), *_inexact(run)),
         statistics=_statistics(run, seconds),
         system=run.system,
     )

@@ -218,7 +218,7 @@ def _solution(store: Store) -> str:
             f"Quasi-static equilibrium was solved in {solver.get('load_steps')} steps of loading and "
             f"{solver.get('unload_steps')} of unloading, cut where Newton's method does not converge",
             f"(residual below {solver['tolerance']:g} of the reactions; at most {solver['max_cuts']} "
-            "halvings)."
+            "cuts in a row)."
             if "tolerance" in solver
             else ".",
             f"Linear systems were solved by {name}." if name else "",
