@@ -65,7 +65,7 @@ REFERENCE = np.array(
 
 @dataclass(frozen=True)
 class Run:
-    """A simulation: size of its family in mm, how often each tetrahedron is split, steps of loading.
+    """A simulation: size of its family in mm, how often each tetrahedron is split, steps of loading, threads.
 
     Without unloading it gives the peak force, but no cost.
     """
@@ -76,6 +76,7 @@ class Run:
     splits: int = 0
     load_steps: int = StepControl().load_steps
     unloading: bool = True
+    threads: int = 1
 
     @property
     def mesh_name(self) -> str:
@@ -170,16 +171,18 @@ def problem_of(run: Run, study: Path, mesh: Mesh) -> Problem:
 
 
 def simulate(run: Run, study: Path, file: Path) -> dict[str, Any]:
-    """Solve a run in this process; unknowns, N, processor seconds of one thread, MiB."""
+    """Solve a run in this process; unknowns, N, processor seconds and seconds by the clock, MiB."""
     mesh = read_vtu(file)
     if ELEMENTS[run.element].cell_type == "tet4":
         mesh = corners_only(mesh)
     problem = problem_of(run, study, mesh)
     warm_up(run.element, sensitivities=False)
-    started = time.process_time()
-    control = StepControl(load_steps=run.load_steps, unload_steps=round(0.8 * run.load_steps))
+    control = StepControl(
+        load_steps=run.load_steps, unload_steps=round(0.8 * run.load_steps), threads=run.threads
+    )
+    started, clock = time.process_time(), time.perf_counter()
     result = solve(problem, control, store="none")
-    seconds = time.process_time() - started
+    seconds, clock = time.process_time() - started, time.perf_counter() - clock
     statistics = result.statistics
     return {
         **asdict(run),
@@ -189,6 +192,7 @@ def simulate(run: Run, study: Path, file: Path) -> dict[str, Any]:
         "peak_force_N": float(result.peak_force),
         "penetration_mm": float(result.penetration.max()),
         "cpu_seconds": seconds,
+        "seconds": clock,
         "max_rss_MB": max_rss_MB(),
         "completed": result.completed,
     }
@@ -202,7 +206,7 @@ def in_own_process(function: Any, *arguments: Any) -> Any:
 
 def complete(rows: list[dict], runs: list[Run], study: Path, folder: Path) -> None:
     """Do the runs that are not among the rows, and store each as soon as it is done."""
-    known = [Run(**{field.name: row[field.name] for field in fields(Run)}) for row in rows]
+    known = [Run(**{f.name: row[f.name] for f in fields(Run) if f.name in row}) for row in rows]
     for run in runs:
         if run in known:
             continue
@@ -212,9 +216,8 @@ def complete(rows: list[dict], runs: list[Run], study: Path, folder: Path) -> No
         rows.append(in_own_process(simulate, run, study, file))
         (folder / "runs.json").write_text(json.dumps(rows, indent=1))
         print(
-            "{site} {element} {size_mm} {unknowns} {peak_force_N:.4f} N {cpu_seconds:.1f} s".format(
-                **rows[-1]
-            ),
+            "{site} {element} {size_mm} {unknowns} {peak_force_N:.4f} N "
+            "{cpu_seconds:.1f} CPU s {seconds:.1f} s".format(**rows[-1]),
             file=sys.stderr,
         )
 
@@ -227,6 +230,9 @@ def options() -> argparse.Namespace:
     parser.add_argument("--sizes", type=float, nargs="+", default=[6.0, 4.5, 3.5, 2.7])
     parser.add_argument("--splits", type=int, default=0)
     parser.add_argument("--load-steps", type=int, default=StepControl().load_steps)
+    parser.add_argument(
+        "--threads", type=int, default=1, help="of a simulation; another number needs another folder"
+    )
     parser.add_argument(
         "--reference", type=Path, help="folder of FEBio's results (default: shared/reference)"
     )
@@ -242,7 +248,7 @@ def main() -> None:
     rows = json.loads(kept.read_text()) if kept.is_file() else []
     study = (chosen.reference or find_reference(Path.cwd())) / "openlimb-study"
     runs = [
-        Run(site, element, size, chosen.splits, chosen.load_steps, not chosen.loading_only)
+        Run(site, element, size, chosen.splits, chosen.load_steps, not chosen.loading_only, chosen.threads)
         for size in chosen.sizes
         for site in chosen.site
         for element in chosen.element
