@@ -30,22 +30,25 @@ Array = NDArray[np.float64]
 # changed by a factor, and less than the smallest is none.
 SHORT_STEP, FIRST_DAMPING, DAMPING_CHANGE, LEAST_DAMPING = 0.3, 0.1, 4.0, 0.02
 NEAR = 0.1  # residual over reactions from which the tangent is the exact one
-TOO_DEEP = 1.2  # penetration over the allowed one that a few more iterations will not mend
 
 
 @dataclass(frozen=True)
 class NewtonControl:
-    """Tolerance of the residual relative to the reactions, limits, and the damping to begin with."""
+    """Tolerance of the residual relative to the reactions, limits, and the damping to begin with.
+
+    ``bearable``: penetration (mm) that near equilibrium ends the search, for the penalty is too small.
+    """
 
     tolerance: float = 3e-5
     max_iterations: int = 30
     max_backtracks: int = 12
     damping: float = 0.0
+    bearable: float = np.inf
 
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """Where Newton stopped: ``reason`` is empty at equilibrium, or near one with too small a penalty;
+    """Where Newton stopped: ``reason`` is empty at equilibrium, or near one of unbearable penetration;
     ``damped``: it had to shorten a step much."""
 
     u: Array
@@ -62,8 +65,7 @@ def equilibrate(
     """Minimise the potential of ``increment`` from the first of the ``guesses`` (n, 3), or a better one.
 
     Supported components of the guesses are in place; ``floor`` (N) is the smallest force against which the
-    residual is judged, ``deep`` (mm) the penetration from which a guess is doubted, and which is allowed:
-    where much more of it is left near equilibrium, the search ends early, for the penalty is too small.
+    residual is judged, ``deep`` (mm) the penetration from which a guess is doubted.
     """
     evaluate = _Evaluator(system, laws, increment, seconds)
     u, here = _lowest(evaluate, guesses, deep)
@@ -76,8 +78,8 @@ def equilibrate(
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
         if norm <= control.tolerance * scale or rounding:
             return Equilibrium(u, here, iteration, damped=damped)
-        if norm <= NEAR * scale and here.penetration > TOO_DEEP * deep:
-            return Equilibrium(u, here, iteration, damped=damped)  # with this penalty there is no use in it
+        if norm <= NEAR * scale and here.penetration > control.bearable:
+            return Equilibrium(u, here, iteration, damped=damped)
         if not np.isfinite(norm):
             return Equilibrium(u, here, iteration, "the residual is not finite")
         if here.data is None:

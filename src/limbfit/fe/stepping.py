@@ -31,6 +31,8 @@ from .system import Evaluation, Increment, System
 from .threads import single_threaded_numpy
 
 Array = NDArray[np.float64]
+# Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
+TOO_DEEP, MOST_RAISES = 1.2, 5
 # Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
 STEEP_PRESSURE = 15.0
 
@@ -181,16 +183,19 @@ class Simulation:
         if warm is not None:  # the same penalty as then, or the force would jump between iterates
             stiffness = max(stiffness, warm.penalty)
         anchors = self.anchors
-        for _ in range(6):
+        for bearable in (*[TOO_DEEP * self.deepest] * MOST_RAISES, np.inf):
             increment = self.memory.increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
             )
             increment = replace(increment, anchors=anchors, flat_from=STEEP_PRESSURE / stiffness)
-            found = self._equilibrate(increment, u, patience)
+            control = replace(
+                self.control.newton, damping=self.damping, max_iterations=patience, bearable=bearable
+            )
+            found = self._equilibrate(increment, u, control)
             if found.reason:
                 return found.reason
             kept, deep = anchors, found.at.penetration > self.deepest
-            if anchors is not None:
+            if anchors is not None and not deep:
                 kept = anchors.let_go(*self._tool(increment), found.u)
             if kept is anchors and not deep:
                 break
@@ -203,7 +208,7 @@ class Simulation:
         assert self.system.indenter is not None
         return self.system.surface, self.system.indenter.moved(increment.displacement)
 
-    def _equilibrate(self, increment: Increment, guess: Array, patience: int) -> Equilibrium:
+    def _equilibrate(self, increment: Increment, guess: Array, control: NewtonControl) -> Equilibrium:
         """From the predicted displacement or the last one; from the last one where that fails."""
         guesses = [self.system.impose(u, increment.displacement) for u in (guess, self.states[-1].u)]
         found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
@@ -214,13 +219,13 @@ class Simulation:
                 increment,
                 tried,
                 self.factor,
-                replace(self.control.newton, damping=self.damping, max_iterations=patience),
+                control,
                 self.floor,
                 self.deepest,
                 self.seconds,
             )
             self.counts["newton_iterations"] += found.iterations
-            if not found.reason or found.iterations >= patience:
+            if not found.reason or found.iterations >= control.max_iterations:
                 break  # from elsewhere it would take as many
         return found
 
