@@ -10,7 +10,15 @@ from samples import SAMPLES
 
 from limbfit.fe import ELEMENTS, History, Problem, System
 from limbfit.fe.assembly import assemble
-from limbfit.fe.kinematics import invert, logarithmic_stretches, principal, principal_axes
+from limbfit.fe.history import elastic_stresses
+from limbfit.fe.kinematics import (
+    deformation_gradient,
+    from_principal,
+    invert,
+    logarithmic_stretches,
+    principal,
+    principal_axes,
+)
 from limbfit.fe.lanes import LANES, block_places, exponential, logarithm, workspace
 from limbfit.fe.laws import Laws
 from limbfit.fe.materials.ogden import ogden, ogden_lanes
@@ -141,6 +149,24 @@ def test_elements_add_up_however_they_fall_into_lanes(name):
     alone = assembled(case, slice(0, count), False)
     assert alone[0] == energy
     np.testing.assert_array_equal(alone[1], residual)
+
+
+@every_element
+def test_elastic_stress_is_that_of_each_point(name):
+    """From axes of C = F^T F, where the kernel takes those of F F^T; and it is none at rest."""
+    system, laws, _, _, u = deformed(name)
+    assert np.abs(elastic_stresses(system, laws, np.zeros_like(u))).max() <= 2e-16 * laws.terms[..., 0].max()
+    stress = elastic_stresses(system, laws, u)
+    A, F, N = (np.empty((3, 3)) for _ in range(3))
+    c2, e, *response = (np.empty(3) for _ in range(5))
+    expected = np.empty(6)
+    for el, q in np.ndindex(stress.shape[:2]):
+        deformation_gradient(system.gradients[el, q], u[system.cells[el]].T.copy(), F)
+        principal(F, A, c2, N)
+        logarithmic_stretches(c2, e)
+        ogden(laws.terms[system.regions[el]], c2, e, *response)
+        from_principal(response[0] / c2, N, expected)
+        np.testing.assert_allclose(stress[el, q], expected, atol=1e-13 * np.abs(stress).max())
 
 
 @every_element

@@ -58,10 +58,14 @@ def test_cholesky_notices_an_indefinite_matrix(name):
         solver.factorise(U.data)
 
 
-def test_symmetric_product():
-    A, b = system()
-    U = upper(A)
-    np.testing.assert_allclose(symmetric_product(U.indptr, U.indices, U.data, b), A @ b, rtol=1e-12)
+@pytest.mark.parametrize("columns", [1, 2, 7, 8, 9, 16, 17])
+def test_symmetric_product(columns):
+    A, _ = system()
+    U, x = upper(A), np.random.default_rng(columns).normal(size=(A.shape[0], columns))
+    for threads in (1, 2):
+        found = symmetric_product(U.indptr, U.indices, U.data, x, threads)
+        np.testing.assert_allclose(found, A @ x, rtol=1e-12, atol=1e-12 * np.abs(A @ x).max())
+        assert found.flags.c_contiguous
 
 
 def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .kinematics import invert, principal_axes
+from .kinematics import deform, invert, principal_axes
 from .lanes import COMPILED, LANES, block_places, prefetch, workspace
-from .materials.ogden import ogden_lanes
+from .materials.ogden import ogden_lanes, set_terms
 from .materials.volumetric import volumetric
 
 Array = NDArray[np.float64]
@@ -114,29 +114,17 @@ def _gather(elements, start, terms, scale, u, points, term, at_points):  # type:
     for l in range(LANES):
         el = min(start + l, m - 1)
         region = regions[el]
-        for j in range(terms.shape[1]):
-            term[j].c[l], term[j].m[l] = terms[region, j, 0], terms[region, j, 1]
+        set_terms(term, l, terms[region])
         for q in range(weights.shape[1]):
             p = points[q]
-            f00 = f11 = f22 = 1.0
-            f01 = f02 = f10 = f12 = f20 = f21 = 0.0
+            deform(p, l, cells[el], grads[el, q], u)
             for a in range(k):
-                x, y, z = u[cells[el, a], 0], u[cells[el, a], 1], u[cells[el, a], 2]
-                gx, gy, gz = grads[el, q, 0, a], grads[el, q, 1, a], grads[el, q, 2, a]
                 to = at_points[q * k + a]
-                to.g[0, l], to.g[1, l], to.g[2, l] = gx, gy, gz
-                f00 += x * gx
-                f01 += x * gy
-                f02 += x * gz
-                f10 += y * gx
-                f11 += y * gy
-                f12 += y * gz
-                f20 += z * gx
-                f21 += z * gy
-                f22 += z * gz
-            p.F[0, 0, l], p.F[0, 1, l], p.F[0, 2, l] = f00, f01, f02
-            p.F[1, 0, l], p.F[1, 1, l], p.F[1, 2, l] = f10, f11, f12
-            p.F[2, 0, l], p.F[2, 1, l], p.F[2, 2, l] = f20, f21, f22
+                to.g[0, l], to.g[1, l], to.g[2, l] = (
+                    grads[el, q, 0, a],
+                    grads[el, q, 1, a],
+                    grads[el, q, 2, a],
+                )
             p.weight[l] = weights[el, q] if start + l < m else 0.0
             p.scale[l] = scale[region]
             for i in range(6):

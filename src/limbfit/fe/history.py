@@ -8,10 +8,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .kinematics import deformation_gradient, from_principal, logarithmic_stretches, principal
+from .kinematics import deform, invert, principal_axes
+from .lanes import COMPILED, LANES, workspace
 from .laws import Laws
 from .materials import prony_factors
-from .materials.ogden import ogden
+from .materials.ogden import ogden_lanes, set_terms
 from .system import Increment, System
 
 Array = NDArray[np.float64]
@@ -57,30 +58,51 @@ def elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
     stress = np.empty((*system.weights.shape, 6))
 
     def part(cells: slice) -> None:
-        elastic_stress(
-            system.cells[cells], system.gradients[cells], system.regions[cells], laws.terms, u, stress[cells]
-        )
+        points, law, *_ = workspace(0, 1, laws.terms.shape[1])
+        elements = system.cells[cells], system.gradients[cells], system.regions[cells]
+        _elastic_stresses(*elements, laws.terms, u, points[0], law, stress[cells])
 
     system.over_cells(part)
     return stress
 
 
-@njit(cache=True, nogil=True)
-def elastic_stress(cells, grads, regions, terms, u, out):  # type: ignore[no-untyped-def]
-    """The kernel of `elastic_stresses`."""
-    m, k = cells.shape
-    ue, matrix, vector = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((7, 3))
-    F, A, N = matrix[0], matrix[1], matrix[2]
-    c2, e, beta, slope, quotient = vector[0], vector[1], vector[2], vector[3], vector[4]
-    for el in range(m):
-        for a in range(k):
-            for i in range(3):
-                ue[i, a] = u[cells[el, a], i]
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _elastic_stresses(cells, grads, regions, terms, u, point, law, out):  # type: ignore[no-untyped-def]
+    """The kernel of `elastic_stresses`, `LANES` elements side by side; a POINT and TERMs are its scratch."""
+    m = len(cells)
+    for start in range(0, m, LANES):
+        for l in range(LANES):
+            set_terms(law, l, terms[regions[min(start + l, m - 1)]])
         for q in range(grads.shape[1]):
-            deformation_gradient(grads[el, q], ue, F)
-            principal(F, A, c2, N)
-            logarithmic_stretches(c2, e)
-            ogden(terms[regions[el]], c2, e, beta, slope, quotient)
-            for i in range(3):
-                beta[i] /= c2[i]
-            from_principal(beta, N, out[el, q])
+            for l in range(LANES):
+                el = min(start + l, m - 1)
+                deform(point, l, cells[el], grads[el, q], u)
+            invert(point)
+            principal_axes(point)
+            ogden_lanes(point, law)
+            _pull_back(point)
+            for l in range(min(LANES, m - start)):
+                for i in range(6):
+                    out[start + l, q, i] = point.tau[i, l]
+
+
+@njit(**COMPILED)
+def _pull_back(p):  # type: ignore[no-untyped-def]
+    """``Se = sum_i beta_i v_i x v_i`` of a POINT, with ``v_i = F^-1 n_i``, in the place of ``tau``."""
+    for l in range(LANES):
+        b0, b1, b2 = p.beta[0, l], p.beta[1, l], p.beta[2, l]
+        x0, x1, x2 = p.n[0, 0, l], p.n[0, 1, l], p.n[0, 2, l]
+        y0, y1, y2 = p.n[1, 0, l], p.n[1, 1, l], p.n[1, 2, l]
+        z0, z1, z2 = p.n[2, 0, l], p.n[2, 1, l], p.n[2, 2, l]
+        f, g, h = p.inverse[0, 0, l], p.inverse[1, 0, l], p.inverse[2, 0, l]
+        X0, X1, X2 = f * x0 + g * y0 + h * z0, f * x1 + g * y1 + h * z1, f * x2 + g * y2 + h * z2
+        f, g, h = p.inverse[0, 1, l], p.inverse[1, 1, l], p.inverse[2, 1, l]
+        Y0, Y1, Y2 = f * x0 + g * y0 + h * z0, f * x1 + g * y1 + h * z1, f * x2 + g * y2 + h * z2
+        f, g, h = p.inverse[0, 2, l], p.inverse[1, 2, l], p.inverse[2, 2, l]
+        Z0, Z1, Z2 = f * x0 + g * y0 + h * z0, f * x1 + g * y1 + h * z1, f * x2 + g * y2 + h * z2
+        p.tau[0, l] = b0 * X0 * X0 + b1 * X1 * X1 + b2 * X2 * X2
+        p.tau[1, l] = b0 * Y0 * Y0 + b1 * Y1 * Y1 + b2 * Y2 * Y2
+        p.tau[2, l] = b0 * Z0 * Z0 + b1 * Z1 * Z1 + b2 * Z2 * Z2
+        p.tau[3, l] = b0 * X0 * Y0 + b1 * X1 * Y1 + b2 * X2 * Y2
+        p.tau[4, l] = b0 * Y0 * Z0 + b1 * Y1 * Z1 + b2 * Y2 * Z2
+        p.tau[5, l] = b0 * Z0 * X0 + b1 * Z1 * X1 + b2 * Z2 * X2

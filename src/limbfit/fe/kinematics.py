@@ -28,16 +28,6 @@ def deformation_gradient(grad, u, F):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def inverse_transpose(F, J, out):  # type: ignore[no-untyped-def]
-    """``F^-T`` of a 3 x 3 matrix whose determinant is ``J``."""
-    for i in range(3):
-        i1, i2 = (i + 1) % 3, (i + 2) % 3
-        for j in range(3):
-            j1, j2 = (j + 1) % 3, (j + 2) % 3
-            out[i, j] = (F[i1, j1] * F[i2, j2] - F[i1, j2] * F[i2, j1]) / J
-
-
-@njit(cache=True)
 def principal(F, A, c2, N):  # type: ignore[no-untyped-def]
     """Eigenvalues ``c2 (3,)`` and eigenvectors (columns of ``N``) of ``C = F^T F`` by Jacobi rotations.
 
@@ -127,6 +117,28 @@ def mean_dilatation(grad, weights, u, F):  # type: ignore[no-untyped-def]
         current += J * weights[q]
         reference += weights[q]
     return current / reference
+
+
+@njit(forceinline=True, **COMPILED)
+def deform(p, l, nodes, grad, u):  # type: ignore[no-untyped-def]
+    """`deformation_gradient` of an element in a lane of a POINT: of its ``nodes (k,)`` in ``u (n, 3)``."""
+    f00 = f11 = f22 = 1.0
+    f01 = f02 = f10 = f12 = f20 = f21 = 0.0
+    for a in range(len(nodes)):
+        x, y, z = u[nodes[a], 0], u[nodes[a], 1], u[nodes[a], 2]
+        gx, gy, gz = grad[0, a], grad[1, a], grad[2, a]
+        f00 += x * gx
+        f01 += x * gy
+        f02 += x * gz
+        f10 += y * gx
+        f11 += y * gy
+        f12 += y * gz
+        f20 += z * gx
+        f21 += z * gy
+        f22 += z * gz
+    p.F[0, 0, l], p.F[0, 1, l], p.F[0, 2, l] = f00, f01, f02
+    p.F[1, 0, l], p.F[1, 1, l], p.F[1, 2, l] = f10, f11, f12
+    p.F[2, 0, l], p.F[2, 1, l], p.F[2, 2, l] = f20, f21, f22
 
 
 @njit(**COMPILED)

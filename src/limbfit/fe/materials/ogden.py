@@ -73,6 +73,13 @@ def _mean_exponential(xi, xj, half):  # type: ignore[no-untyped-def]
     return np.sqrt(xi * xj) * series if near else 0.5 * (xi - xj) / (1.0 if near else half)
 
 
+@njit(forceinline=True, **COMPILED)
+def set_terms(law, l, terms):  # type: ignore[no-untyped-def]
+    """Put the ``terms (k, 2)`` of an element's law in a lane of its TERMs."""
+    for k in range(len(terms)):
+        law[k].c[l], law[k].m[l] = terms[k, 0], terms[k, 1]
+
+
 @njit(**COMPILED)
 def ogden_lanes(p, terms):  # type: ignore[no-untyped-def]
     """`ogden` in all lanes of a POINT whose ``b`` is diagonal, with a TERM for each of the law's.
