@@ -99,6 +99,17 @@ def test_scaling_in_fresh_processes():
     assert all(row["max_rss_MB"] > 50 for row in (small, large))
 
 
+@pytest.mark.slow
+@with_reference
+def test_a_forward_run_as_febio_has_its_softer_contact():
+    own, febio = (
+        bench_forward(REFERENCE, "block/block_tet4", as_febio=chosen, tell=silent) for chosen in (False, True)
+    )
+    assert own["element"] == febio["element"] == "tet4"
+    assert febio["peak_force_N"] < own["peak_force_N"] < 1.05 * febio["peak_force_N"]
+    assert (own["as_febio"], febio["as_febio"]) == (False, True)
+
+
 @pytest.fixture
 def elsewhere(monkeypatch):
     """A folder name that no machine has above its temporary files."""

@@ -103,7 +103,7 @@ def test_a_soft_skin_does_not_slip_past_a_penalty_that_is_too_small(robustness):
     assert result.displacement[-1] == pytest.approx(0.4 * depth)
     assert result.peak_force == pytest.approx(21.1, rel=0.01)
     assert result.statistics["newton_iterations"] < 60
-    assert not result.warnings
+    assert not any(warning.startswith("the force falls") for warning in result.warnings)
 
 
 def paced(hard: Callable[[float, float, int], int]) -> list[tuple[float, int, str]]:

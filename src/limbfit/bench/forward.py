@@ -29,10 +29,11 @@ def bench_forward(
     case: str = "residuum/posterior_tet10",
     element: str = "",
     threads: int = 1,
+    as_febio: bool = False,
     *,
     tell: Tell,
 ) -> dict[str, Any]:
-    """Time a reference case with limbfit's own contact on FEBio's mesh and steps.
+    """Time a reference case on FEBio's mesh and steps, with limbfit's own contact or FEBio's.
 
     Parameters
     ----------
@@ -40,6 +41,7 @@ def bench_forward(
     case : a case with an indenter in it.
     element : name in the element table; empty: that of the mesh.
     threads : of assembly and linear algebra.
+    as_febio : with the element's quadrature and the contact penalty of the parity table.
 
     Raises
     ------
@@ -49,7 +51,9 @@ def bench_forward(
     if case not in CASES:
         raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(CASES)}")
     folder = reference or find_reference(Path.cwd())
-    named = replace(CASES[case], problem={"element": element}, control={"threads": threads})
+    chosen: dict[str, Any] = {"element": element} if element or not as_febio else {}
+    like: tuple[Any, Any] = (CASES[case].problem, CASES[case].control) if as_febio else ({}, {})
+    named = replace(CASES[case], problem={**like[0], **chosen}, control={**like[1], "threads": threads})
     job = ForwardJob(named, folder, False)
     tell(0, 2, f"{case}, plain")
     plain = in_fresh_process(run_forward, job, threads)
@@ -65,6 +69,7 @@ def bench_forward(
         "max_rss_with_sensitivities_MB": full["max_rss_MB"],
         "seconds_by_part_with_sensitivities": full["seconds_by_part"],
         "threads": threads,
+        "as_febio": as_febio,
         "febio_seconds": febio,
         "ratio": None if febio is None else febio / plain["seconds"],
     }

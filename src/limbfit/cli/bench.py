@@ -55,11 +55,16 @@ def forward(
     case: Annotated[str, typer.Option(help="case of the reference folder")] = "residuum/posterior_tet10",
     element: Annotated[str, typer.Option(help="name in the element table; default: that of the mesh")] = "",
     threads: Threads = CORES,
+    as_febio: Annotated[
+        bool, typer.Option("--as-febio", help="with FEBio's quadrature and contact penalty (parity table)")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Time one simulation, plain and with sensitivities, beside FEBio's time for it."""
     with listening() as listener:
-        found = limbfit.bench_forward(reference, case, element, threads, tell=teller(listener, "forward"))
+        found = limbfit.bench_forward(
+            reference, case, element, threads, as_febio, tell=teller(listener, "forward")
+        )
     if as_json:
         print_json(found)
     else:
