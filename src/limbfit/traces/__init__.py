@@ -1,9 +1,10 @@
 """Indentation records: read them, find the touch-down, regularise them.
 
-A record starts clear of the skin (or on it), the indenter is pushed in along a line, possibly held, and drawn
-back. ``read_trace`` checks it, ``find_touch_down`` tells where the skin was met, and ``regularise`` gives
-curves counted from there: piecewise straight for the displacement, a cubic smoothing spline for the force,
-loading and unloading apart so that the peak is not smoothed away (paper, section 2.1 and figure 3).
+A record starts clear of the skin (or on it); the indenter is pushed in along a line, held, drawn back, in any
+order, at any rates and in several cycles (see `phases`). ``read_trace`` checks it, ``understand`` mends
+or refuses it, ``find_touch_down`` tells where the skin was met, and ``regularise`` gives curves counted from
+there: piecewise straight for the displacement, a cubic smoothing spline for the force, each phase by itself
+so that the peak is not smoothed away (paper, section 2.1 and figure 3).
 
 Units: s, mm, N; force positive when pushing, displacement positive into the limb.
 """
@@ -12,15 +13,19 @@ from .reading import read_trace
 from .record import COLUMNS, Trace, check_trace
 from .regularise import Regularised, regularise
 from .touchdown import TouchDown, find_touch_down, touch_down_at
+from .understanding import Remark, Understood, understand
 
 __all__ = [
     "COLUMNS",
     "Regularised",
+    "Remark",
     "TouchDown",
     "Trace",
+    "Understood",
     "check_trace",
     "find_touch_down",
     "read_trace",
     "regularise",
     "touch_down_at",
+    "understand",
 ]

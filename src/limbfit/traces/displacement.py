@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ..errors import TraceError
-from .numerics import Array, bins, noise_level
+from ..phases import Phase, find_phases, tolerance_mm, way_in
+from .numerics import Array, bins, noise_level, straight
 
-_MAX_KNOTS = 12
+_MAX_KNOTS = 41
 
 
 @dataclass(frozen=True)
@@ -25,41 +26,33 @@ class BrokenLine:
     def __call__(self, at: Array) -> Array:
         return np.interp(at, self.times, self.values)
 
-    @property
-    def _top(self) -> NDArray[np.intp]:
-        return np.flatnonzero(self.values >= self.values.max() - self.tolerance)
+    @cached_property
+    def phases(self) -> tuple[Phase, ...]:
+        """What the indenter does, from the first sample to the last."""
+        return find_phases(self.times, self.values, tolerance=max(tolerance_mm(self.values), self.tolerance))
 
     @property
     def peak_s(self) -> float:
-        """When the way in ends."""
-        return float(self.times[self._top[0]])
-
-    @property
-    def unload_s(self) -> float:
-        """When the way out begins, or the record ends."""
-        return float(self.times[self._top[-1]])
-
-    @property
-    def unloads(self) -> bool:
-        return bool(self._top[-1] < len(self.times) - 1)
+        """When the (first) way in ends."""
+        last = way_in(self.phases)
+        return float(self.times[-1]) if last is None else last.end_s
 
     @property
     def start_s(self) -> float:
-        """When the indenter starts to move."""
-        return float(self.times[max(int(np.argmax(self.values > self.values[0] + self.tolerance)) - 1, 0)])
+        """When the indenter starts to move in."""
+        return next((phase.start_s for phase in self.phases if phase.kind == "load"), float(self.times[0]))
 
     def time_at(self, displacement: float, back: bool = False) -> float:
-        """When the line passes a displacement on the way in, or ``back`` out (the end where it never
-        does)."""
-        way = self.times >= self.unload_s if back else self.times <= self.peak_s
-        t, u = self.times[way], self.values[way]
+        """When the line passes a displacement on the first way in, or for the last time ``back`` out (the
+        end where it stays beyond)."""
         if back:
-            first = int(np.argmax(u <= displacement)) if (u <= displacement).any() else len(u)
-            t, u = t[: first + 1][::-1], u[: first + 1][::-1]
-        else:
-            last = int(np.flatnonzero(u <= displacement)[-1]) if (u <= displacement).any() else 0
-            t, u = t[last:], u[last:]
-        return float(np.interp(displacement, np.maximum.accumulate(u), t))
+            last = int(np.flatnonzero(self.values > displacement)[-1])
+            after = min(last + 1, len(self.times) - 1)
+            return float(np.interp(-displacement, -self.values[[last, after]], self.times[[last, after]]))
+        way = self.times <= self.peak_s
+        t, u = self.times[way], self.values[way]
+        last = int(np.flatnonzero(u <= displacement)[-1]) if (u <= displacement).any() else 0
+        return float(np.interp(displacement, np.maximum.accumulate(u[last:]), t[last:]))
 
 
 def broken_line(time: Array, displacement: Array, peak_s: float | None = None) -> BrokenLine:
@@ -71,7 +64,7 @@ def broken_line(time: Array, displacement: Array, peak_s: float | None = None) -
     Raises
     ------
     TraceError
-        Where the way in cannot end at ``peak_s``.
+        Where forty pieces do not describe it, it never advances, or the way in cannot end at ``peak_s``.
     """
     t, u, _ = bins(time, displacement, 5000)
     at, coarse, n = bins(t, u, 300)
@@ -83,10 +76,22 @@ def broken_line(time: Array, displacement: Array, peak_s: float | None = None) -
         miss = np.abs(coarse - np.interp(at, knots, values))
         # Averages over a corner are blunt: no misfit, and no place for another corner.
         miss[np.searchsorted(at, knots[1:-1]).clip(1, len(at) - 1)[:, None] - [0, 1]] = 0.0
-        if miss.max() <= tolerance or len(knots) >= _MAX_KNOTS:
-            line = BrokenLine(knots, values, tolerance)
-            return line if peak_s is None else _turning_at(peak_s, line, t, u)
+        if miss.max() <= tolerance:
+            break
+        if len(knots) >= _MAX_KNOTS:
+            worst = float(at[np.argmax(miss)])
+            raise TraceError(
+                f"the displacement wanders: {len(knots) - 1} straight pieces leave {miss.max():.2g} mm at "
+                f"{worst:.2f} s",
+                place="displacement",
+                remedy="a record is made of ramps and holds, in any number of cycles up to ten: "
+                "cut out the part that is",
+            )
         knots = np.sort(np.append(knots, at[np.argmax(miss)]))
+    line = BrokenLine(knots, values, tolerance)
+    if way_in(line.phases) is None:
+        raise TraceError("the displacement never advances", place="displacement", remedy="check the column")
+    return line if peak_s is None else _turning_at(peak_s, line, t, u)
 
 
 def _turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLine:
@@ -108,17 +113,41 @@ def _turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLi
 
 
 def _values(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
-    """Least-squares values of a continuous broken line with corners at ``knots``, and its misfit."""
-    hats = np.stack([np.interp(t, knots, row) for row in np.eye(len(knots))], axis=1)
-    fit = np.asarray(np.linalg.lstsq(hats, u, rcond=None)[0], dtype=np.float64)
-    return fit, hats @ fit - u
+    """Least-squares values of a continuous broken line with corners at ``knots``, and its hats."""
+    hats = straight(t, knots)
+    return _projected(hats, u), hats
+
+
+def _projected(hats: Array, u: Array) -> Array:
+    """Coefficients (k, ...) of hats (n, k) that come nearest to ``u`` (n, ...).
+
+    Hats overlap with their neighbours only, so the normal equations are well conditioned; the little on their
+    diagonal is for corners so near to each other that no sample lies between them.
+    """
+    normal = hats.T @ hats
+    normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal)
+    return np.asarray(np.linalg.solve(normal, hats.T @ u), dtype=np.float64)
 
 
 def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
     """Least-squares corner times and values of a continuous broken line through (t, u)."""
 
-    def values(inner: Array) -> tuple[Array, Array]:
-        return _values(t, u, np.r_[knots[0], inner, knots[-1]])
+    def whole(inner: Array) -> Array:
+        return np.r_[knots[0], inner, knots[-1]]
+
+    def misfit(inner: Array) -> Array:
+        values, hats = _values(t, u, whole(inner))
+        return hats @ values - u
+
+    def slopes(inner: Array) -> Array:
+        """A corner that moves takes its hat along, at the speed on either side; the values follow (variable
+        projection, Kaufman 1975)."""
+        corners = whole(inner)
+        values, hats = _values(t, u, corners)
+        piece = np.clip(np.searchsorted(corners, t) - 1, 0, len(corners) - 2)
+        speed = (np.diff(values) / np.diff(corners))[piece]
+        moved = -speed[:, None] * hats[:, 1:-1]
+        return np.asarray(moved - hats @ _projected(hats, moved))
 
     inner = knots[1:-1]
     if inner.size:
@@ -126,5 +155,6 @@ def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
         middle = (knots[:-1] + knots[1:]) / 2
         lower = np.r_[knots[0] + margin[0], middle[1:-1] + margin[1:-1]]
         upper = np.r_[middle[1:-1] - margin[1:-1], knots[-1] - margin[-1]]
-        inner = least_squares(lambda x: values(x)[1], inner, bounds=(lower, upper), x_scale=np.ptp(knots)).x
-    return np.r_[knots[0], inner, knots[-1]], values(inner)[0]
+        found = least_squares(misfit, inner, jac=slopes, bounds=(lower, upper), x_scale=np.ptp(knots))
+        inner = found.x
+    return whole(inner), _values(t, u, whole(inner))[0]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
-from .displacement import BrokenLine, broken_line
-from .numerics import Array, Bools, bins, rms, straight
+from ..phases import Phase, boundaries, find_phases, spread, way_in
+from .displacement import broken_line
+from .numerics import Array, bins, rms, straight
 from .record import Trace
 from .touchdown import TouchDown
 
@@ -20,10 +21,9 @@ from .touchdown import TouchDown
 class Regularised:
     """Curves from touch-down: (n,) arrays that start at time 0, displacement 0, force 0.
 
-    ``knots_s`` and ``knots_mm`` are the corners of the displacement (start, peak, end; more for a hold or a
-    speed that changes); ``corners_s`` are the ends of the parts that were smoothed apart. ``noise_N`` and
-    ``noise_mm`` are standard deviations of what was smoothed away. ``speed_unload_mm_s`` is nan where nothing
-    was unloaded. ``curve`` is the force as the splines that it is made of.
+    ``knots_s`` and ``knots_mm`` are the corners of the displacement; ``phases`` what it does, from touch-down
+    on. ``noise_N`` and ``noise_mm`` are standard deviations of what was smoothed away. ``curve`` is the force
+    as the splines that it is made of.
     """
 
     time_s: Array
@@ -31,11 +31,9 @@ class Regularised:
     force_N: Array
     knots_s: Array
     knots_mm: Array
-    corners_s: Array
+    phases: tuple[Phase, ...]
     noise_N: float
     noise_mm: float
-    speed_load_mm_s: float
-    speed_unload_mm_s: float
     curve: SmoothCurve = field(repr=False)
 
     @property
@@ -48,27 +46,46 @@ class Regularised:
         return float(self.force_N.max())
 
     @property
+    def peak_s(self) -> float:
+        """When the first way in ends."""
+        last = way_in(self.phases)
+        assert last is not None  # touch-down lies on it
+        return last.end_s
+
+    @property
     def depth_mm(self) -> float:
         return float(self.knots_mm.max())
 
+    @property
+    def corners_s(self) -> Array:
+        """Ends of the phases (k,) s."""
+        return boundaries(self.phases)
+
+    @property
+    def speed_load_mm_s(self) -> float:
+        """Of the first loading."""
+        return self._speed("load")
+
+    @property
+    def speed_unload_mm_s(self) -> float:
+        """Of the first unloading; nan where nothing was unloaded."""
+        return self._speed("unload")
+
+    def _speed(self, kind: str) -> float:
+        return next((abs(phase.rate_mm_s) for phase in self.phases if phase.kind == kind), float("nan"))
+
     def resample(self, points: int) -> Regularised:
         """The same curves at about ``points`` times, spread evenly in time, every corner among them."""
-        time = _grid(np.union1d(self.corners_s, self.knots_s), points)
-        return Regularised(
-            time,
-            np.interp(time, self.knots_s, self.knots_mm),
-            np.interp(time, self.time_s, self.force_N),
-            self.knots_s,
-            self.knots_mm,
-            self.corners_s,
-            self.noise_N,
-            self.noise_mm,
-            self.speed_load_mm_s,
-            self.speed_unload_mm_s,
-            self.curve,
+        time = spread(self.phases, points, self.knots_s)
+        return replace(
+            self,
+            time_s=time,
+            displacement_mm=np.interp(time, self.knots_s, self.knots_mm),
+            force_N=np.interp(time, self.time_s, self.force_N),
         )
 
 
+_LEAST_SAMPLES = 5  # of a part
 _BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
 _PINNED = 1e3  # weight of a shared end point, in weights of its whole part
 
@@ -82,8 +99,8 @@ def regularise(
     ----------
     smoothing : penalty on the squared second derivative of force, s^3 (``lam`` of
         ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
-        cross-validation chooses it for loading and unloading each.
-    peak_s : when the way in ends, as someone states it; found where it is not given.
+        cross-validation chooses it for each phase.
+    peak_s : when the (first) way in ends, as someone states it; found where it is not given.
 
     Raises
     ------
@@ -92,41 +109,42 @@ def regularise(
         the way in cannot end where it is stated to.
     """
     line = broken_line(trace.time_s, trace.displacement_mm, peak_s)
-    start = touch_down.time_s
-    corners = _corners(line, start, touch_down.displacement_mm)
-    force = trace.force_N - touch_down.baseline_N
-    parts = [(trace.time_s >= a) & (trace.time_s <= b) for a, b in pairwise(corners)]
-    if parts[0].sum() < 8:
-        raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
-    curve = SmoothCurve(trace.time_s - start, force, parts, corners - start, smoothing)
-    inside = (trace.time_s >= start) & (trace.time_s <= corners[-1])
-    knots = np.union1d(corners, line.times[(line.times > start) & (line.times < corners[-1])])
+    start, end = touch_down.time_s, line.time_at(touch_down.displacement_mm, back=True)
+    knots = np.r_[start, line.times[(line.times > start) & (line.times < end)], end]
     knots_mm = line(knots) - touch_down.displacement_mm
-    time = _grid(knots, 1000)
-    speeds = np.diff(line(corners)) / np.diff(corners)
+    phases = find_phases(knots - start, knots_mm)
+    force = trace.force_N - touch_down.baseline_N
+    if ((trace.time_s >= start) & (trace.time_s <= line.peak_s)).sum() < 8:
+        raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
+    corners = _with_samples(boundaries(phases), trace.time_s - start)
+    curve = SmoothCurve(trace.time_s - start, force, corners, smoothing)
+    inside = (trace.time_s >= start) & (trace.time_s <= end)
+    time = spread(phases, 1000, knots - start)
     return Regularised(
-        time_s=time - start,
-        displacement_mm=np.interp(time, knots, knots_mm),
-        force_N=np.maximum(curve(time - start), 0.0),  # a dry indenter cannot pull
+        time_s=time,
+        displacement_mm=np.interp(time, knots - start, knots_mm),
+        force_N=np.maximum(curve(time), 0.0),  # a dry indenter cannot pull
         knots_s=knots - start,
         knots_mm=knots_mm,
-        corners_s=corners - start,
+        phases=phases,
         noise_N=rms(force[inside] - curve(trace.time_s[inside] - start)),
         noise_mm=rms(trace.displacement_mm[inside] - line(trace.time_s[inside])),
-        speed_load_mm_s=float(speeds[0]),
-        speed_unload_mm_s=float(-speeds[-1]) if line.unloads else float("nan"),
         curve=curve,
     )
 
 
-def _corners(line: BrokenLine, start: float, touch_mm: float) -> Array:
-    """Touch-down, end of loading, start of unloading after a hold, and lift-off or the end of the record."""
-    corners = [start, line.peak_s]
-    if line.unload_s > line.peak_s:
-        corners.append(line.unload_s)
-    if line.unloads:
-        corners.append(line.time_at(touch_mm, back=True))
-    return np.array(corners)
+def _with_samples(corners: Array, time: Array) -> Array:
+    """The corners between which there are samples enough for a spline: a shorter part belongs to its
+    neighbour."""
+    kept = list(corners)
+    k = 0
+    while len(kept) > 2 and k < len(kept) - 1:
+        if ((time >= kept[k]) & (time <= kept[k + 1])).sum() >= _LEAST_SAMPLES:
+            k += 1
+        else:
+            del kept[k + 1 if k + 2 < len(kept) else k]
+            k = max(k - 1, 0)
+    return np.array(kept)
 
 
 class SmoothCurve:
@@ -136,11 +154,10 @@ class SmoothCurve:
     linear in the record: ``response`` says what the same smoothing makes of another force.
     """
 
-    def __init__(
-        self, time: Array, force: Array, parts: list[Bools], corners: Array, smoothing: float | None
-    ) -> None:
-        self._bins = [bins(time[part], force[part], _BINS) for part in parts if part.sum() >= 5]
-        self._corners = corners[: len(self._bins) + 1]
+    def __init__(self, time: Array, force: Array, corners: Array, smoothing: float | None) -> None:
+        parts = [(time >= a) & (time <= b) for a, b in pairwise(corners)]
+        self._bins = [bins(time[part], force[part], _BINS) for part in parts]
+        self._corners = corners
         given = [(smoothing, smoothing)] * len(self._bins)
         self._splines, self._penalties = self._fitted([averages for _, averages, _ in self._bins], given)
 
@@ -203,10 +220,3 @@ def _penalty(spline: BSpline, x: Array, y: Array, w: Array) -> float:
     rough = float(np.sum(np.diff(x) * (bend[1:] ** 2 + bend[1:] * bend[:-1] + bend[:-1] ** 2))) / 3.0
     smooth = spline(x)
     return max(float(np.sum(w * smooth * (y - smooth))), 0.0) / max(rough, 1e-300)
-
-
-def _grid(corners: Array, points: int) -> Array:
-    """About ``points`` times, evenly spread between the corners in proportion, corners included."""
-    share = np.maximum(np.round((points - 1) * np.diff(corners) / np.ptp(corners)).astype(int), 2)
-    pieces = [np.linspace(a, b, n + 1)[:-1] for (a, b), n in zip(pairwise(corners), share)]
-    return np.r_[np.concatenate(pieces), corners[-1]]

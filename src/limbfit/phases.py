@@ -1,0 +1,213 @@
+"""The phases of an indentation: what the indenter does, told from its displacement alone.
+
+Vocabulary
+----------
+approach  before the skin is met.
+load      the indenter advances; two rates in a row are two phases.
+hold      it stays where it is; a creep of micrometres is no advance.
+unload    it goes back.
+
+Any number of them follow one another, as in cycles. Everything that asks where loading ends asks here: the
+largest of many values that are equal but for noise or creep may lie anywhere in a hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Kind = Literal["approach", "load", "hold", "unload"]
+
+SHARE = 0.005  # of the travel: a smaller change is none
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What the indenter does from ``start_s`` to ``end_s``, and where it was then, mm."""
+
+    kind: Kind
+    start_s: float
+    end_s: float
+    start_mm: float
+    end_mm: float
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+    @property
+    def rate_mm_s(self) -> float:
+        """Mean speed, mm/s; negative on the way out."""
+        return (self.end_mm - self.start_mm) / self.duration_s
+
+    def later(self, seconds: float) -> Phase:
+        """The same, with times that count from so much earlier."""
+        return replace(self, start_s=self.start_s + seconds, end_s=self.end_s + seconds)
+
+
+def tolerance_mm(displacement: Array) -> float:
+    """The change of displacement (n,), mm, that counts as none: half a percent of the travel."""
+    return SHARE * float(np.ptp(displacement))
+
+
+def find_phases(
+    times: Array, displacement: Array, *, tolerance: float | None = None, contact_s: float | None = None
+) -> tuple[Phase, ...]:
+    """The phases of a displacement: corners of a broken line, or as many samples as one likes.
+
+    The displacement is reduced to the fewest straight pieces that follow it to the tolerance; a piece that
+    changes it by no more than that is a hold. Noise of samples must be far smaller (a broken line is fitted
+    to a record first, in ``traces.displacement``).
+
+    Parameters
+    ----------
+    times, displacement : (n,) s, growing, and mm, with n > 1.
+    tolerance : mm that count as nothing; ``tolerance_mm`` by default.
+    contact_s : when the skin is met: all before is one ``approach``.
+    """
+    times, displacement = np.asarray(times, dtype=float), np.asarray(displacement, dtype=float)
+    allowed = tolerance_mm(displacement) if tolerance is None else tolerance
+    corners = _corners(times, displacement, allowed)
+    found: list[Phase] = []
+    for a, b in pairwise(corners):
+        piece = _piece(
+            float(times[a]), float(times[b]), float(displacement[a]), float(displacement[b]), allowed
+        )
+        if found and piece.kind == found[-1].kind == "hold":
+            piece = replace(found.pop(), end_s=piece.end_s, end_mm=piece.end_mm)
+        found.append(piece)
+    return tuple(found) if contact_s is None else _from_contact(found, contact_s)
+
+
+def loading_end(phases: Sequence[Phase]) -> Phase | None:
+    """The loading that first reaches the largest displacement, to the tolerance; None where nothing advances.
+
+    Its end is the peak that people mean: what creeps on afterwards is the hold.
+    """
+    ends = np.array([value for phase in phases for value in (phase.start_mm, phase.end_mm)])
+    enough = ends.max() - tolerance_mm(ends)
+    return next((phase for phase in phases if phase.kind == "load" and phase.end_mm >= enough), None)
+
+
+def way_in(phases: Sequence[Phase]) -> Phase | None:
+    """The loading with which the first advance ends, holds and other rates before it; None where none is.
+
+    An advance of less than a tenth of the travel that is taken back is not counted.
+    """
+    ends = np.array([value for phase in phases for value in (phase.start_mm, phase.end_mm)])
+    enough = ends.min() + 0.1 * float(np.ptp(ends))
+    last: Phase | None = None
+    for phase in phases:
+        if phase.kind == "load":
+            last = phase
+        elif phase.kind == "unload" and last is not None:
+            if last.end_mm >= enough:
+                return last
+            last = None
+    return last
+
+
+def boundaries(phases: Sequence[Phase]) -> Array:
+    """Times (k,) s at which phases begin or end: the kinks of the displacement, both its ends among them."""
+    return np.array([phases[0].start_s, *(phase.end_s for phase in phases)])
+
+
+def spread(phases: Sequence[Phase], points: int, among: Array | None = None) -> Array:
+    """About ``points`` times (k,) s, evenly over the phases, their boundaries and all ``among`` included.
+
+    A phase that is short beside the others has ten steps nevertheless, or its part of half of the points.
+    """
+    ends = boundaries(phases)
+    whole = float(np.ptp(ends))
+    least = min(10, max(points // (2 * len(phases)), 2))
+    grid = [ends[:1]]
+    for a, b in pairwise(ends):
+        steps = max(round((points - 1) * (b - a) / whole), least)
+        inner = np.array([]) if among is None else among[(among > a) & (among < b)]
+        for start, end in pairwise(np.r_[a, inner, b]):
+            count = max(round(steps * (end - start) / (b - a)), 2)
+            grid.append(np.linspace(start, end, count + 1)[1:])
+    return np.concatenate(grid)
+
+
+def in_words(phases: Sequence[Phase]) -> str:
+    """The phases as people say them, cycles that repeat within 5 % counted; the approach left out."""
+    named = [phase for phase in phases if phase.kind != "approach"]
+    for length in range(1, len(named) // 2 + 1):
+        cycles = len(named) // length
+        if cycles * length == len(named) and all(
+            _alike(a, b) for a, b in zip(named, named[length:], strict=False)
+        ):
+            return f"{cycles} cycles of {', '.join(map(_word, named[:length]))}"
+    return ", ".join(map(_word, named))
+
+
+def _alike(one: Phase, other: Phase) -> bool:
+    """Whether two phases are the same part of two cycles: the first one's way is from touch-down."""
+    if one.kind != other.kind:
+        return False
+    a, b = (phase.duration_s if phase.kind == "hold" else phase.rate_mm_s for phase in (one, other))
+    return abs(a - b) <= 0.05 * abs(a)
+
+
+def _word(phase: Phase) -> str:
+    if phase.kind == "hold":
+        return f"hold for {phase.duration_s:.3g} s"
+    return f"{phase.kind} at {abs(phase.rate_mm_s):.3g} mm/s"
+
+
+def _piece(start_s: float, end_s: float, start_mm: float, end_mm: float, allowed: float) -> Phase:
+    change = end_mm - start_mm
+    kind: Kind = "hold" if abs(change) <= allowed else "load" if change > 0.0 else "unload"
+    return Phase(kind, start_s, end_s, start_mm, end_mm)
+
+
+def _from_contact(phases: Sequence[Phase], contact_s: float) -> tuple[Phase, ...]:
+    """One approach up to contact, then the phases."""
+    first = phases[0]
+    if contact_s <= first.start_s:
+        return tuple(phases)
+    within = next((p for p in phases if p.end_s > contact_s), phases[-1])
+    at = float(np.interp(contact_s, [within.start_s, within.end_s], [within.start_mm, within.end_mm]))
+    left = [replace(p, start_s=contact_s, start_mm=at) if p is within else p for p in phases]
+    return (
+        Phase("approach", first.start_s, contact_s, first.start_mm, at),
+        *(p for p in left if p.end_s > contact_s),
+    )
+
+
+def _corners(times: Array, values: Array, allowed: float) -> list[int]:
+    """Indices of the fewest samples between which straight lines follow all others to ``allowed``.
+
+    Split where the misfit is largest (Douglas and Peucker, Cartographica 10, 1973, here along the
+    displacement), then leave out what later corners have made unnecessary.
+    """
+    corners, open_pieces = {0, len(times) - 1}, [(0, len(times) - 1)]
+    while open_pieces:
+        a, b = open_pieces.pop()
+        miss = _misfit(times, values, a, b)
+        if miss.size and miss.max() > allowed:
+            middle = a + 1 + int(np.argmax(miss))
+            corners.add(middle)
+            open_pieces += [(a, middle), (middle, b)]
+    kept = sorted(corners)
+    while len(kept) > 2:
+        without = [_misfit(times, values, a, b).max() for a, b in zip(kept, kept[2:])]
+        least = int(np.argmin(without))
+        if without[least] > allowed:
+            break
+        del kept[least + 1]
+    return kept
+
+
+def _misfit(times: Array, values: Array, a: int, b: int) -> Array:
+    """How far the samples between two are from the straight line through those, mm."""
+    inside = slice(a + 1, b)
+    straight = np.interp(times[inside], [times[a], times[b]], [values[a], values[b]])
+    return np.abs(values[inside] - straight)

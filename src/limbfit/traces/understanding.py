@@ -1,0 +1,233 @@
+"""What a record is before it is regularised: mended where that is safe, refused where it cannot be used.
+
+Single samples that stick out are replaced by their neighbours' line, a force that drifts is set straight by
+what the sensor says clear of the skin, and a record that begins in contact is refused: where its skin was met
+nobody knows.  What was done, and what someone should know, stands in ``remarks``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from ..errors import TraceError
+from .displacement import BrokenLine, broken_line
+from .numerics import Array, Bools, bins, noise_level
+from .record import Trace
+from .scatter import scatter_of
+from .touchdown import TouchDown, find_touch_down, touch_down_at
+
+_SPIKE_WIDTH = 2  # samples; what lasts longer may have happened
+_SPIKE_NOISE = 8.0  # standard deviations
+_SPIKE_STEPS = 6.0  # times the usual step between the samples around it: a corner is no spike
+_SPIKE_SHARE = 0.02  # of the range: less does no harm
+_MOST_SPIKES = 0.01  # of the samples
+_AROUND = 4  # samples on either side
+_CLEAR_MM = 0.1  # and two standard deviations of touch-down: off the skin
+_LEAST_CLEAR = 20  # samples
+_DRIFT_SHARE = 0.01  # of the peak force, over the record: less does no harm
+_DRIFT_SD = 5.0
+_MOST_DRIFT = 0.3  # of the peak force: more is no sensor to correct
+_PRELOAD_SHARE = 0.05  # of the peak force
+_START_FORCE_SHARE = 0.25  # of the peak force, where there are too few samples for a slope
+_START_SHARE = 0.03  # of the travel
+_START_SLOPE = 0.25  # of the mean slope of the way in
+_LEAST_START = 8  # samples
+_BINS = 200
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something to know about a record: its kind, what, its likely cause, the remedy, and the numbers."""
+
+    kind: str
+    what: str
+    cause: str
+    remedy: str
+    evidence: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Understood:
+    """A record as it is used, where its skin is met, and what to know about it."""
+
+    trace: Trace
+    touch_down: TouchDown
+    remarks: tuple[Remark, ...]
+
+
+def understand(trace: Trace, touch_down_s: float | None = None) -> Understood:
+    """Mend a record and find its touch-down, unless ``touch_down_s`` states it.
+
+    Raises
+    ------
+    TraceError
+        Where it begins in contact, where more than 1 % of its samples stick out, where its force drifts by
+        more than 30 % of the peak, or as `find_touch_down` and `touch_down_at` do.
+    """
+    trace, remarks = _without_spikes(trace)
+    line = broken_line(trace.time_s, trace.displacement_mm)
+    _check_start(trace, line)
+    level = _level_ends(trace, line)
+    touch = _touch_down(level, touch_down_s)
+    straight, drift = _without_drift(trace, line, touch)
+    if straight is not level:
+        touch = _touch_down(straight, touch_down_s)
+    return Understood(straight, touch, (*remarks, *drift, *_start_remark(touch, touch_down_s)))
+
+
+def _touch_down(trace: Trace, stated_s: float | None) -> TouchDown:
+    return find_touch_down(trace) if stated_s is None else touch_down_at(trace, stated_s)
+
+
+def _without_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
+    remarks = []
+    for column, quantity, unit in (("force_N", "force", "N"), ("displacement_mm", "displacement", "mm")):
+        values: Array = getattr(trace, column)
+        spikes = _spikes(values)
+        count = int(spikes.sum())
+        if not count:
+            continue
+        if count > _MOST_SPIKES * len(values):
+            raise TraceError(
+                f"{count} of {len(values)} samples stick out from their neighbours",
+                place=column,
+                remedy="check the sensor and its cable, and record again",
+            )
+        mended = values.copy()
+        mended[spikes] = np.interp(trace.time_s[spikes], trace.time_s[~spikes], values[~spikes])
+        largest = float(np.abs(values - mended).max())
+        trace = replace(trace, **{column: mended})
+        what = (
+            f"{count} of {len(values)} samples of the {quantity} stick out by up to {largest:.2g} {unit} and "
+            "were replaced"
+        )
+        numbers = {"spikes": float(count), f"largest_{unit}": largest}
+        remarks.append(Remark("spikes", what, "a loose contact or a disturbance", "check the cable", numbers))
+    return trace, remarks
+
+
+def _spikes(values: Array) -> Bools:
+    """Which samples (n,) stick out from the median of their neighbours, one or two in a row."""
+    off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="nearest")
+    noise = max(1.4826 * float(np.median(np.abs(off))), noise_level(values))
+    out = np.abs(off) > max(
+        _SPIKE_NOISE * noise, _SPIKE_SHARE * float(np.ptp(np.percentile(values, [1, 99])))
+    )
+    steps = np.abs(np.diff(values))
+    for i in np.flatnonzero(out):
+        before, after = steps[max(i - 1 - _AROUND, 0) : max(i - 1, 0)], steps[i + 2 : i + 2 + _AROUND]
+        out[i] = abs(off[i]) > _SPIKE_STEPS * np.median(np.r_[before, after])
+    edges = np.flatnonzero(np.diff(np.r_[False, out, False]))
+    for start, end in edges.reshape(-1, 2):
+        if end - start > _SPIKE_WIDTH:
+            out[start:end] = False
+    return np.asarray(out, dtype=bool)
+
+
+def _level_ends(trace: Trace, line: BrokenLine) -> Trace:
+    """The record without the line from its start to its end, where the indenter is back where it began.
+
+    Only there a drift shows before the touch-down is known: near the skin it looks like an onset.
+    """
+    back = line(trace.time_s) < line.values[0] + _CLEAR_MM
+    before, after = back & (trace.time_s < line.peak_s), back & (trace.time_s > _release_s(line))
+    if min(before.sum(), after.sum()) < _LEAST_CLEAR:
+        return trace
+    change = float(np.median(trace.force_N[after]) - np.median(trace.force_N[before]))
+    if abs(change) < _DRIFT_SHARE * _rise(trace):
+        return trace
+    slope = change / float(trace.time_s[after].mean() - trace.time_s[before].mean())
+    return replace(trace, force_N=trace.force_N - slope * (trace.time_s - trace.time_s[0]))
+
+
+def _release_s(line: BrokenLine) -> float:
+    """When the last way out begins; infinite where there is none."""
+    return max((phase.start_s for phase in line.phases if phase.kind == "unload"), default=float("inf"))
+
+
+def _clear(trace: Trace, line: BrokenLine, touch: TouchDown) -> Bools:
+    """Samples surely off the skin: the approach, the end, and what is between cycles."""
+    margin = max(_CLEAR_MM, 2 * touch.uncertainty_mm)
+    return np.asarray(line(trace.time_s) < touch.displacement_mm - margin)
+
+
+def _without_drift(trace: Trace, line: BrokenLine, touch: TouchDown) -> tuple[Trace, list[Remark]]:
+    clear = _clear(trace, line, touch)
+    if clear.sum() < _LEAST_CLEAR:
+        return trace, []
+    time, force = trace.time_s[clear], trace.force_N[clear]
+    slope, residual = _straight(time, force)
+    scatter = scatter_of(*np.split(residual, np.flatnonzero(np.diff(np.flatnonzero(clear)) > 1) + 1))
+    spread = float(np.sqrt(np.sum((time - time.mean()) ** 2)))
+    sd = scatter.sd_N * float(np.sqrt((1 + scatter.lag) / (1 - scatter.lag))) / spread
+    peak = _rise(trace)
+    total = slope * float(np.ptp(trace.time_s))
+    if abs(slope) < _DRIFT_SD * sd or abs(total) < _DRIFT_SHARE * peak:
+        return trace, []
+    what = f"the force drifts by {slope:+.2g} N/s clear of the skin, {total:+.2g} N over the record"
+    if abs(total) > _MOST_DRIFT * peak:
+        raise TraceError(
+            f"{what}, against a peak of {peak:.3g} N",
+            place="force_N",
+            remedy="let the sensor warm up, zero it, and record again",
+        )
+    straight = replace(trace, force_N=trace.force_N - slope * (trace.time_s - trace.time_s[0]))
+    numbers = {"drift_N_per_s": slope, "drift_sd_N_per_s": sd, "drift_N": total}
+    remedy = "let the sensor warm up before recording"
+    remark = Remark("drift", what + "; taken off", "a sensor that warms up", remedy, numbers)
+    return straight, [remark]
+
+
+def _straight(time: Array, force: Array) -> tuple[float, Array]:
+    """Slope of the straight line through (time, force), and what it leaves."""
+    level, slope = np.polynomial.polynomial.polyfit(time - time[0], force, 1)
+    return float(slope), force - level - slope * (time - time[0])
+
+
+def _rise(trace: Trace) -> float:
+    _, force, _ = bins(trace.time_s, trace.force_N, _BINS)
+    return float(np.ptp(force))
+
+
+def _check_start(trace: Trace, line: BrokenLine) -> None:
+    """Refuse a record whose force is there from the first sample on, and rises at once."""
+    _, force, _ = bins(trace.time_s, trace.force_N, _BINS)
+    peak, first, least = float(force.max()), float(force[0]), float(force.min())
+    # Once released, the sensor says what its zero is; else it is taken to be zeroed.
+    released = np.isfinite(_release_s(line))
+    preload = max(first, first - least if released else 0.0)
+    if preload < _PRELOAD_SHARE * peak or not _rises_at_once(trace, line):
+        return
+    zeroed = f", and {least:.3g} N when it is released" if released else ""
+    raise TraceError(
+        f"the record begins in contact: {first:.3g} N of {peak:.3g} N in its first samples{zeroed}",
+        place="force_N",
+        remedy="zero the sensor clear of the skin, and start there",
+    )
+
+
+def _rises_at_once(trace: Trace, line: BrokenLine) -> bool:
+    """Whether the force rises over the first bit of travel about as it does on the whole way in."""
+    load = (trace.time_s >= line.start_s) & (trace.time_s <= line.peak_s)
+    travel, force = line(trace.time_s[load]), trace.force_N[load]
+    bit = travel < travel[0] + _START_SHARE * (travel[-1] - travel[0])
+    if bit.sum() < _LEAST_START:
+        return bool(force[0] > _START_FORCE_SHARE * force.max())
+    start = float(np.polynomial.polynomial.polyfit(travel[bit], force[bit], 1)[1])
+    return bool(start > _START_SLOPE * (force[-1] - force[0]) / (travel[-1] - travel[0]))
+
+
+def _start_remark(touch: TouchDown, stated_s: float | None) -> list[Remark]:
+    if not touch.in_contact_at_start or stated_s is not None:
+        return []
+    what = (
+        f"no approach is seen before the skin is met after {touch.displacement_mm:.2f} +- "
+        f"{touch.uncertainty_mm:.2f} mm: the touch-down rests on a sensor that was zero at the start"
+    )
+    numbers = {"touch_down_mm": touch.displacement_mm, "touch_down_sd_mm": touch.uncertainty_mm}
+    cause = "a record that starts on the skin"
+    return [Remark("start", what, cause, "start some tenths of a millimetre clear of it", numbers)]

@@ -1,0 +1,245 @@
+"""Records that are not what they seem: mended with a remark, or refused in one line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import write_trace
+from limbfit import check_study, load_study
+from limbfit.errors import InputError, StudyError, TraceError
+from limbfit.traces import Trace, find_touch_down, understand
+
+NOISE_N = 0.03
+
+
+def record(seed=0, clear=0.5, depth=6.0, speed=1.0, peak=8.0, after=1.0):
+    """A record of 500 Hz that turns and comes back to where it started, and what it is without noise."""
+    random = np.random.default_rng(seed)
+    turn = (clear + depth) / speed
+    time = np.arange(0.0, 2 * turn + after, 0.002)
+    path = np.interp(time, [0, turn, 2 * turn], [0, clear + depth, 0])
+    force = peak * (np.maximum(path - clear, 0.0) / depth) ** 1.5
+    noisy = Trace(time, path + 0.005 * random.standard_normal(time.size),
+                  force + NOISE_N * random.standard_normal(time.size))  # fmt: skip
+    return noisy, force
+
+
+def kinds(found):
+    return [remark.kind for remark in found.remarks]
+
+
+def test_a_sound_record_is_left_alone():
+    for seed in range(5):
+        trace, _ = record(seed)
+        found = understand(trace)
+        assert found.trace is trace
+        assert found.remarks == ()
+        assert found.touch_down == find_touch_down(trace)
+
+
+# --- drift
+
+
+@pytest.mark.parametrize("drift", [0.05, -0.05])
+def test_a_force_that_drifts_is_set_straight(drift):
+    trace, clean = record()
+    found = understand(replace(trace, force_N=trace.force_N + drift * trace.time_s))
+    assert kinds(found) == ["drift"]
+    assert found.remarks[0].evidence["drift_N_per_s"] == pytest.approx(drift, rel=0.05)
+    assert f"{drift:+.2g} N/s" in found.remarks[0].what
+    mended = found.trace.force_N - found.touch_down.baseline_N
+    assert np.abs(np.mean((mended - clean)[-400:])) < 0.02
+    assert found.touch_down.displacement_mm == pytest.approx(0.5, abs=3 * found.touch_down.uncertainty_mm)
+
+
+def test_a_sensor_that_drifts_away_is_refused():
+    trace, _ = record()
+    with pytest.raises(
+        TraceError, match=r"force_N: the force drifts by \+0\.3 N/s.*; let the sensor warm up"
+    ):
+        understand(replace(trace, force_N=trace.force_N + 0.3 * trace.time_s))
+
+
+# --- spikes
+
+
+def spiked(values, size, seed=3, per_mille=1.0):
+    random, n = np.random.default_rng(seed), len(values)
+    places = random.choice(n, round(n * per_mille / 1000), replace=False)
+    spikes = values.copy()
+    spikes[places] += size * random.choice([-1, 1], len(places))
+    return spikes, places
+
+
+@pytest.mark.parametrize("size", [1.0, 5.0, 500.0])
+def test_spikes_are_taken_out_and_counted(size):
+    trace, clean = record()
+    force, places = spiked(trace.force_N, size)
+    found = understand(replace(trace, force_N=force))
+    assert kinds(found) == ["spikes"]
+    assert found.remarks[0].evidence["spikes"] == len(places)
+    assert f"{len(places)} of {len(force)} samples of the force" in found.remarks[0].what
+    assert np.abs(found.trace.force_N - clean).max() < 6 * NOISE_N
+    changed = found.trace.force_N != force
+    assert np.array_equal(np.flatnonzero(changed), np.sort(places))
+
+
+def test_spikes_of_the_displacement_are_taken_out():
+    trace, _ = record()
+    moved, _ = spiked(trace.displacement_mm, 2.0)
+    found = understand(replace(trace, displacement_mm=moved))
+    assert "displacement" in found.remarks[0].what
+    assert np.abs(found.trace.displacement_mm - trace.displacement_mm).max() < 0.05
+
+
+def test_a_broken_cable_is_refused():
+    trace, _ = record()
+    force, _ = spiked(trace.force_N, 5.0, per_mille=30)
+    with pytest.raises(
+        TraceError, match="samples stick out from their neighbours; check the sensor and its cable"
+    ):
+        understand(replace(trace, force_N=force))
+
+
+def test_a_corner_is_no_spike():
+    """At 10 Hz a peak is three samples."""
+    trace, clean = record()
+    few = Trace(trace.time_s[::50], trace.displacement_mm[::50], clean[::50])
+    assert understand(few).trace is few
+
+
+# --- in contact
+
+
+def cut(trace, at_mm, zeroed=False):
+    """The record as if it had been started with the indenter ``at_mm``, and ended there."""
+    top = int(trace.displacement_mm.argmax())
+    start = int(np.argmax(trace.displacement_mm >= at_mm))
+    end = top + int(np.argmax(trace.displacement_mm[top:] <= at_mm))
+    rows = slice(start, end)
+    force = trace.force_N[rows] - (trace.force_N[start] if zeroed else 0.0)
+    return Trace(trace.time_s[rows] - trace.time_s[start], trace.displacement_mm[rows] - at_mm, force)
+
+
+@pytest.mark.parametrize("at_mm", [2.5, 4.5])
+def test_a_record_that_begins_in_full_contact_is_refused(at_mm):
+    with pytest.raises(TraceError, match=r"force_N: the record begins in contact: .*; zero the sensor clear"):
+        understand(cut(record()[0], at_mm))
+
+
+def test_a_sensor_that_was_zeroed_in_contact_is_refused():
+    trace, _ = record()
+    start = int(np.argmax(trace.displacement_mm >= 2.5))
+    pressed = Trace(
+        trace.time_s[start:], trace.displacement_mm[start:], trace.force_N[start:] - trace.force_N[start]
+    )
+    with pytest.raises(TraceError, match=r"begins in contact: .* N when it is released"):
+        understand(pressed)
+
+
+def test_a_record_that_starts_on_the_skin_is_taken_with_a_remark():
+    found = understand(record(clear=0.0)[0])
+    assert kinds(found) == ["start"]
+    assert "no approach" in found.remarks[0].what
+
+
+def test_a_sensor_with_an_offset_is_no_contact():
+    trace, _ = record()
+    found = understand(replace(trace, force_N=trace.force_N + 0.6))
+    assert found.remarks == ()
+    assert found.touch_down.baseline_N == pytest.approx(0.6, abs=0.02)
+
+
+# --- what `limbfit check` says
+
+
+def checked(study):
+    return check_study(load_study(study), listener=lambda event: None)
+
+
+def change(study, name, edit):
+    file = study / f"{name}.csv"
+    table = np.loadtxt(file, delimiter=",", skiprows=1)
+    np.savetxt(file, edit(table), delimiter=",", header="time_s,displacement_mm,force_N", comments="")
+
+
+def test_check_tells_what_was_mended(study):
+    assert checked(study)["flags"] == []
+
+    def spoil(table):
+        table[:, 2] += 0.05 * table[:, 0]
+        table[[300, 900], 2] += 5.0
+        return table
+
+    change(study, "1", spoil)
+    found = checked(study)
+    assert [(flag["sites"], flag["kind"]) for flag in found["flags"]] == [(["1"], "spikes"), (["1"], "drift")]
+    assert "site 1: the force drifts by +0.05" in found["flags"][1]["text"]
+    json.dumps(found)
+
+
+def test_check_names_the_file_of_a_record_that_begins_in_contact(study):
+    change(study, "1", lambda table: table[200:800])
+    with pytest.raises(InputError, match=r"1\.csv.*force_N: the record begins in contact") as caught:
+        checked(study)
+    assert "\n" not in str(caught.value)
+
+
+def test_check_says_that_a_record_has_loading_only(study):
+    assert not any("loading only" in fact for fact in checked(study)["facts"])
+    change(study, "1", lambda table: table[: int(table[:, 1].argmax())])
+    found = checked(study)
+    assert any(fact.startswith("site 1:") and "loading only" in fact for fact in found["facts"])
+    assert found["flags"] == []
+
+
+def same_place(study):
+    text = (study / "study.toml").read_text()
+    first, second = (line for line in text.splitlines() if line.startswith("position"))
+    (study / "study.toml").write_text(text.replace(second, first))
+
+
+def test_two_sites_at_one_place_with_different_records_are_told(study):
+    same_place(study)
+    assert checked(study)["flags"] == []  # repeats of one record
+    write_trace(study / "2.csv", peak=9.0)
+    (flag,) = checked(study)["flags"]
+    assert flag["sites"] == ["1", "2"]
+    assert flag["kind"] == "place"
+    assert flag["text"].startswith("sites 1 and 2: they are at one place (0.0 mm apart)")
+
+
+# --- settings that cannot be meant
+
+
+def settings(study, table):
+    text = (study / "study.toml").read_text()
+    (study / "study.toml").write_text(text.replace("[[sites]]", table + "\n[[sites]]", 1))
+
+
+@pytest.mark.parametrize("ratio", ["1e9", "0.5"])
+def test_a_bulk_modulus_that_no_tissue_has_is_refused(study, ratio):
+    settings(study, f"[material]\nkappa_ratio = {ratio}\n")
+    with pytest.raises(
+        StudyError, match=r"study\.toml: material\.kappa_ratio: give (10 or more|at most 10000)"
+    ) as caught:
+        load_study(study)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("table", ["mesh", "mesh.coarse"])
+def test_a_mesh_of_billions_of_cells_is_refused(study, table):
+    settings(study, f"[{table}]\nedge_near_mm = 0.01\n")
+    with pytest.raises(
+        StudyError, match=r"study\.toml: mesh.*billion cells.* give edge_near_mm of 0\.\d+ or more"
+    ) as caught:
+        load_study(study)
+    assert "\n" not in str(caught.value)
+    least = float(str(caught.value).split("edge_near_mm of ")[1].split()[0])
+    text = (study / "study.toml").read_text()
+    (study / "study.toml").write_text(text.replace("0.01", str(least)))
+    load_study(study)
