@@ -32,6 +32,7 @@ import numpy as np
 from mapped_bodies import Array, Body, Indices, limb, slab
 
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, solve
+from limbfit.fe.doubts import slipped
 from limbfit.mesh import node_jacobians
 from limbfit.study import PARAMETERS, MaterialTable
 
@@ -223,9 +224,9 @@ def broken_laws(result: Result) -> list[str]:
     """What a completed simulation does that no body does (store="all").
 
     Force finite, and not negative, and not lost while the indenter advances; none after unloading;
-    penetration under 1 % of the depth; no element
-    folded at a quadrature point (the solver sees to it) or in its straight corners; no node inside an
-    element that it does not belong to.  Tissue cannot enter a bone without one of the last two.
+    penetration under 1 % of the depth; no element folded at a quadrature point (the solver sees to it) or in
+    its straight corners; no node inside an element that it does not belong to.  Tissue cannot enter a bone
+    without one of the last two.
     """
     force, depth = result.force, float(result.displacement.max())
     broken = []
@@ -233,7 +234,7 @@ def broken_laws(result: Result) -> list[str]:
         broken.append("force not finite")
     if force.min() < -1e-9 * max(force.max(), 1e-12):
         broken.append("negative force")
-    if any(warning.startswith("the force falls") for warning in result.warnings):
+    if slipped(result.displacement, force):
         broken.append("force falls in loading")
     if force[-1] > 0.01 * force.max():
         broken.append("force after unloading")

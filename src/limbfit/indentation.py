@@ -19,16 +19,28 @@ from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from .errors import ProblemError, SurfaceError
-from .fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, State, StepControl, System, solve
+from .fe import (
+    Doubt,
+    History,
+    Indenter,
+    OgdenQLV,
+    Problem,
+    Result,
+    RigidSurface,
+    State,
+    StepControl,
+    System,
+    solve,
+)
 from .fields import Animation, write_fields
 from .mesh import Mesh, read_vtu
+from .phases import spread
 from .study import PARAMETERS, IndenterTable, SolverTable, Vector
 
 Parameters = dict[str, dict[str, float]]
 Array = NDArray[np.float64]
 
 KPA = 1e-3  # MPa
-FREE = 1.0  # penetration over the depth: a stated penalty is never raised
 _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
 
 
@@ -72,6 +84,15 @@ class SiteModel:
     steps: SolverTable = field(default_factory=SolverTable)
     element: str = ""  # row of the element table; by default that of the mesh's cell type
 
+    @property
+    def history(self) -> History:
+        """The advance of the indenter."""
+        return History(np.array(self.knots_s), np.array(self.knots_mm))
+
+    def curve_times(self, points: int) -> Array:
+        """About ``points`` times (k,) s that show the force, all phases and corners among them."""
+        return spread(self.history.phases, points, self.history.times)
+
 
 @dataclass(frozen=True)
 class SimulationJob:
@@ -93,7 +114,7 @@ class SimulationJob:
 class Simulation:
     """What came back: force (n,) N and its derivatives (n, 4 x tissues) at the job's times.
 
-    Derivatives are in flat order, per kPa, -, -, s.  ``warnings``: what is doubtful about it.
+    Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
     """
 
     site: str
@@ -103,7 +124,12 @@ class Simulation:
     reason: str
     penetration_mm: float
     facts: dict[str, Any]
-    warnings: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is doubtful about it, in words."""
+        return tuple(doubt.text for doubt in self.doubts)
 
 
 def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
@@ -135,7 +161,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         fixed=np.unique(np.concatenate([n for s, n in mesh.node_sets.items() if s.startswith("fixed_")])),
         contact_faces=faces[near],
         indenter=indenter,
-        history=History(np.array(model.knots_s), np.array(model.knots_mm)),
+        history=model.history,
         friction=model.indenter.friction,
         element=model.element,
     )
@@ -187,16 +213,17 @@ def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
 _KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest usual ones, some 5 GB in all
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}  # tissue that sets a site's contact penalty
 _REFERENCE_STEPS = 4  # to the deepest point
-_MARGIN = 0.3  # of the penetration that is allowed: few other tissues then need a larger penalty
+# Of the penetration that is allowed: two of 24 tissues drawn over the bounds then go 1.3 times beyond it.
+_MARGIN = 0.3
 
 
 @dataclass
 class Prepared:
     """What a process keeps of a site for its next simulations.
 
-    ``problem``, ``system`` and ``penalty`` (of contact; None where the solver is to find it) follow from the
-    site alone. ``rested``: the newest simulation from rest with its parameters; one with sensitivities (True)
-    with all of its states, one without (False) with the deepest.
+    ``problem``, ``system`` and ``penalty`` (of contact, 1/mm; None: the solver's first) follow from the site
+    alone. ``rested``: the newest simulation from rest with its parameters; one with sensitivities (True) with
+    all of its states, one without (False) with the deepest.
     """
 
     problem: Problem
@@ -228,17 +255,17 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
 
 
 def _reference_penalty(problem: Problem, control: StepControl, system: System) -> float | None:
-    """The contact penalty that reference tissue needs at the deepest point; None where it fails.
+    """The contact penalty that reference tissue needs at the deepest point it reaches; None where at none.
 
-    A penalty that each simulation found for itself would change in steps with the parameters, and the force
-    by a percent with it; one taken over from the simulation before makes the answer depend on what that was.
-    Simulations that need more raise it.
+    All simulations of a site hold it.  One that each found for itself would change in steps with the
+    parameters, and the force by a percent with it; one taken over from the simulation before makes the answer
+    depend on what that was.  Where other tissue lets the indenter sink in farther, the result says so.
     """
     deepest = problem.history.peak or float(problem.history.times[-1])
     times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
     control = replace(control, times=times, penetration=_MARGIN * control.penetration)
     found = solve(problem, steps=control, store="peak", system=system)
-    return found.states[0].penalty if found.completed and found.states else None
+    return found.states[0].penalty if found.states else None
 
 
 def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
@@ -246,7 +273,7 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     known = _prepare(model, tuple(parameters))
     return solve(
         known.problem.with_materials(materials(parameters, model.kappa_ratio)),
-        steps=replace(steps_of(model), penalty=known.penalty),
+        steps=first_steps(model, tuple(parameters)),
         system=known.system,
         **how,
     )
@@ -272,13 +299,18 @@ def _lightened(state: State) -> State:
     return replace(state, sensitivity=single)  # type: ignore[arg-type]
 
 
+def first_steps(model: SiteModel, tissues: Sequence[str]) -> StepControl:
+    """`steps_of`, with the contact penalty that every simulation of the site holds."""
+    return replace(steps_of(model), penalty=_prepare(model, tuple(tissues)).penalty, hold_penalty=True)
+
+
 def steps_of(model: SiteModel) -> StepControl:
     """How the solver steps through a site's history, before it adapts."""
     table = model.steps
     control = StepControl(load_steps=table.load_steps, unload_steps=table.unload_steps)
     if table.penalty_per_mm is None:
         return control
-    return replace(control, penalty=table.penalty_per_mm, penetration=FREE)
+    return replace(control, penalty=table.penalty_per_mm, hold_penalty=True)
 
 
 def simulate(job: SimulationJob) -> Simulation:
@@ -303,7 +335,7 @@ def simulate(job: SimulationJob) -> Simulation:
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
         facts=dict(result.statistics),
-        warnings=result.warnings,
+        doubts=result.doubts,
     )
 
 
@@ -336,9 +368,8 @@ def rested_fields(model: SiteModel, parameters: Parameters, file: Path, sensitiv
 
 
 def _write_deepest(result: Result, file: Path) -> None:
-    if result.states:
-        deepest = max(result.states, key=lambda state: state.displacement)
-        write_fields(result.system, result.problem, deepest, file)
+    if result.deepest is not None:
+        write_fields(result.system, result.problem, result.deepest, file)
 
 
 def _in_user_units(result: Result, tissues: Sequence[str], times: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from numpy.typing import NDArray
 
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter, Problem, RigidSurface, StepControl, System, solve
-from limbfit.fe.indenter import signed_distance
+from limbfit.fe.indenter import SHAPES, signed_distance
+from limbfit.febio.faceting import FRONTS, STEEPEST_DEG
+from limbfit.pipeline.stages.plausible import SECTION_RADIUS
+from limbfit.study import IndenterTable
 
 BOX_FACES = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5],
                       [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])  # fmt: skip
@@ -124,7 +128,7 @@ def test_starts_just_touching(name):
 
 
 def test_force_under_a_box_of_triangles_is_that_under_the_square():
-    control = StepControl(load_steps=3, unload_steps=3)
+    control = StepControl(load_steps=3, unload_steps=3, tolerance=1e-7)
     square = solve(punch("tet10", 4, 1, indenter=Indenter("square", 20.0, 1.0)), control)
     triangles = solve(punch("tet10", 4, 1, indenter=Indenter("stl", edge_radius=1.0, surface=box())), control)
     assert square.completed
@@ -179,3 +183,11 @@ def test_shape_and_surface_belong_together():
     for arguments in ({"shape": "stl"}, {"shape": "square", "surface": box()}):
         with pytest.raises(ProblemError, match="needs a surface"):
             Indenter(**arguments)
+
+
+def test_every_shape_is_known_wherever_shapes_differ():
+    """A shape that is added is refused there until somebody has said what it is: none is taken as round."""
+    assert set(SECTION_RADIUS) == set(SHAPES)
+    assert set(FRONTS) == set(SHAPES) - {"stl"}
+    assert set(STEEPEST_DEG) == set(SHAPES)
+    assert set(get_args(IndenterTable.model_fields["shape"].annotation)) == set(SHAPES)

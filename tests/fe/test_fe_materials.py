@@ -241,7 +241,7 @@ def test_volumetric_laws(law, J):
 @pytest.mark.parametrize("dt", [1e-6, 1e-3, 0.1, 10.0])
 def test_prony_factors_and_their_derivatives(dt):
     tau, h = 0.32, 1e-5
-    _, ramp, d_decay, d_ramp = prony_factors(dt, tau)
+    _, ramp, _, d_decay, d_ramp, _ = prony_factors(dt, tau)
     grid = np.linspace(0.0, dt, 20001)
     assert ramp == pytest.approx(np.trapezoid(np.exp(-(dt - grid) / tau), grid) / dt, rel=1e-6)
     ahead, back = prony_factors(dt, tau + h), prony_factors(dt, tau - h)

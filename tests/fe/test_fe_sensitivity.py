@@ -10,7 +10,7 @@ from blocks import punch
 
 from limbfit.fe import Indenter, StepControl, solve, stepping
 
-TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-9)
+TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from blocks import punch
+from scipy.signal import lfilter
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, StepControl, iterate, solve
@@ -45,6 +47,48 @@ def test_interpolation_passes_through_the_steps_and_is_never_negative(result):
     assert (result.force_at(np.linspace(-1.0, 20.0, 500)) >= 0).all()
 
 
+def layer_force(t, history, tau=0.32, gamma=3.0):
+    """Force (n,) of a layer with d^2 and relaxation, 1 + gamma exp(-t / tau): midpoint sums."""
+    fine = np.linspace(0.0, history.times[-1], 200_001)
+    rate, dt = np.gradient(np.maximum(history.at(fine), 0.0) ** 2, fine), fine[1]
+    memory = lfilter([dt], [1.0, -np.exp(-dt / tau)], rate)
+    return np.interp(t, fine, np.maximum(history.at(fine), 0.0) ** 2 + gamma * memory)
+
+
+HELD = History(np.array([0.0, 3.0, 13.0, 16.0]), np.array([0.0, 3.0, 3.006, 0.0]))
+FLAT = History(HELD.times, np.array([0.0, 3.0, 3.0, 0.0]))
+CYCLES = History(np.arange(7.0) * 3.0, np.array([0.0, 3.0, 1.0, 3.0, 1.0, 3.0, 0.0]))
+LEAVING = History(np.arange(5.0) * 3.0, np.array([0.0, 3.0, -0.5, 3.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    "history", [HELD, FLAT, CYCLES, LEAVING], ids=["creeping", "flat", "cycles", "leaving"]
+)
+def test_no_spline_crosses_the_kink_of_a_phase(problem, result, history):
+    """Given the exact forces at steps that grow from every kink, the curve between them is right."""
+    grade = np.linspace(0.0, 1.0, 13) ** 1.5
+    times = np.unique(np.concatenate([a + (b - a) * grade for a, b in pairwise(history.times)]))
+    known = replace(
+        result,
+        problem=replace(problem, history=history),
+        times=times,
+        displacement=history.at(times),
+        force=np.maximum(layer_force(times, history), 0.0),
+        force_sensitivity=None,
+    )
+    t = np.linspace(0.0, times[-1], 2001)
+    error = np.abs(known.force_at(t) - np.maximum(layer_force(t, history), 0.0))
+    assert error.max() < 0.012 * known.peak_force
+
+
+@pytest.mark.parametrize("store", ["peak", "all"])
+def test_fields_of_a_creeping_hold_are_those_where_loading_ends(problem, store):
+    history = History(np.array([0.0, 2.0, 6.0, 8.0]), np.array([0.0, 2.0, 2.004, 0.0]))
+    found = solve(replace(problem, history=history), StepControl(load_steps=3, unload_steps=3), store=store)
+    kept = [state for state in found.states if state.memory is not None]
+    assert [state.time for state in kept] == [2.0]
+
+
 def test_interpolated_sensitivity_is_the_derivative_of_the_interpolated_force(result):
     t, step = np.linspace(0.0, 12.0, 97), np.random.default_rng(0).normal(size=8) * 1e-7
     moved = replace(result, force=result.force + result.force_sensitivity @ step)
@@ -59,6 +103,15 @@ def test_warm_start_gives_the_same_forces_with_fewer_iterations(problem, result)
     np.testing.assert_allclose(warm.force, cold.force, atol=2e-5 * cold.peak_force)
     assert warm.statistics["newton_iterations"] < cold.statistics["newton_iterations"]
     assert warm.system is result.system
+
+
+def test_a_warm_start_from_stiffer_contact_changes_no_force(problem):
+    """Tissue that stiffens more needs a stiffer contact; it was taken over, and with it 0.4 % of force."""
+    hard = problem.with_materials({name: replace(m, m=16.0) for name, m in problem.materials.items()})
+    before = solve(hard, sensitivities=True, store="all")
+    assert before.statistics["penalty_per_mm"] > 100.0
+    cold, warm = solve(problem), solve(problem, warm_start=before)
+    np.testing.assert_allclose(warm.force, cold.force, atol=1e-4 * cold.peak_force)
 
 
 def test_iterate_and_solve_agree_and_states_are_kept_as_asked(problem, result):

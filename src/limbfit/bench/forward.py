@@ -51,10 +51,10 @@ def bench_forward(
     if case not in CASES:
         raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(CASES)}")
     folder = reference or find_reference(Path.cwd())
-    chosen: dict[str, Any] = {"element": element} if element or not as_febio else {}
-    like: tuple[Any, Any] = (CASES[case].problem, CASES[case].control) if as_febio else ({}, {})
-    named = replace(CASES[case], problem={**like[0], **chosen}, control={**like[1], "threads": threads})
-    job = ForwardJob(named, folder, False)
+    named = CASES[case] if as_febio else replace(CASES[case], problem={}, control={})
+    problem = {**named.problem, "element": element} if element else named.problem
+    control = {**named.control, "threads": threads}
+    job = ForwardJob(replace(named, problem=problem, control=control), folder, False)
     tell(0, 2, f"{case}, plain")
     plain = in_fresh_process(run_forward, job, threads)
     tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")

@@ -103,7 +103,7 @@ def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, 
     model = read_feb(folder / f"{case.name}.feb")
     log = read_log(folder / f"{case.name}.txt")
     problem = to_problem(model, PUNCH if model.rigid else None, **case.problem)
-    return problem, StepControl(times=tuple(log.times[1:]), **case.control), log
+    return problem, StepControl(times=tuple(log.times[1:]), stress="linear", **case.control), log
 
 
 def pushing_force(problem: Problem, log: Log) -> Array:

@@ -369,15 +369,3 @@ def _ask_for(positions, k, data):  # type: ignore[no-untyped-def]
             first = r * 3 * k - r * (r - 1) // 2
             for j in range(first, first + k - a):
                 prefetch(data, np.int64(max(positions[j], 0)))
-
-
-@njit(cache=True)
-def scatter_upper(Ke, positions, data):  # type: ignore[no-untyped-def]
-    """Add the upper triangle of an element matrix to the sparse data; negative positions are dropped."""
-    n = Ke.shape[0]
-    at = 0
-    for r in range(n):
-        for c in range(r, n):
-            if positions[at] >= 0:
-                data[positions[at]] += Ke[r, c]
-            at += 1

@@ -13,12 +13,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from .assembly import scatter_upper
 from .elements import Element, face_quadrature
 from .indenter import Indenter, signed_distance
 
 Array = NDArray[np.float64]
-START_MM = 1e-6  # inside the tissue is a start that is deeper
+START_MM = 0.02  # inside the tissue is a start that is deeper; other quadratures touch a little sooner
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,10 @@ def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, X, u, centre, frame, kernel, penalty, flat_from, anchors, tangent, positions, residual,
-    data, advance, gaps, normals, blocks,
+    faces, N, areas, X, u, centre, frame, kernel, penalty, flat_from, anchors, residual, advance, gaps,
+    normals, blocks,
 ):  # fmt: skip
-    """Add the contact energy's gradient to ``residual`` and, with ``tangent``, its hessian to ``data``.
+    """Add the contact energy's gradient to ``residual``; its hessian is that of the springs ``blocks``.
 
     ``flat_from``: penetration from which a point's tangent leaves the indenter's curvature out (mm).
     ``anchors``: which points stick (f, q), where (f, q, 3) and in which plane, as the normal (f, q, 3) to it,
@@ -133,14 +132,11 @@ def contact(  # type: ignore[no-untyped-def]
     """
     held, places, planes = anchors
     half, k = kernel[1], faces.shape[1]
-    Ke = np.empty((3 * k, 3 * k))
     x, local, g, t = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    bend, h, H = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    bend, h = np.empty((3, 3)), np.empty((3, 3))
     energy = force = deepest = area = 0.0
     reach = 1.8 * half
     for f in range(faces.shape[0]):
-        Ke[:] = 0.0
-        touched = False
         for q in range(N.shape[0]):
             x[:] = -centre
             for a in range(k):
@@ -167,28 +163,22 @@ def contact(  # type: ignore[no-untyped-def]
                 energy += _stick(local, places[f, q], planes[f, q], w, t, h)
             elif phi >= 0.0:
                 continue
-            touched = True
             force -= t[2]
             for i in range(3):
                 push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
                 for a in range(k):
                     residual[faces[f, a], i] += N[q, a] * push
+            H = blocks[f, q]
             for i in range(3):
                 for j in range(3):
                     H[i, j] = 0.0
                     for p in range(3):
                         for r in range(3):
                             H[i, j] += frame[p, i] * h[p, r] * frame[r, j]
-                    blocks[f, q, i, j] = H[i, j]
             for a in range(k):
                 for i in range(3):
                     along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
                     advance[faces[f, a], i] += N[q, a] * along
-                    for j in range(3 if tangent else 0):
-                        for b in range(k):
-                            Ke[i * k + a, j * k + b] += H[i, j] * N[q, a] * N[q, b]
-        if tangent and touched:
-            scatter_upper(Ke, positions[f], data)
     return energy, force, deepest, area
 
 
@@ -209,7 +199,10 @@ def _stick(local, place, normal, w, t, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def add_springs(N, blocks, positions, data):  # type: ignore[no-untyped-def]
-    """Add stiffnesses ``blocks (f, q, 3, 3)`` at the contact points to the sparse ``data``."""
+    """Add stiffnesses ``blocks (f, q, 3, 3)`` at the contact points to the sparse ``data``.
+
+    ``positions (f, .)``: where each entry of a face's upper triangle goes; -1: nowhere.
+    """
     k = N.shape[1]
     Ke = np.empty((3 * k, 3 * k))
     for f in range(len(blocks)):
@@ -222,4 +215,9 @@ def add_springs(N, blocks, positions, data):  # type: ignore[no-untyped-def]
                     for a in range(k):
                         for b in range(k):
                             Ke[i * k + a, j * k + b] += blocks[f, q, i, j] * N[q, a] * N[q, b]
-        scatter_upper(Ke, positions[f], data)
+        at = 0
+        for r in range(3 * k):
+            for c in range(r, 3 * k):
+                if positions[f, at] >= 0:
+                    data[positions[f, at]] += Ke[r, c]
+                at += 1

@@ -1,7 +1,8 @@
 """The element table: shape functions, quadrature and formulation of every element, as data.
 
 Local coordinates: tetrahedra and triangles on the unit simplex, hexahedra and quadrilaterals on [-1, 1]^d,
-nodes in VTK order.  Adding an element is adding a row to `ELEMENTS`.
+nodes in VTK order.  An element of a known cell type is a row of
+`ELEMENTS`; what a new cell type needs beside it: docs/mechanics.md.
 """
 
 from __future__ import annotations
@@ -135,6 +136,7 @@ _TRI3 = {
 _TRI6 = {
     "nodes": (np.array([[0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]), np.full(3, 1.0 / 6.0)),
     "gauss": _orbit((2.0 / 3.0, 1.0 / 3.0), d=2),
+    "gauss7": _triangle_7(),  # FEBio's
 }
 _QUAD4 = {"nodes": (QUAD_CORNERS, np.ones(4)), "gauss": _gauss(2, 2)}
 _HEX = _gauss(3, 2)

@@ -20,37 +20,55 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Memory:
-    """``elastic (m, q, 6)``: deviatoric second Piola-Kirchhoff stress Se; ``prony (l, m, q, 6)``: H; MPa."""
+    """What the tissue keeps of its past at the quadrature points, MPa.
+
+    Parameters
+    ----------
+    elastic : (m, q, 6) deviatoric second Piola-Kirchhoff stress Se.
+    prony : (l, m, q, 6) history H of each Prony term.
+    before, duration : Se one step earlier and how long that step was, s; None and infinite where the next
+        step takes the stress as linear in time: at rest, and where the indenter has just turned.
+    """
 
     elastic: Array
     prony: Array
+    before: Array | None = None
+    duration: float = np.inf
 
     @classmethod
     def rest(cls, system: System, laws: Laws) -> Memory:
         shape = (*system.weights.shape, 6)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
 
+    def turned(self) -> Memory:
+        """The same, with no smooth past: the next step takes the stress as linear in time."""
+        return Memory(self.elastic, self.prony)
+
     def increment(
         self, system: System, laws: Laws, time: float, dt: float, displacement: float, penalty: float
     ) -> Increment:
         """The step of ``dt`` s that ends at ``time``."""
-        decay, ramp, *_ = prony_factors(dt, laws.prony[..., 1])
+        decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
         gamma = laws.prony[..., 0]
         of = system.regions
-        K = -((gamma * ramp).sum(axis=1))[of][:, None, None] * self.elastic
+        K = ((gamma * (back - ramp)).sum(axis=1))[of][:, None, None] * self.elastic
+        if self.before is not None:
+            K -= ((gamma * back).sum(axis=1))[of][:, None, None] * self.before
         for l in range(gamma.shape[1]):
             K += (gamma * decay)[of, l][:, None, None] * self.prony[l]
         return Increment(time, displacement, 1.0 + (gamma * ramp).sum(axis=1), K, penalty)
 
     def advanced(self, system: System, laws: Laws, elastic: Array, dt: float) -> Memory:
         """The memory at the end of a step of ``dt`` s that ended with the elastic stress ``elastic``."""
-        decay, ramp, *_ = prony_factors(dt, laws.prony[..., 1])
+        decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
         of = system.regions
         prony = np.empty_like(self.prony)
         for l in range(len(prony)):
-            change = ramp[of, l][:, None, None] * (elastic - self.elastic)
-            prony[l] = decay[of, l][:, None, None] * self.prony[l] + change
-        return Memory(elastic, prony)
+            prony[l] = decay[of, l][:, None, None] * self.prony[l]
+            prony[l] += ramp[of, l][:, None, None] * (elastic - self.elastic)
+            if self.before is not None:
+                prony[l] += back[of, l][:, None, None] * (self.elastic - self.before)
+        return Memory(elastic, prony, self.elastic, dt)
 
 
 def elastic_stresses(system: System, laws: Laws, u: Array) -> Array:

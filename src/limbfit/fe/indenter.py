@@ -38,6 +38,7 @@ class Indenter:
     axis : (3,) into the tissue; any length.
     edge : (3,) direction of one edge of the square; by default the cross product of ``axis`` and z.
     surface : triangles in the indenter's frame, for ``stl`` only.
+    sharp : the rounding over the width that stands for a sharp edge, where 1 % is too coarse for the tissue.
     """
 
     shape: str = "square"
@@ -47,6 +48,7 @@ class Indenter:
     axis: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, -1.0)
     edge: Sequence[float] | NDArray[np.float64] | None = None
     surface: RigidSurface | None = None
+    sharp: float = SHARP_EDGE
 
     def __post_init__(self) -> None:
         if self.shape not in SHAPES:
@@ -57,6 +59,10 @@ class Indenter:
             object.__setattr__(self, "width", self.surface.width)
         if not (math.isfinite(self.width) and self.width > 0):
             raise ProblemError(f"indenter width {self.width} mm is not positive")
+        if not 0 < self.sharp <= SHARP_EDGE:
+            raise ProblemError(
+                f"a sharp edge of {self.sharp} of the width is not above 0 and up to {SHARP_EDGE}"
+            )
         if not 0 <= self.edge_radius <= self.width / 2:
             raise ProblemError(f"edge radius {self.edge_radius} mm does not fit a width of {self.width} mm")
         if self.surface is not None:
@@ -90,7 +96,7 @@ class Indenter:
     @property
     def _rounding(self) -> tuple[float, bool]:
         """Edge radius, mm, and whether it was asked for."""
-        least = SHARP_EDGE * self.width
+        least = self.sharp * self.width
         return max(self.edge_radius, least), self.edge_radius >= least
 
     @property

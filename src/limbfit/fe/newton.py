@@ -29,7 +29,10 @@ Array = NDArray[np.float64]
 # A shorter step damps the next directions, at first by this share of each tissue's own shear modulus; it is
 # changed by a factor, and less than the smallest is none.
 SHORT_STEP, FIRST_DAMPING, DAMPING_CHANGE, LEAST_DAMPING = 0.3, 0.1, 4.0, 0.02
+# Times the tolerance: a residual that is taken where the line search finds no lower energy; it is told.
+LOOSE = 100.0
 NEAR = 0.1  # residual over reactions from which the tangent is the exact one
+TINY = 1e-300  # N; before the first touch there are no reactions
 
 
 @dataclass(frozen=True)
@@ -49,13 +52,15 @@ class NewtonControl:
 @dataclass(frozen=True)
 class Equilibrium:
     """Where Newton stopped: ``reason`` is empty at equilibrium, or near one of unbearable penetration;
-    ``damped``: it had to shorten a step much."""
+    ``damped``: it had to shorten a step much; ``residual``: over the reactions, more than the tolerance where
+    nothing lower was found."""
 
     u: Array
     at: Evaluation
     iterations: int
     reason: str = ""
     damped: bool = False
+    residual: float = np.inf
 
 
 def equilibrate(
@@ -76,10 +81,9 @@ def equilibrate(
         norm = residual_norm(system, here)
         scale = reaction_scale(system, here, floor)
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
-        if norm <= control.tolerance * scale or rounding:
-            return Equilibrium(u, here, iteration, damped=damped)
-        if norm <= NEAR * scale and here.penetration > control.bearable:
-            return Equilibrium(u, here, iteration, damped=damped)
+        unbearable = norm <= NEAR * scale and here.penetration > control.bearable
+        if norm <= control.tolerance * scale or rounding or unbearable:
+            return Equilibrium(u, here, iteration, damped=damped, residual=norm / max(scale, TINY))
         if not np.isfinite(norm):
             return Equilibrium(u, here, iteration, "the residual is not finite")
         if here.data is None:
@@ -94,8 +98,8 @@ def equilibrate(
             evaluate.exactly()
         found = _line_search(evaluate, u, here, direction, control)
         if found is None:
-            if norm <= 100 * control.tolerance * scale:
-                return Equilibrium(u, here, iteration, damped=damped)
+            if norm <= LOOSE * control.tolerance * scale:
+                return Equilibrium(u, here, iteration, damped=damped, residual=norm / max(scale, TINY))
             return Equilibrium(u, here, iteration, "the line search found no lower energy")
         u, here, step = found
         damping, damped = _damped(damping, step), damped or step < SHORT_STEP

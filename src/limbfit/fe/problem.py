@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..mesh import Mesh
+from ..phases import Phase, boundaries, find_phases, loading_end
 from .elements import ELEMENTS, Element, reference_gradients
 from .indenter import Indenter
 from .materials import Material
@@ -41,17 +43,26 @@ class History:
         """Displacement at time(s) ``t``, mm."""
         return np.asarray(np.interp(t, self.times, self.displacement))
 
+    @cached_property
+    def phases(self) -> tuple[Phase, ...]:
+        """What the indenter does: loads, holds, unloads, in any number."""
+        return find_phases(self.times, self.displacement)
+
     @property
-    def knots(self) -> NDArray[np.float64]:
-        """Times where the speed changes, with both ends: the steps that must be hit."""
-        speed = np.diff(self.displacement) / np.diff(self.times)
-        turns = np.abs(np.diff(speed)) > 1e-6 * np.abs(speed).max()
-        return self.times[np.concatenate([[True], turns, [True]])]
+    def kinks(self) -> NDArray[np.float64]:
+        """Times where phases begin or end, s, both ends among them."""
+        return boundaries(self.phases)
 
     @property
     def peak(self) -> float:
-        """Time of the (first) largest displacement, s."""
-        return float(self.times[np.argmax(self.displacement)])
+        """End of the loading that first reaches the largest displacement, s; 0 where nothing advances."""
+        loading = loading_end(self.phases)
+        return 0.0 if loading is None else loading.end_s
+
+    @property
+    def loading_s(self) -> float:
+        """How long the way to the `peak` takes, s; all of it where nothing advances."""
+        return self.peak or float(self.times[-1])
 
 
 @dataclass(frozen=True)
@@ -153,7 +164,7 @@ def _check_choices(problem: Problem) -> None:
         raise ProblemError(f"region {missing[0]!r} has no material")
     if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
         raise ProblemError("the mesh has region indices without a name")
-    if problem.contact_rule not in ("nodes", "gauss"):
+    if problem.contact_rule not in ELEMENTS[name].face_rules:
         raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy="use 'nodes' or 'gauss'")
     if problem.friction not in ("frictionless", "sticky"):
         raise ProblemError(f"unknown friction {problem.friction!r}", remedy="use 'frictionless' or 'sticky'")

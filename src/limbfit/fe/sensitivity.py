@@ -33,7 +33,7 @@ from .system import Evaluation, Increment, System
 Array = NDArray[np.float64]
 # Residual of the linear systems, relative to their right-hand sides: what is left then in the force is of
 # second order, but what the history hands on is not.
-TOLERANCE = 3e-4
+TOLERANCE = 2e-4
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,20 @@ class Explicit:
 
 @dataclass(frozen=True)
 class MemoryDerivative:
-    """Derivatives of a `Memory`: ``elastic (m, q, 6, p)``, ``prony (l, m, q, 6, p)``."""
+    """Derivatives of a `Memory`: ``elastic, before (m, q, 6, p)``, ``prony (l, m, q, 6, p)``."""
 
     elastic: Array
     prony: Array
+    before: Array | None = None
 
     @classmethod
     def rest(cls, system: System, laws: Laws) -> MemoryDerivative:
         shape = (*system.weights.shape, 6, laws.count)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
+
+    def turned(self) -> MemoryDerivative:
+        """That of `Memory.turned`."""
+        return MemoryDerivative(self.elastic, self.prony)
 
     def explicit(
         self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
@@ -72,19 +77,22 @@ class MemoryDerivative:
         """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
         bends = laws.d_terms.any(axis=(2, 3))  # parameters of the elastic law
         derivatives = laws.d_terms, bends, laws.d_kappa, laws.parameter_index
-        coefficients = _step_coefficients(laws, dt)
+        coefficients = _step_coefficients(laws, dt, memory.duration)
+        past = memory.elastic if memory.before is None else memory.before
         elastic, stress = np.zeros_like(self.elastic), np.empty_like(memory.elastic)
         moduli = np.empty((*stress.shape, 9))
-        before = (a.reshape(*a.shape[:-2], -1) for a in (self.elastic, self.prony))
-        d_elastic, d_prony = before
+        d_past = self.elastic if self.before is None else self.before
+        d_elastic, d_past, d_prony = (
+            a.reshape(*a.shape[:-2], -1) for a in (self.elastic, d_past, self.prony)
+        )
 
         def part(cells: slice) -> Array:
             forces = np.zeros((*u.shape, laws.count))
             explicit_derivatives(
                 system.cells[cells], system.gradients[cells], system.weights[cells],
                 system.element.mean_dilatation, system.regions[cells], laws.tables, derivatives,
-                increment.scale, coefficients, memory.elastic[cells], memory.prony[:, cells],
-                d_elastic[cells], d_prony[:, cells], u,
+                increment.scale, coefficients, memory.elastic[cells], past[cells], memory.prony[:, cells],
+                d_elastic[cells], d_past[cells], d_prony[:, cells], u,
                 forces, elastic[cells], stress[cells], moduli[cells],
             )  # fmt: skip
             return forces
@@ -95,21 +103,25 @@ class MemoryDerivative:
         self, system: System, laws: Laws, before: Memory, step: Explicit, du: Array, dt: float
     ) -> MemoryDerivative:
         """The derivative of the memory after the step, given ``du (n, 3, p)``; uses up ``step.elastic``."""
-        decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
-        d_tau = laws.d_prony[..., 1]
-        factors = decay, ramp, d_tau * d_decay[:, None], d_tau * d_ramp[:, None]
+        found = prony_factors(dt, laws.prony[..., 1], before.duration)
+        slopes = (found.d_decay, found.d_ramp, found.d_back)
+        d_factors = tuple(laws.d_prony[..., 1] * slope[:, None] for slope in slopes)
+        factors = (found.decay, found.ramp, found.back, *d_factors)
+        past = before.elastic if before.before is None else before.before
+        d_past = self.elastic if self.before is None else self.before
         prony = np.empty_like(self.prony)
 
         def part(cells: slice) -> None:
             advance(
                 system.cells[cells], system.gradients[cells], system.regions[cells], factors,
                 laws.parameter_index, step.moduli[cells], step.stress[cells] - before.elastic[cells],
-                before.prony[:, cells], self.elastic[cells], self.prony[:, cells], du,
+                before.elastic[cells] - past[cells], before.prony[:, cells], self.elastic[cells],
+                d_past[cells], self.prony[:, cells], du,
                 step.elastic[cells], prony[:, cells],
             )  # fmt: skip
 
         system.over_cells(part)
-        return MemoryDerivative(step.elastic, prony)
+        return MemoryDerivative(step.elastic, prony, self.elastic)
 
 
 def solve_with_adjoint(
@@ -128,16 +140,20 @@ def solve_with_adjoint(
     return x, adjoint[:, 0] @ b + missed @ x
 
 
-def _step_coefficients(laws: Laws, dt: float) -> tuple[Array, ...]:
-    """Weights of H and Se in the history tensor K, their explicit derivatives, and that of the scale."""
-    decay, ramp, d_decay, d_ramp = prony_factors(dt, laws.prony[..., 1])
+def _step_coefficients(laws: Laws, dt: float, before: float) -> tuple[Array, ...]:
+    """Weights in the history tensor K of H, of Se and of Se a step earlier, their explicit derivatives (for
+    the changes of Se: in this step, that of the scale, and in the one before)."""
+    f = prony_factors(dt, laws.prony[..., 1], before)
     gamma = laws.prony[..., 0]
     d_gamma, d_tau = laws.d_prony[..., 0], laws.d_prony[..., 1]
-    on_prony = gamma * decay
-    on_elastic = -(gamma * ramp).sum(axis=1)
-    d_on_prony = d_gamma * decay[:, None] + d_tau * (gamma * d_decay)[:, None]
-    d_scale = (d_gamma * ramp[:, None] + d_tau * (gamma * d_ramp)[:, None]).sum(axis=2)
-    return on_prony, on_elastic, d_on_prony, d_scale
+    on_prony = gamma * f.decay
+    on_elastic = (gamma * (f.back - f.ramp)).sum(axis=1)
+    on_before = -(gamma * f.back).sum(axis=1)
+    d_on_prony, d_scale, d_back = (
+        d_gamma * value[:, None] + d_tau * (gamma * slope)[:, None]
+        for value, slope in ((f.decay, f.d_decay), (f.ramp, f.d_ramp), (f.back, f.d_back))
+    )
+    return on_prony, on_elastic, on_before, d_on_prony, d_scale.sum(axis=2), d_back.sum(axis=2)
 
 
 _KERNEL: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
@@ -179,19 +195,36 @@ def elastic_moduli(beta, slope, quotient, c2, N, F, scratch, out):  # type: igno
                 out[t, 3 * j + i] = x * F[i, 0] + y * F[i, 1] + z * F[i, 2]
 
 
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _add_forces(S, F, grad, weight, FS, fe):  # type: ignore[no-untyped-def]
+    """Add the weighted nodal forces of stresses ``S (6, p)`` at a point to ``fe (k, row)``; FS is scratch."""
+    P, row = S.shape[1], fe.shape[1]
+    for i in range(3):
+        x, y, z = weight * F[i, 0], weight * F[i, 1], weight * F[i, 2]
+        for p in range(P):
+            FS[0, i * P + p] = x * S[0, p] + y * S[3, p] + z * S[5, p]
+            FS[1, i * P + p] = x * S[3, p] + y * S[1, p] + z * S[4, p]
+            FS[2, i * P + p] = x * S[5, p] + y * S[4, p] + z * S[2, p]
+    for a in range(fe.shape[0]):
+        x, y, z = grad[0, a], grad[1, a], grad[2, a]
+        for c in range(row):
+            fe[a, c] += x * FS[0, c] + y * FS[1, c] + z * FS[2, c]
+
+
 @njit(**_KERNEL)
 def explicit_derivatives(  # type: ignore[no-untyped-def]
-    cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, H, dSe, dH, u,
-    forces, elastic, stress, moduli
+    cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, past, H, dSe, d_past, dH,
+    u, forces, elastic, stress, moduli
 ):  # fmt: skip
     """The kernel of `MemoryDerivative.explicit`; adds to ``forces`` and to ``elastic``.
 
-    The forces are those of ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``.  Rows of the work arrays hold
+    The forces are those of ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``; ``past`` is Se one step
+    earlier, ``d_past`` its derivative.  Rows of the work arrays hold
     three components of all parameters and are padded to whole vectors.
     """
     terms, _, law = tables
     d_terms, bends, d_kappa, index = d_tables
-    on_prony, on_elastic, d_on_prony, d_scale = coefficients
+    on_prony, on_elastic, on_before, d_on_prony, d_scale, d_back = coefficients
     m, k = cells.shape
     P = forces.shape[2]
     row = 16 * ((3 * P + 15) // 16)
@@ -207,9 +240,7 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
                 ue[i, a] = u[cells[el, a], i]
         region = regions[el]
         fe[:] = 0.0
-        ratio = 1.0
-        if mean:
-            ratio = mean_dilatation(grads[el], weights[el], ue, F)
+        ratio = mean_dilatation(grads[el], weights[el], ue, F) if mean else 1.0
         for q in range(grads.shape[1]):
             J = deformation_gradient(grads[el, q], ue, F)
             if not mean:
@@ -224,7 +255,7 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
             from_principal(value, N, inverse)
             from_principal(beta, N, stress[el, q])
             for c in range(6 * P):
-                flat[c] = on_elastic[region] * dSe[el, q, c]
+                flat[c] = on_elastic[region] * dSe[el, q, c] + on_before[region] * d_past[el, q, c]
             for l in range(H.shape[0]):
                 for c in range(6 * P):
                     flat[c] += on_prony[region, l] * dH[l, el, q, c]
@@ -244,20 +275,12 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
                 for t in range(6):
                     total = scale[region] * part[t] + d_JU * inverse[t]
                     total += d_scale[region, j] * (stress[el, q, t] - Se[el, q, t])
+                    total += d_back[region, j] * (Se[el, q, t] - past[el, q, t])
                     for l in range(H.shape[0]):
                         total += d_on_prony[region, j, l] * H[l, el, q, t]
                     elastic[el, q, t, p] += part[t]
                     S[t, p] += total
-            for i in range(3):
-                x, y, z = weights[el, q] * F[i, 0], weights[el, q] * F[i, 1], weights[el, q] * F[i, 2]
-                for p in range(P):
-                    FS[0, i * P + p] = x * S[0, p] + y * S[3, p] + z * S[5, p]
-                    FS[1, i * P + p] = x * S[3, p] + y * S[1, p] + z * S[4, p]
-                    FS[2, i * P + p] = x * S[5, p] + y * S[4, p] + z * S[2, p]
-            for a in range(k):
-                x, y, z = grads[el, q, 0, a], grads[el, q, 1, a], grads[el, q, 2, a]
-                for c in range(row):
-                    fe[a, c] += x * FS[0, c] + y * FS[1, c] + z * FS[2, c]
+            _add_forces(S, F, grads[el, q], weights[el, q], FS, fe)
         for a in range(k):
             for i in range(3):
                 for p in range(P):
@@ -266,13 +289,13 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
 
 @njit(**_KERNEL)
 def advance(  # type: ignore[no-untyped-def]
-    cells, grads, regions, factors, index, moduli, change, H, dSe, dH, du, elastic, prony
+    cells, grads, regions, factors, index, moduli, change, earlier, H, dSe, d_past, dH, du, elastic, prony
 ):
     """The kernel of `MemoryDerivative.advanced`: adds to ``elastic`` what ``du`` does, and fills ``prony``.
 
-    ``change (m, q, 6)`` is that of Se in the step.
+    ``change, earlier (m, q, 6)`` are those of Se in the step and in the one before.
     """
-    decay, ramp, d_decay, d_ramp = factors
+    decay, ramp, back, d_decay, d_ramp, d_back = factors
     m, k = cells.shape
     P = du.shape[2]
     row = 16 * ((3 * P + 15) // 16)
@@ -301,13 +324,15 @@ def advance(  # type: ignore[no-untyped-def]
                         + d6 * dF[2, p] + d7 * dF[2, P + p] + d8 * dF[2, 2 * P + p]
                     )  # fmt: skip
             for l in range(H.shape[0]):
-                x, y = decay[region, l], ramp[region, l]
+                x, y, z = decay[region, l], ramp[region, l], back[region, l]
                 for t in range(6):
                     for p in range(P):
                         prony[l, el, q, t, p] = x * dH[l, el, q, t, p]
                         prony[l, el, q, t, p] += y * (elastic[el, q, t, p] - dSe[el, q, t, p])
+                        prony[l, el, q, t, p] += z * (dSe[el, q, t, p] - d_past[el, q, t, p])
                 for j in range(index.shape[1]):
-                    x, y = d_decay[region, j, l], d_ramp[region, j, l]
-                    if index[region, j] >= 0 and (x != 0.0 or y != 0.0):
+                    x, y, z = d_decay[region, j, l], d_ramp[region, j, l], d_back[region, j, l]
+                    if index[region, j] >= 0 and (x != 0.0 or y != 0.0 or z != 0.0):
                         for t in range(6):
-                            prony[l, el, q, t, index[region, j]] += x * H[l, el, q, t] + y * change[el, q, t]
+                            total = x * H[l, el, q, t] + y * change[el, q, t] + z * earlier[el, q, t]
+                            prony[l, el, q, t, index[region, j]] += total

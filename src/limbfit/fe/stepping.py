@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import node_jacobians
 from .contact import ContactSurface
 from .direction import renew
+from .doubts import Doubt, folded, inexact, slipped, sunk, unbalanced
 from .factor import Factor
 from .history import Memory, elastic_stresses
 from .indenter import Indenter
@@ -24,7 +24,8 @@ from .laws import Laws
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .pace import Pace
 from .problem import History, Problem, ProblemError
-from .result import Result, State, Step, slipped
+from .result import Result, State, Step
+from .schedule import foresee, graded
 from .sensitivity import Explicit, MemoryDerivative, solve_with_adjoint
 from .sticky import Anchors
 from .system import Evaluation, Increment, System
@@ -43,26 +44,32 @@ class StepControl:
 
     Parameters
     ----------
-    load_steps, unload_steps : steps up to the peak and after it, before any is cut.
+    load_steps, unload_steps : steps of an indentation on the way in and on the way out, before any is cut.
     times : (k,) s, instead of the two numbers: exactly these steps (rest at 0 left out).
+    stress : how the elastic stress runs in a step: ``quadratic``, through the step before it, or ``linear``,
+        as FEBio has it (second order in the step instead of third).
     tolerance : residual over reactions at equilibrium.
     max_iterations, most_iterations : of Newton's method in a step, and in all.
     max_cuts : how often a step may be cut, to 0.3 of it each time.
     penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
     penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
+    hold_penalty : it is never raised, so that forces of neighbouring parameters do not jump; a deeper
+        penetration is a doubt of the result.
     linear_solver : name in the solver table, multigrid (``tet10`` only), or auto.
     threads : of assembly and linear algebra.
     """
 
-    load_steps: int = 10
-    unload_steps: int = 8
+    load_steps: int = 8
+    unload_steps: int = 10
     times: tuple[float, ...] | None = None
+    stress: str = "quadratic"
     tolerance: float = 3e-5
     max_iterations: int = 60
     most_iterations: int = 1500
     max_cuts: int = 5
     penetration: float = 0.01
     penalty: float | None = None
+    hold_penalty: bool = False
     linear_solver: str = "auto"
     threads: int = 1
 
@@ -73,6 +80,8 @@ class StepControl:
         for name in ("tolerance", "penetration"):
             if not getattr(self, name) > 0.0:
                 raise ProblemError(f"{name} = {getattr(self, name)} is not positive")
+        if self.stress not in ("quadratic", "linear"):
+            raise ProblemError(f"unknown stress {self.stress!r}", remedy="use 'quadratic' or 'linear'")
         times = np.asarray(self.times if self.times is not None else (1.0,), dtype=float)
         if not (len(times) and np.isfinite(times).all() and (np.diff([0.0, *times]) > 0.0).all()):
             raise ProblemError("the times of the steps do not grow from 0")
@@ -83,22 +92,14 @@ class StepControl:
 
 
 def schedule(history: History, control: StepControl) -> Array:
-    """Times (k,) of the steps: even in loading; in unloading dense after the peak, where force drops fast."""
-    if control.times is not None:
-        if control.times[-1] > history.times[-1] * (1.0 + 1e-9):
-            raise ProblemError(
-                f"a step at {control.times[-1]} s lies beyond the history's end at {history.times[-1]} s"
-            )
-        return np.asarray(control.times, dtype=float)
-    peak, end = history.peak, float(history.times[-1])
-    parts = [history.knots[1:]]
-    if peak > 0:
-        parts.append(peak * np.arange(1, control.load_steps + 1) / control.load_steps)
-    if end > peak:
-        grade = (np.arange(1, control.unload_steps + 1) / control.unload_steps) ** 1.5
-        parts.append(peak + (end - peak) * grade)
-    times = np.unique(np.concatenate(parts))
-    return times[np.concatenate([np.diff(times) > 1e-9 * end, [True]])]
+    """Times (k,) of the steps, s, before any is cut: those stated, or as `graded` places them."""
+    if control.times is None:
+        return graded(history, control.load_steps, control.unload_steps)
+    if control.times[-1] > history.times[-1] * (1.0 + 1e-9):
+        raise ProblemError(
+            f"a step at {control.times[-1]} s lies beyond the history's end at {history.times[-1]} s"
+        )
+    return np.asarray(control.times, dtype=float)
 
 
 class Simulation:
@@ -131,7 +132,7 @@ class Simulation:
         if problem.friction == "sticky" and self.system.surface is not None:
             self.anchors = Anchors.none(self.system.surface, self.laws.count if sensitivities else 0)
         self.warm = _warm_states(problem, warm_start)
-        self.floor = 0.0
+        self.floor, self.pushing = 0.0, False
         width = problem.indenter.width if problem.indenter is not None else 1.0
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
         self.deepest = control.penetration * float(np.abs(problem.history.displacement).max())
@@ -139,12 +140,15 @@ class Simulation:
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
         self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness, still)]
         self.reason = ""
+        self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.seconds["setup"] = time.perf_counter() - started
 
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
-        targets = list(schedule(self.problem.history, self.control))
+        planned = schedule(self.problem.history, self.control)
+        targets = list(planned)
         pace, why = Pace(self.control.max_iterations), ""
+        times, forces = [0.0], [0.0]
         while targets:
             now, spent = (
                 self.states[-1].time,
@@ -167,8 +171,12 @@ class Simulation:
                 continue
             pace.done(now, t, self.counts["newton_iterations"] - before)
             why = ""
+            times.append(t)
+            forces.append(found.force)
             if t == targets[0]:
-                targets.pop(0)
+                targets = targets[1:]
+                if self.control.times is None:
+                    targets = foresee(self.problem.history, planned, targets, times, forces)
             yield found
 
     def _attempt(self, t: float, patience: int) -> Step | str:
@@ -178,26 +186,25 @@ class Simulation:
         """
         before = self.states[-1]
         displacement, dt = float(self.problem.history.at(t)), t - before.time
-        warm = self.warm.get(round(t, 9))
         stiffness, u = self.stiffness, self._predict(t, displacement)
-        if warm is not None:  # the same penalty as then, or the force would jump between iterates
-            stiffness = max(stiffness, warm.penalty)
         anchors = self.anchors
-        for bearable in (*[TOO_DEEP * self.deepest] * MOST_RAISES, np.inf):
+        for raises in range(MOST_RAISES, -1, -1):
+            may_rise = raises > 0 and not self.control.hold_penalty
             increment = self.memory.increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
             )
             increment = replace(increment, anchors=anchors, flat_from=STEEP_PRESSURE / stiffness)
             control = replace(
-                self.control.newton, damping=self.damping, max_iterations=patience, bearable=bearable
-            )
+                self.control.newton, damping=self.damping, max_iterations=patience,
+                bearable=TOO_DEEP * self.deepest if may_rise else np.inf,
+            )  # fmt: skip
             found = self._equilibrate(increment, u, control)
             if found.reason:
                 return found.reason
-            kept, deep = anchors, found.at.penetration > self.deepest
+            kept, deep = anchors, may_rise and found.at.penetration > self.deepest
             if anchors is not None and not deep:
                 kept = anchors.let_go(*self._tool(increment), found.u)
-            if kept is anchors and not deep:
+            if raises == 0 or (kept is anchors and not deep):
                 break
             stiffness, anchors, u = (3.0 if deep else 1.0) * stiffness, kept, found.u
         return self._accept(found, increment, dt, stiffness)
@@ -256,19 +263,31 @@ class Simulation:
             du, force_slope = self._differentiate(explicit, found, increment)
             self.slope = self.slope.advanced(self.system, self.laws, self.memory, explicit, du, dt)
         after = self.memory.advanced(self.system, self.laws, stress, dt)
+        if self._turns(increment.time, at.force):
+            after, self.slope = after.turned(), None if self.slope is None else self.slope.turned()
         if increment.anchors is not None:
             self.anchors = increment.anchors.after(*self._tool(increment), u, du)
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
-        state = State(increment.time, increment.displacement, u, stiffness, du, after)
+        state = State(increment.time, increment.displacement, u, stiffness, du, after.turned())
         self.states = [*self.states[-2:], state]
+        if found.residual > self.control.tolerance:
+            self.unbalanced.append((increment.displacement, found.residual))
         self.counts["steps"] += 1
         self.seconds["accept"] += time.perf_counter() - started
         return Step(
             increment.time, increment.displacement, at.force, at.penetration, at.contact_area,
             found.iterations, force_slope, state,
         )  # fmt: skip
+
+    def _turns(self, t: float, force: float) -> bool:
+        """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
+        contact began or ended."""
+        met, self.pushing = (force > 0.0) != self.pushing, force > 0.0
+        if self.control.stress == "linear" or (met and len(self.states) > 1):
+            return True
+        return bool(np.isclose(t, self.problem.history.kinks, rtol=1e-9, atol=0.0).any())
 
     def _differentiate(
         self, explicit: Explicit, found: Equilibrium, increment: Increment
@@ -368,7 +387,8 @@ def solve(
     sensitivities : also the derivative of the force with respect to every material parameter.
     warm_start : an earlier result on the same mesh whose states (``store="all"``) are the first guesses.
     on_step : called with every accepted step.
-    store : which states to keep: ``peak``, ``all`` (stresses of the deepest only) or ``none``.
+    store : which states to keep: ``peak`` (the deepest of the loading), ``all`` (its stresses only) or
+        ``none``.
     system : the discretisation of the same mesh, supports and contact faces, where it is known.
 
     Raises
@@ -381,16 +401,22 @@ def solve(
     run = Simulation(problem, steps, sensitivities, warm_start, system)
     rows: list[Step] = []
     kept: list[State] = []
+    deepest_state: State | None = None
+    loading_s = problem.history.loading_s * (1.0 + 1e-9)
     for step in run.run():
         rows.append(replace(step, state=run.states[0]))
-        deepest = all(step.displacement >= state.displacement for state in kept)
+        # What creeps deeper in a hold has relaxed: people mean the end of loading.
+        deepest = step.time <= loading_s and (
+            deepest_state is None or step.displacement >= deepest_state.displacement
+        )
         if deepest:
+            deepest_state = step.state
             kept = [replace(state, memory=None) for state in kept] if store == "all" else []
         if store == "all" or (store == "peak" and deepest):
             kept.append(step.state if deepest else replace(step.state, memory=None))
         if on_step is not None:
             on_step(step)
-    return _result(problem, run, rows, kept, sensitivities, time.perf_counter() - started)
+    return _result(problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started)
 
 
 def _result(
@@ -398,6 +424,7 @@ def _result(
     run: Simulation,
     rows: list[Step],
     kept: list[State],
+    deepest: State | None,
     sensitivities: bool,
     seconds: float,
 ) -> Result:
@@ -408,49 +435,44 @@ def _result(
     if sensitivities:
         nothing = np.zeros(run.laws.count)
         slopes = np.array([nothing, *(row.force_sensitivity for row in rows)])
+    displacement, force = column("displacement", float(problem.history.at(0.0))), column("force")
+    penetration = column("penetration")
+    doubts = _doubts(run, deepest, displacement, force, penetration)
     return Result(
         problem=problem,
         times=column("time"),
-        displacement=column("displacement", float(problem.history.at(0.0))),
-        force=column("force"),
+        displacement=displacement,
+        force=force,
         force_sensitivity=slopes,
         parameter_names=problem.parameter_names,
-        penetration=column("penetration"),
+        penetration=penetration,
         contact_area=column("contact_area"),
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
-        warnings=(*_folded(problem, kept), *slipped(rows), *_inexact(run)),
-        statistics=_statistics(run, seconds),
+        doubts=doubts,
+        statistics=_statistics(run, seconds, int((penetration > run.deepest).sum())),
         system=run.system,
     )
 
 
-def _inexact(run: Simulation) -> tuple[str, ...]:
-    """A warning where sensitivities of an unstable equilibrium could not be solved for."""
-    count = run.slopes.counts["inexact"]
-    return (f"{count} sensitivities at unstable equilibria are inexact",) if count else ()
-
-
-def _folded(problem: Problem, states: Sequence[State]) -> tuple[str, ...]:
-    """A warning where elements are inside out at nodes of theirs at the deepest of the ``states``.
-
-    The quadrature of ``tet10`` lies inside and does not see it; the element has lost part of its stiffness.
-    """
-    if not states:
-        return ()
-    deepest = max(states, key=lambda state: state.displacement)
-    shape = problem.mesh.with_points(problem.mesh.points + deepest.u)
-    count = int((node_jacobians(shape) <= 0.0).any(axis=1).sum())
-    if not count:
-        return ()
+def _doubts(
+    run: Simulation, deepest: State | None, displacement: Array, force: Array, penetration: Array
+) -> tuple[Doubt, ...]:
+    """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
+    folds: tuple[Doubt, ...] = ()
+    if deepest is not None:
+        folds = folded(run.problem.mesh, deepest.u, deepest.displacement, displacement)
     return (
-        f"{count} elements are inside out at a node at {deepest.displacement:.3g} mm and the force may be "
-        "too small: use element tet10v, a rounded edge of the indenter or a finer mesh at its edge",
+        *folds,
+        *slipped(displacement, force),
+        *sunk(displacement, penetration, run.deepest, run.stiffness),
+        *unbalanced(displacement, run.unbalanced, run.control.tolerance),
+        *inexact(displacement, run.slopes.counts["inexact"]),
     )
 
 
-def _statistics(run: Simulation, seconds: float) -> dict[str, Any]:
+def _statistics(run: Simulation, seconds: float, sunk_steps: int) -> dict[str, Any]:
     used = [run.factor, *([run.slopes] if run.slopes is not run.factor else [])]
     parts = dict(run.seconds)
     for factor in used:
@@ -459,6 +481,9 @@ def _statistics(run: Simulation, seconds: float) -> dict[str, Any]:
     return {
         "steps": run.counts["steps"],
         "cuts": run.counts["cuts"],
+        "sunk_steps": sunk_steps,
+        "unbalanced_steps": len(run.unbalanced),
+        "penalty_per_mm": run.stiffness,
         "newton_iterations": run.counts["newton_iterations"],
         "factorisations": sum(factor.counts["factorisations"] for factor in used),
         "multigrids": run.factor.counts["multigrids"],

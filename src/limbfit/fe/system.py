@@ -182,15 +182,14 @@ class System:
             data += more[2]
         if not np.isfinite(energy) or self.surface is None or self.indenter is None:
             return Evaluation(energy, residual, data if tangent else None)
-        advance, pushed = np.zeros_like(u), np.zeros_like(u)
-        shape = self.surface.areas.shape
-        points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
-        found, force, deepest, area = self._contact(u, increment, tangent, pushed, data, advance, points)
+        numbers, pushed, advance, gaps, normals, blocks = self._contact(u, increment)
+        found, force, deepest, area = numbers
+        if tangent:
+            add_springs(self.surface.N, blocks, self.face_positions, data)
         norm = float(np.linalg.norm(pushed))
         anchors = increment.anchors or self.free_to_slip
         stick = anchors.blocks(self.surface, self.indenter, increment.penalty).reshape(-1, 3, 3)
         weights = increment.penalty * self.surface.areas.ravel()
-        gaps, normals, blocks = points
         touch = Touch(gaps.ravel(), normals.reshape(-1, 3), weights, blocks.reshape(-1, 3, 3), stick)
         return Evaluation(
             energy + found, residual + pushed, data if tangent else None, force, deepest, area, advance, norm,
@@ -199,33 +198,26 @@ class System:
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
         """The contact part of the residual (n, 3), N."""
-        pushed = np.zeros_like(u)
-        if self.surface is not None:
-            shape = self.surface.areas.shape
-            points = np.empty(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
-            self._contact(u, increment, False, pushed, np.empty(0), np.zeros_like(u), points)
-        return pushed
+        return np.zeros_like(u) if self.surface is None else self._contact(u, increment)[1]
 
     def _contact(
-        self,
-        u: Array,
-        increment: Increment,
-        tangent: bool,
-        pushed: Array,
-        data: Array,
-        advance: Array,
-        points: tuple[Array, Array, Array],
-    ) -> tuple[float, float, float, float]:
+        self, u: Array, increment: Increment
+    ) -> tuple[tuple[float, float, float, float], Array, Array, Array, Array, Array]:
+        """What `contact` returns, and the arrays that it fills: residual, advance, gaps, normals, blocks."""
         assert self.surface is not None
         assert self.indenter is not None
         surface, frame = self.surface, self.indenter.frame
         anchors = increment.anchors or self.free_to_slip
         centre = np.asarray(self.indenter.centre) + increment.displacement * frame[2]
-        return contact(
+        shape = surface.areas.shape
+        residual, advance, gaps = np.zeros_like(u), np.zeros_like(u), np.empty(shape)
+        normals, blocks = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
+        found = contact(
             surface.faces, surface.N, surface.areas, self.points, u, centre, frame, self.indenter.kernel,
-            increment.penalty, increment.flat_from, (anchors.held, anchors.places, anchors.normals), tangent,
-            self.face_positions, pushed, data, advance, *points,
+            increment.penalty, increment.flat_from, (anchors.held, anchors.places, anchors.normals),
+            residual, advance, gaps, normals, blocks,
         )  # fmt: skip
+        return found, residual, advance, gaps, normals, blocks
 
     def with_springs(self, data: Array, blocks: Array) -> Array:
         """``data`` plus a stiffness (c, 3, 3) at every contact point."""

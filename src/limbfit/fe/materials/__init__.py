@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from .material import Material, MaterialTable
-from .viscoelastic import prony_factors
+from .viscoelastic import ORDER_IN_TIME, prony_factors
 from .volumetric import VOLUMETRIC_LAWS
 
 __all__ = [
+    "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
     "Material",
     "MaterialTable",

@@ -1,0 +1,118 @@
+"""What is doubtful about a simulation that goes on to its end, by kind.
+
+Those who use a simulation decide by the kind what to do with it; the text is for people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import Mesh, node_jacobians
+
+Array = NDArray[np.float64]
+Kind = Literal["folded", "slipped", "sunk", "unbalanced", "inexact"]
+
+SLIP = 0.9  # force over the one before, in an advancing step, that is no relaxation
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One doubt about a simulation.
+
+    Parameters
+    ----------
+    kind : ``folded`` (elements inside out at a node), ``slipped`` (the force falls in loading), ``sunk`` (the
+        indenter is deeper in the skin than allowed), ``unbalanced`` (equilibrium to less than the tolerance),
+        ``inexact`` (sensitivities).
+    text : one sentence, with its remedy.
+    count : elements (``folded``), or steps.
+    depth_mm : indentation where it is first seen; of folded elements, where they were counted.
+    share : the same over the largest indentation.
+    """
+
+    kind: Kind
+    text: str
+    count: int
+    depth_mm: float
+    share: float
+
+
+def _doubt(kind: Kind, text: str, count: int, depth_mm: float, displacement: Array) -> tuple[Doubt]:
+    most = float(np.abs(displacement).max(initial=0.0))
+    return (Doubt(kind, text, count, float(depth_mm), float(depth_mm) / most if most else 0.0),)
+
+
+def folded(mesh: Mesh, u: Array, depth_mm: float, displacement: Array) -> tuple[Doubt, ...]:
+    """Elements that are inside out at a node of theirs at the displacements ``u (n, 3)`` of a depth.
+
+    The quadrature of ``tet10`` lies inside and does not see it; the element has lost part of its stiffness.
+    """
+    shape = mesh.with_points(mesh.points + u)
+    count = int((node_jacobians(shape) <= 0.0).any(axis=1).sum())
+    if not count:
+        return ()
+    text = (
+        f"{count} elements are inside out at a node at {depth_mm:.3g} mm and the force may be "
+        "too small: use element tet10v, a rounded edge of the indenter or a finer mesh at its edge"
+    )
+    return _doubt("folded", text, count, depth_mm, displacement)
+
+
+def slipped(displacement: Array, force: Array) -> tuple[Doubt, ...]:
+    """Whether the force (n,), N, falls while the indenter advances (n,), mm.
+
+    The tissue has lost its equilibrium.
+    """
+    advancing = np.diff(displacement) > 1e-2 * displacement.max()
+    falls = np.flatnonzero(advancing & (force[1:] < SLIP * force[:-1]))
+    if not len(falls):
+        return ()
+    (before, after), (start, end) = force[falls[0] :][:2], displacement[falls[0] :][:2]
+    text = (
+        f"the force falls from {before:.3g} N to {after:.3g} N while the indenter advances from {start:.3g} "
+        f"to {end:.3g} mm: tissue folds, or slips past the indenter between contact points; "
+        "use a finer mesh there"
+    )
+    return _doubt("slipped", text, len(falls), start, displacement)
+
+
+def sunk(displacement: Array, penetration: Array, allowed_mm: float, penalty: float) -> tuple[Doubt, ...]:
+    """Steps whose penetration (n,), mm, is more than is allowed, with contact of ``penalty`` (1/mm)."""
+    deep = np.flatnonzero(penetration > allowed_mm)
+    if not len(deep):
+        return ()
+    most = float(penetration.max())
+    stiffer = float(f"{1.5 * penalty * most / allowed_mm:.2g}")
+    text = (
+        f"the indenter sinks in by up to {most:.3g} mm in {len(deep)} steps, more than the allowed "
+        f"{allowed_mm:.3g} mm, and the force is a little too small: state a stiffer contact than "
+        f"{penalty:.4g} per mm (solver.penalty_per_mm), such as {stiffer:g}"
+    )
+    return _doubt("sunk", text, len(deep), displacement[deep[0]], displacement)
+
+
+def unbalanced(
+    displacement: Array, found: Sequence[tuple[float, float]], tolerance: float
+) -> tuple[Doubt, ...]:
+    """Steps, as (mm, residual over reactions), that were accepted at more than the tolerance."""
+    if not found:
+        return ()
+    worst = max(residual for _, residual in found)
+    text = (
+        f"{len(found)} steps are in equilibrium to {worst:.2g} of the reactions only, not to "
+        f"{tolerance:.2g}, first at {found[0][0]:.3g} mm: the force may be off by as much"
+    )
+    return _doubt("unbalanced", text, len(found), found[0][0], displacement)
+
+
+def inexact(displacement: Array, count: int) -> tuple[Doubt, ...]:
+    """Sensitivities of unstable equilibria that could not be solved for."""
+    if not count:
+        return ()
+    text = f"{count} sensitivities at unstable equilibria are inexact"
+    return _doubt("inexact", text, count, 0.0, displacement)

@@ -1,0 +1,105 @@
+"""What a simulation doubts about itself: counted, told, and by kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import punch
+
+from limbfit.fe import Problem, Result, StepControl, solve
+from limbfit.fe.laws import Laws
+from limbfit.fe.observables import contact_pressure
+from limbfit.fe.system import Increment
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return punch("tet10", 2, 1)
+
+
+@pytest.fixture(scope="module")
+def stiffening(problem: Problem) -> Problem:
+    """Tissue that stiffens so much that the first penalty lets the indenter sink in too far."""
+    return problem.with_materials({name: replace(law, m=18.0) for name, law in problem.materials.items()})
+
+
+def kinds(result: Result) -> list[str]:
+    return [doubt.kind for doubt in result.doubts]
+
+
+def reactions(result: Result) -> np.ndarray:
+    """Force along the axis (n,) of the states' own penalties, N."""
+    laws = Laws.build([result.problem.materials[name] for name in result.problem.mesh.region_names])
+    nothing, found = np.zeros(0), []
+    for state in result.states:
+        penalty = state.penalty * laws.modulus
+        increment = Increment(state.time, state.displacement, nothing, nothing, penalty)
+        found.append(result.system.contact_force(state.u, increment).sum(axis=0)[2])
+    return np.array(found)
+
+
+def test_a_state_s_penalty_is_the_one_that_holds_it(problem):
+    """Also where raising it did not help enough: reactions and pressure were three times the force's."""
+    result = solve(problem, StepControl(penetration=1e-6, load_steps=1), store="all")
+    np.testing.assert_allclose(reactions(result), result.force[1:], rtol=1e-3, atol=1e-6)
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    deepest = max(result.states, key=lambda state: state.displacement)
+    usual = solve(problem, StepControl(load_steps=1))
+    pressures = [
+        contact_pressure(r.system, laws, s) for r, s in ((result, deepest), (usual, usual.states[0]))
+    ]
+    assert pressures[0].max() == pytest.approx(pressures[1].max(), rel=0.1)
+
+
+def test_penetration_left_after_the_last_raise_is_counted_and_told(problem):
+    result = solve(problem, StepControl(penetration=1e-6))
+    beyond = result.penetration > 6e-6
+    assert result.statistics["sunk_steps"] == beyond.sum() > 0
+    (doubt,) = result.doubts
+    assert (doubt.kind, doubt.count) == ("sunk", beyond.sum())
+    assert doubt.depth_mm == pytest.approx(result.displacement[beyond][0])
+    assert doubt.share == pytest.approx(doubt.depth_mm / 6.0)
+    assert result.warnings == (doubt.text,)
+
+
+def test_a_held_penalty_is_not_raised_and_what_sinks_in_is_told(stiffening):
+    free = solve(stiffening)
+    assert free.statistics["penalty_per_mm"] > 100.0
+    assert not free.doubts
+    held = solve(stiffening, StepControl(hold_penalty=True))
+    assert held.statistics["penalty_per_mm"] == 100.0
+    assert held.penetration.max() > 0.06
+    assert kinds(held) == ["sunk"]
+    stated = float(held.warnings[0].split("such as ")[1])
+    remedied = solve(stiffening, StepControl(penalty=stated, hold_penalty=True))
+    assert not remedied.doubts
+
+
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-14])
+def test_an_equilibrium_beyond_the_tolerance_is_counted_and_told(problem, tolerance):
+    """Digits that the energy does not have: the search ends at a residual above what was asked for."""
+    result = solve(problem, StepControl(tolerance=tolerance))
+    assert result.completed, result.reason
+    count = result.statistics["unbalanced_steps"]
+    assert count > 0
+    (doubt,) = result.doubts
+    assert (doubt.kind, doubt.count) == ("unbalanced", count)
+    assert f"not to {tolerance:.2g}" in doubt.text
+    assert 0.0 < doubt.depth_mm <= 6.0
+
+
+def test_usual_simulations_are_not_doubted(problem):
+    result = solve(problem, sensitivities=True)
+    assert not result.doubts
+    assert result.statistics["sunk_steps"] == result.statistics["unbalanced_steps"] == 0
+
+
+def test_folded_elements_are_told_whatever_states_are_kept(problem):
+    """On this block the skin folds under the punch when it is soft and the muscle is stiff."""
+    skin, muscle = problem.materials["skin"], problem.materials["muscle"]
+    soft = problem.with_materials({"skin": replace(skin, c=2e-4), "muscle": replace(muscle, c=0.02)})
+    kept, dropped = solve(soft), solve(soft, store="none")
+    assert "folded" in kinds(kept)
+    assert dropped.doubts == kept.doubts

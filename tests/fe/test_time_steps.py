@@ -1,0 +1,123 @@
+"""The error of the steps in time over the whole curve, on a layer whose exact force is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from blocks import punch
+
+from limbfit.bench.layer import curve_error, reference_layer, solve_layer
+from limbfit.fe import History, StepControl, solve
+from limbfit.fe.materials import prony_factors
+from limbfit.fe.schedule import foresee, graded
+from limbfit.phantom.forces import STEPS as TRUTH
+from limbfit.phantom.studyfile import STEPS as DEMO
+from limbfit.study import SolverTable
+
+T = 10.0
+HISTORIES = {
+    "ramp": History(np.array([0.0, T, 2 * T]), np.array([0.0, 1.0, 0.0])),
+    "hold": History(np.array([0.0, T, T + 30.0, 2 * T + 30.0]), np.array([0.0, 1.0, 1.0, 0.0])),
+    "cycles": History(T * np.arange(7), np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0])),
+    "two rates": History(np.array([0.0, T, 1.3 * T, 2 * T]), np.array([0.0, 0.5, 1.0, 0.0])),
+}
+STUDY = SolverTable()
+USUAL = StepControl(load_steps=STUDY.load_steps, unload_steps=STUDY.unload_steps)
+OF_DEMO = StepControl(**DEMO)
+
+
+@pytest.mark.parametrize("tau", [0.1, 0.2, 0.32, 1.0, 3.0])
+@pytest.mark.parametrize("name", ["ramp", "hold"])
+def test_the_curve_is_within_its_goal(name, tau):
+    """0.3 % rms and 1 % at worst of the peak, read between the steps too."""
+    layer = {"prony": ((3.0, tau),)}
+    exact = reference_layer(HISTORIES[name], **layer)
+    for control in (USUAL, OF_DEMO):
+        rms, worst = curve_error(solve_layer(HISTORIES[name], control, **layer), exact)
+        assert rms < 0.3
+        assert worst < 1.0
+
+
+@pytest.mark.parametrize("tau", [0.1, 0.32])
+@pytest.mark.parametrize("name", ["cycles", "two rates"])
+def test_cycles_and_rates_are_within_the_goal(name, tau):
+    layer = {"prony": ((3.0, tau),)}
+    rms, worst = curve_error(
+        solve_layer(HISTORIES[name], USUAL, **layer), reference_layer(HISTORIES[name], **layer)
+    )
+    assert rms < 0.3
+    assert worst < 1.0
+
+
+@pytest.mark.parametrize(("control", "most"), [(USUAL, 18), (OF_DEMO, 14)])
+@pytest.mark.parametrize("tau", [0.1, 0.32, 1.0, 3.0])
+def test_a_ramp_takes_no_more_steps_than_stated(control, most, tau):
+    found = solve_layer(HISTORIES["ramp"], control, ((3.0, tau),))
+    assert len(found.times) - 1 <= control.load_steps + control.unload_steps == most
+
+
+@pytest.mark.parametrize("tau", [0.1, 0.32, 1.0])
+def test_the_phantoms_truth_has_a_tenth_of_the_goals_error(tau):
+    layer = {"prony": ((3.0, tau),)}
+    exact = reference_layer(HISTORIES["ramp"], parts=1500, **layer)
+    rms, worst = curve_error(solve_layer(HISTORIES["ramp"], TRUTH, **layer), exact)
+    assert rms < 0.03
+    assert worst < 0.1
+
+
+@pytest.mark.parametrize(("stress", "order"), [("linear", 2.0), ("quadratic", 3.0)])
+def test_order_of_convergence(stress, order):
+    """At the end of a loading whose elastic force grows as the cube of time, even steps, two Prony terms."""
+    history = History(np.array([0.0, 4.0]), np.array([0.0, 1.0]))
+    layer = {"prony": ((2.0, 0.5), (1.0, 3.0)), "power": 3.0}
+    ends = []
+    for n in (20, 40, 80, 1600):
+        times = tuple(4.0 * np.arange(1, n + 1) / n)
+        ends.append(solve_layer(history, StepControl(times=times, stress=stress), **layer).force[-1])
+    errors = np.abs(np.array(ends[:-1]) - ends[-1])
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(order, abs=0.2)
+
+
+@pytest.mark.parametrize("x", [1e-4, 0.019, 0.021, 0.5, 4.0])
+@pytest.mark.parametrize("q", [0.4, 1.0, 3.0])
+def test_the_history_of_a_quadratic_stress_is_exact(x, q):
+    """Against the integral, and derivatives against differences."""
+    tau = 0.32
+    dt = x * tau
+    s, w = np.polynomial.legendre.leggauss(40)
+    s = 0.5 * dt * (s + 1.0)
+    whole = 0.5 * dt * w @ (np.exp(-(dt - s) / tau) * (0.3 + 2.0 * 0.7 * s / dt))
+    f = prony_factors(dt, tau, q * dt)
+    change, before = 0.3 * dt + 0.7 * dt, 0.3 * q * dt - 0.7 * q**2 * dt
+    assert f.ramp * change + f.back * before == pytest.approx(whole, rel=1e-9)
+    h = 1e-5 * tau
+    ends = [prony_factors(dt, tau + sign * h, q * dt) for sign in (1, -1)]
+    for name in ("decay", "ramp", "back"):
+        slope = (getattr(ends[0], name) - getattr(ends[1], name)) / (2 * h)
+        assert getattr(f, f"d_{name}") == pytest.approx(slope, rel=1e-5, abs=1e-9)
+
+
+def test_a_step_before_the_end_of_contact_does_not_move_with_the_parameters():
+    places = set()
+    for g in np.linspace(2.9, 3.1, 9):
+        places |= set(solve_layer(HISTORIES["ramp"], USUAL, ((g, 1.0),)).times.round(9))
+    planned = set(graded(HISTORIES["ramp"], USUAL.load_steps, USUAL.unload_steps).round(9))
+    assert 1 <= len(places - planned - {0.0}) <= 2
+
+
+def test_only_what_unloads_foresees_the_end_of_contact():
+    history = HISTORIES["hold"]
+    planned = graded(history, 4, 4)
+    left = [t for t in planned if t > 12.0]
+    assert foresee(history, planned, left, [0.0, T, 11.0, 12.0], [0.0, 5.0, 2.0, 1.0]) == left
+
+
+def test_a_block_is_within_the_goal_with_the_demos_steps():
+    problem = punch("tet4", 2, 1)
+    fine = solve(problem, StepControl(load_steps=40, unload_steps=50), store="none")
+    found = solve(problem, OF_DEMO, store="none")
+    t = np.linspace(0.0, problem.history.times[-1], 400)
+    error = 100.0 * (found.force_at(t) - fine.force_at(t)) / fine.peak_force
+    assert np.sqrt((error**2).mean()) < 0.3
+    assert np.abs(error).max() < 1.0
+    assert found.statistics["steps"] <= 14

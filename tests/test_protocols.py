@@ -1,0 +1,138 @@
+"""Records with a creeping hold and with three cycles, from the file to residuals and report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from layered import layered_block
+from limbfit import check_study, load_study
+from limbfit.bench.blocks import block_site
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import SimulationJob, simulate, to_vector
+from limbfit.pipeline.context import Context
+from limbfit.pipeline.simulations import CURVE_POINTS
+from limbfit.pipeline.stages.record_noise import site_noise
+from limbfit.pipeline.stages.traces import run_traces, site_record
+from limbfit.pipeline.store import Store, write_json
+from limbfit.report.records import record_figure, trace_table
+from limbfit.report.store import load_store
+
+TISSUES = ("skin", "muscle")
+TRUTH = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
+PROTOCOLS = {
+    "held": (
+        (0.0, 2.5, 32.5, 35.0),
+        (0.0, 3.0, 3.006, 0.0),
+        "load at 1.2 mm/s, hold for 30 s, unload at 1.2 mm/s",
+    ),
+    "cycles": (
+        (0.0, 2.5, 5.0, 7.5, 10.0, 12.5, 15.0),
+        (0.0, 3.0, 0.0, 3.0, 0.0, 3.0, 0.0),
+        "3 cycles of load at 1.2 mm/s, unload at 1.2 mm/s",
+    ),
+}
+TEXT = """
+[study]
+name = "blocks"
+[surfaces]
+skin = "skin.stl"
+[indenter]
+edge_radius_mm = 2.0
+[solver]
+load_steps = 5
+unload_steps = 8
+penalty_per_mm = 100.0
+"""
+SITE = """
+[[sites]]
+name = "{name}"
+trace = "{name}.csv"
+position = [0.0, 0.0, 0.0]
+"""
+
+
+def write_record(file: Path, knots_s, knots_mm, force, slack_mm=0.36, slack_s=0.3) -> None:
+    """What a robot writes down: slack before and after, noise of both sensors; ``force`` of the time."""
+    times = np.arange(0.0, knots_s[-1] + 2 * slack_s, 0.004)
+    ends = np.r_[0.0, slack_s + np.array(knots_s), knots_s[-1] + 2 * slack_s]
+    moved = np.interp(times, ends, np.r_[0.0, slack_mm + np.array(knots_mm), 0.0])
+    pushed = np.where((times > slack_s) & (times < ends[-2]), force(times - slack_s), 0.0)
+    random = np.random.default_rng(3)
+    columns = (
+        times,
+        moved + 0.003 * random.standard_normal(times.size),
+        pushed + 0.01 * random.standard_normal(times.size),
+    )
+    np.savetxt(
+        file,
+        np.column_stack(columns),
+        delimiter=",",
+        header="time_s,displacement_mm,force_N",
+        comments="",
+    )
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name):
+    knots_s, knots_mm, words = PROTOCOLS[name]
+    (tmp_path / "study.toml").write_text(TEXT + SITE.format(name=name), encoding="utf-8")
+    (tmp_path / "skin.stl").touch()
+    (tmp_path / f"{name}.csv").touch()
+    study = load_study(tmp_path)
+    store = Store(study.results)
+    for stage in ("sites", "traces", "mesh"):
+        store[stage].mkdir(parents=True)
+    mesh = layered_block((3.0, 11.0), TISSUES, divisions=4)
+    model = block_site(name, store["mesh"] / f"{name}.vtu", mesh, 3.0, study.solver)
+    own = {"indenter": study.indenter, "element": study.mesh.element}
+    model = replace(model, knots_s=knots_s, knots_mm=knots_mm, **own)
+    truth = tuple(to_vector(TRUTH, TISSUES))
+    times = model.curve_times(400)
+    found = simulate(SimulationJob(model, TISSUES, truth, tuple(times), False))
+    assert found.completed
+    write_record(
+        study.path(Path(f"{name}.csv")), knots_s, knots_mm, lambda t: np.interp(t, times, found.force_N)
+    )
+    place = {"site": name, "region": "", "fitted": True, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}
+    write_json(store["sites"] / "sites.json", {"sites": [place | {"off_skin_mm": 0.0, "marker": None}]})
+    context = Context(study, store, SerialExecutor(), lambda event: None)
+
+    run_traces(context, store["traces"])
+    facts = store.read("traces", "traces.json")["sites"][name]
+    assert facts["phases_in_words"] == words
+    assert facts["phases"][0]["kind"] == "approach"
+    assert facts["peak_s"] == pytest.approx(0.3 + knots_s[1], abs=0.02)
+
+    record = site_record(context, study.site(name))
+    assert len(record.times_s) <= 1.3 * CURVE_POINTS
+    response = record.respond(simulate(record.job(np.array(truth))))
+    error = response.force_N - record.force_N
+    peak = record.force_N.max()
+    assert np.sqrt(np.mean(error**2)) < 0.01 * peak
+    assert np.abs(error).max() < 0.04 * peak
+    noise = site_noise(study, record, response.force_N)
+    assert np.isfinite(np.linalg.cholesky(noise.covariance)).all()
+    assert np.sqrt(np.diag(noise.covariance)).max() < 0.05 * peak
+
+    stored = load_store(study.results)
+    figure, table = record_figure(stored, name), trace_table(stored)
+    assert figure is not None
+    assert f"the indenter's phases are {words}" in figure.caption
+    assert words in [cell.text for cell in table.rows[0].cells]
+
+
+def test_check_tells_the_phases_of_a_record(study):
+    times = {"1": PROTOCOLS["held"], "2": PROTOCOLS["cycles"]}
+    for name, (knots_s, knots_mm, _) in times.items():
+        depth = lambda t, s=knots_s, mm=knots_mm: np.interp(t, s, mm)  # noqa: E731
+        write_record(study / f"{name}.csv", knots_s, knots_mm, lambda t, d=depth: 0.6 * d(t) ** 1.3)
+    facts = check_study(load_study(study), listener=lambda event: None)["facts"]
+    for name, (_, _, words) in times.items():
+        assert any(fact.startswith(f"site {name}: peak force") and fact.endswith(words) for fact in facts)
