@@ -83,6 +83,19 @@ def test_other_ends(said, code, kind, fragment):
     assert fragment in verdict.reason
 
 
+@pytest.mark.parametrize("end", [10.022314, 6.623194858657083, 2.0 / 3.0, 999.9996])
+def test_six_digits_of_the_end_are_the_end(tmp_path, end):
+    """FEBio prints the time with six digits: a run that reached its end says a little less, or more."""
+    said = WELL.replace("time : 2", f"time : {end:.6g}")
+    assert judge(said, 0, end).kind == "normal"
+    assert judge(WELL.replace("time : 2", f"time : {0.9999 * end:.6g}"), 0, end).kind == "partial"
+    (tmp_path / "forces.txt").write_text(f"*Step  = 1\n*Time  = {end:.6g}\n*Data  = Fz\n3,-1.5\n")
+    history = History(np.array([0.0, end / 2, end]), np.array([0.0, 6.1, 0.0]))
+    problem = replace(punched_block("hex8", 2), history=history)
+    log = read_log(tmp_path / "forces.txt")
+    assert result_of_log(problem, log, judge(said, 0, end)).completed
+
+
 def program(folder: Path, body: str) -> Path:
     file = folder / "febio4"
     file.write_text(f"#!{sys.executable}\nimport os, shutil, signal, sys, time\n{body}\n")

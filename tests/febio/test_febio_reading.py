@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from febfiles import FEB, written
 
+from limbfit.bench.blocks import punched_block
 from limbfit.errors import ProblemError
-from limbfit.fe import Indenter
-from limbfit.febio import read_feb, read_log, step_control, to_problem
+from limbfit.fe import Indenter, RigidSurface
+from limbfit.febio import FebSettings, read_feb, read_log, step_control, to_problem, write_feb
 
+BOX = np.array([[x, y, z] for z in (-2.0, 0.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
+BOX_FACES = np.array(
+    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 6, 7], [2, 7, 3], [0, 4, 6],
+     [0, 6, 2], [1, 3, 7], [1, 7, 5]]
+)  # fmt: skip
 LOG = "*Step  = 0\n*Time  = 0\n*Data  = Fz;z\n3,0,5\n*Step  = 1\n*Time  = 0.5\n*Data  = Fz;z\n3,-0.25,4.5\n"
 
 
@@ -165,3 +173,16 @@ def test_a_motion_backwards_pushes_the_other_way(tmp_path):
     np.testing.assert_array_equal(problem.indenter.axis, [0, 0, 1])
     assert problem.history.at(2.0) == 3.0
     assert [s.factor for s in problem.supports] == [0.0, -0.5]
+
+
+@pytest.mark.parametrize("thin", [1.0, 1e-2])
+def test_edges_are_no_rounder_than_the_tissue_is_thick(tmp_path, thin):
+    """A plate of 150 mm over a bar: 1 % of its width would be an edge of 1.5 mm."""
+    plate = RigidSurface(np.array([75.0, 75.0, 5.0]) * BOX, BOX_FACES)
+    problem = punched_block("hex8", 2)
+    points = problem.mesh.points * [1.0, 1.0, thin]
+    tool = Indenter("stl", centre=(0.0, 0.0, 1.0), axis=(0.0, 0.0, -1.0), surface=plate)
+    problem = replace(problem, mesh=problem.mesh.with_points(points), indenter=tool)
+    write_feb(problem, tmp_path / "model.feb", FebSettings())
+    found = to_problem(read_feb(tmp_path / "model.feb")).indenter
+    assert found.kernel[2] == pytest.approx(min(1.5, 3.0 * thin))

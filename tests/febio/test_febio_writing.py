@@ -151,8 +151,8 @@ def test_structure(tmp_path, shape):
 def test_another_reader_understands_it(tmp_path):
     """pyfebio's schemas of the sections that it can read back.
 
-    Its Ogden takes no negative exponent, and what it writes as 0 or 1 (degrees of freedom, contact) it does
-    not read.
+    Its Ogden takes no negative exponent, and what it writes as 0 or 1 (degrees of freedom, contact, how
+    steps are cut) it does not read.
     """
     pytest.importorskip("pyfebio")
     from pyfebio import control, loaddata, mesh, meshdomains, output
@@ -160,6 +160,8 @@ def test_another_reader_understands_it(tmp_path):
     problem = block("tet10", "stl")
     file, tool = exported(problem, tmp_path)
     root = ET.parse(file).getroot()
+    stepper = root.find("Control/time_stepper")
+    stepper.remove(stepper.find("aggressiveness"))
     schemas = {
         "Control": control.Control,
         "Mesh": mesh.Mesh,
@@ -180,13 +182,29 @@ def test_another_reader_understands_it(tmp_path):
     assert len(curve.points.points) == len(problem.history.times)
 
 
+@pytest.mark.parametrize(
+    ("shape", "parts"), [("square", 64), ("cylinder", 64), ("sphere", 64), ("sharp", 128), ("stl", 128)]
+)
+def test_steps_that_febio_gets_through_with(tmp_path, shape, parts):
+    """Half as large under a sharp edge; a step that fails is halved, not shortened by a ninth."""
+    problem = block("tet4", shape)
+    file, _ = exported(problem, tmp_path)
+    control = ET.parse(file).getroot().find("Control")
+    size, count = float(control.findtext("step_size")), int(control.findtext("time_steps"))
+    assert size == pytest.approx(problem.history.peak / parts, rel=0.02)
+    assert size * count == pytest.approx(problem.history.times[-1])
+    assert control.findtext("time_stepper/aggressiveness") == "1"
+    largest = read_feb(file).curves[2].points[:, 1]
+    np.testing.assert_allclose(largest, 4.0 * problem.history.peak / parts, rtol=0.02)
+
+
 @pytest.mark.parametrize("shape", ["square", "sphere"])
 def test_it_pushes_as_hard(tmp_path, shape):
     """Solved from the file, with the same penalty, the facets are all that differs."""
     ramp = History(np.array([0.0, 2.0, 3.0]), np.array([0.0, 2.0, 1.0]))
     problem = replace(block("tet4", shape, divisions=8), history=ramp)
     file, _ = exported(problem, tmp_path)
-    same = {"times": (1.0, 2.0, 3.0), "penalty": 20.0, "penetration": 1.0}
+    same = {"times": (1.0, 2.0, 3.0), "stress": "linear", "penalty": 20.0, "penetration": 1.0}
     direct = solve(problem, StepControl(**same), store="none")
     run = run_feb(file, tmp_path / "out", **same)
     assert run.result.completed

@@ -88,6 +88,8 @@ def export(
     for row in found["sites"]:
         head = f"site {row['site']}, parameters {row['parameters_from']}"
         STDOUT.print(f"{head}: {', '.join(row['files'])}", soft_wrap=True)
+        for note in row["notes"]:
+            STDERR.print(f"note: {note}", soft_wrap=True)
     if to is Format.optimize:
         STDOUT.print("run: febio4 -i SITE-model.feb -s SITE-optimize.feb; FEBio fits one site at a time")
 
@@ -118,7 +120,7 @@ def compare(
         STDOUT.print(f"FEBio: peak force {found['febio']['peak_force_N']:.4g} N")
         for key, words in (
             ("limbfit", "limbfit"),
-            ("limbfit_matched", "limbfit with FEBio's contact penalty"),
+            ("limbfit_matched", "limbfit with FEBio's contact penalty and steps"),
         ):
             row = found[key]
             most = row["difference"]["max_percent"]

@@ -2,16 +2,18 @@
 
 from .abaqus import write_inp
 from .logs import Log, read_log
-from .model import Contact, FebModel, read_feb
+from .model import FebModel, read_feb
 from .optimising import Range, in_indenter_frame, write_optimisation
-from .problem import mean_penalty, step_control, to_problem
+from .penalty import FaceWise, mean_penalty
+from .problem import step_control, to_problem
 from .program import FebioRun, axial_force, find_febio, result_of_log, run_febio
 from .running import FebRun, run_feb
-from .verdict import Verdict, judge
-from .writing import FebSettings, write_feb
+from .verdict import SLACK, Verdict, judge
+from .writing import FebSettings, contact_of, differences, write_feb
 
 __all__ = [
-    "Contact",
+    "SLACK",
+    "FaceWise",
     "FebModel",
     "FebRun",
     "FebSettings",
@@ -20,6 +22,8 @@ __all__ = [
     "Range",
     "Verdict",
     "axial_force",
+    "contact_of",
+    "differences",
     "find_febio",
     "in_indenter_frame",
     "judge",

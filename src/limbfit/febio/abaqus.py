@@ -169,7 +169,7 @@ def _step(problem: Problem, system: System, handle: int, settings: FebSettings) 
     relaxing = any(g for m in problem.materials.values() for g, _ in m.table().prony)
     kind = "*VISCO, CETOL=0.1" if relaxing else "*STATIC"
     yield f"*STEP, NLGEOM, INC=10000\n{kind}"
-    first, largest = (history.peak or end) / 64.0, (history.peak or end) / 16.0
+    first, largest = history.loading_s / 64.0, history.loading_s / 16.0
     yield f"{first!r}, {end!r}, {end * 1e-8!r}, {largest!r}"
     yield "*BOUNDARY, AMPLITUDE=advance"
     yield from (f"handle, {i}, {i}, {float(axis[i - 1])!r}" for i in (1, 2, 3))

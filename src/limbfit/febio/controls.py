@@ -1,6 +1,6 @@
-"""Time in a FEBio input: load curves, steps and the automatic time stepper.
+"""Time in a FEBio input: steps and the automatic time stepper.
 
-Source: FEBio User Manual 4.0, sections 3.3 and 3.14.
+Source: FEBio User Manual 4.0, section 3.3.
 """
 
 from __future__ import annotations
@@ -11,22 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .curves import Curve
 from .tree import Node
 
 Array = NDArray[np.float64]
 MOST_STEPS = 20_000
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A load curve: ``points (n, 2)``, time (s) and value; constant beyond its ends."""
-
-    points: Array
-    interpolate: str
-    line: int
-
-    def at(self, times: float | Array) -> Array:
-        return np.asarray(np.interp(times, self.points[:, 0], self.points[:, 1]))
 
 
 @dataclass(frozen=True)
@@ -47,24 +36,6 @@ class Phase:
     @property
     def seconds(self) -> float:
         return self.steps * self.size
-
-
-def read_curves(section: Node | None) -> dict[int, Curve]:
-    """Load curves by number; other controllers and interpolations are refused where they are used."""
-    curves: dict[int, Curve] = {}
-    for node in section or ():
-        number = node.identity()
-        if number in curves:
-            raise node.refuse(f"load controller {number} is there twice")
-        if node.attribute("type") != "loadcurve":
-            raise node.refuse(f"load controllers of type {node.attribute('type')!r} are not supported")
-        points = np.array([point.numbers(2) for point in node.child("points")]).reshape(-1, 2)
-        if not len(points) or (np.diff(points[:, 0]) <= 0).any():
-            raise node.refuse("a load curve needs points that go forward in time")
-        if node.string("extend", "CONSTANT") != "CONSTANT":
-            raise node.child("extend").refuse("load curves are supported with constant extension only")
-        curves[number] = Curve(points, node.string("interpolate", "LINEAR").upper(), node.line)
-    return curves
 
 
 def read_phases(root: Node, curves: Mapping[int, Curve]) -> tuple[Phase, ...]:

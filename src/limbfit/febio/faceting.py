@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STEEPEST_DEG = {"square": 68.0, "cylinder": 68.0, "sphere": 75.0, "stl": 68.0}
+BLUNT = 0.05  # edge radius over the width that FEBio's contact goes round without retries
 FLAT, ARC, RINGS = 8, 4, 6  # divisions of half a face, of its rounding, and around the middle of a disk
 
 
@@ -32,6 +33,13 @@ class Tool:
     front: Indices
 
 
+def blunt(indenter: Indenter) -> bool:
+    """Whether the rigid mesh is round enough for FEBio's contact; the edges of a surface are sharp."""
+    if indenter.shape in ("sphere", "stl"):
+        return indenter.shape == "sphere"
+    return indenter.kernel[2] >= BLUNT * indenter.width
+
+
 def tool_mesh(indenter: Indenter) -> Tool:
     """The rigid mesh of an indenter where it stands.
 
@@ -40,7 +48,7 @@ def tool_mesh(indenter: Indenter) -> Tool:
     """
     if indenter.shape == "stl":
         return _shells(indenter)
-    local, front = _rounded_square(indenter) if indenter.shape == "square" else _round(indenter)
+    local, front = FRONTS[indenter.shape](indenter)
     back = local - [0.0, 0.0, 0.5 * indenter.width]
     cells = np.hstack([front + len(local), front])
     return Tool(_placed(indenter, np.vstack([local, back])), cells, "hex8", front)
@@ -107,6 +115,10 @@ def _round(indenter: Indenter) -> tuple[Array, Indices]:
     rho = np.minimum(length, inner) + radius * np.sin(turned)
     direction = plane / np.maximum(length, 1e-300)[:, None]
     return np.column_stack([rho[:, None] * direction, radius * (np.cos(turned) - 1.0)]), faces
+
+
+# The shapes that are meshed here; a surface is its own mesh.
+FRONTS = {"square": _rounded_square, "cylinder": _round, "sphere": _round}
 
 
 def _disk(radius: float, beyond: Array) -> tuple[Array, Indices]:

@@ -33,7 +33,8 @@ class Part:
     """Cells (m, k) of one type in FEBio's (and VTK's) node order.
 
     ``material`` by name, ``ids (m,)`` FEBio's numbers, ``element`` the row of limbfit's element table
-    (empty for a type that limbfit cannot deform), ``line`` where it stands in the file.
+    (empty for a type that limbfit cannot deform), ``line`` where it stands in the file, ``thickness`` that
+    of shells, mm.
     """
 
     cell_type: str
@@ -42,16 +43,21 @@ class Part:
     ids: Indices
     element: str
     line: int
+    thickness: float = 0.0
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What stands in ``<Mesh>`` and ``<MeshDomains>``; nodes are numbered from 0 in the order of the file."""
+    """What stands in ``<Mesh>`` and ``<MeshDomains>``; nodes are numbered from 0 in the order of the file.
+
+    ``element_sets`` hold FEBio's numbers; every part is one, too.
+    """
 
     points: Array
     node_ids: Indices
     parts: Mapping[str, Part]
     node_sets: Mapping[str, Indices]
+    element_sets: Mapping[str, Indices]
     surfaces: Mapping[str, Indices]
     pairs: Mapping[str, tuple[str, str]]
 
@@ -87,8 +93,10 @@ def read_geometry(root: Node, materials: Iterable[str]) -> Geometry:
                 raise pair.refuse(f"there is no surface {surface!r}")
         pairs[name] = both
     sets = {name: _node_set(group, numbers) for name, group in _named(mesh, "NodeSet")}
+    elements = {name: part.ids for name, part in parts.items()}
+    elements |= {name: np.array(_listed(group)) for name, group in _named(mesh, "ElementSet")}
     points = np.array([node.numbers(3) for node in nodes])
-    return Geometry(points, numbers.ids, parts, sets, surfaces, pairs)
+    return Geometry(points, numbers.ids, parts, sets, elements, surfaces, pairs)
 
 
 class _Numbers:
@@ -156,7 +164,8 @@ def _part(group: Node, domain: Node, numbers: _Numbers, seen: set[int]) -> Part:
         raise group.refuse("has no elements")
     formulation = _formulation(domain, cell_type, rule)
     material = domain.attribute("mat")
-    return Part(cell_type, np.array(cells), material, np.array(ids), formulation, group.line)
+    thickness = domain.number("shell_thickness", 0.0)
+    return Part(cell_type, np.array(cells), material, np.array(ids), formulation, group.line, thickness)
 
 
 def _formulation(domain: Node, cell_type: str, rule: str) -> str:
@@ -189,19 +198,24 @@ def _faces(group: Node, numbers: _Numbers) -> Indices:
 
 
 def _node_set(group: Node, numbers: _Numbers) -> Indices:
+    return np.array(numbers.of(group, _listed(group, len(numbers.ids))), dtype=np.int64)
+
+
+def _listed(group: Node, most: int = 10**7) -> list[int]:
+    """The numbers of a set; ``most`` are in a range."""
     if group.children:  # FEBio 3: <n id="1"/>
-        return np.array(numbers.of(group, [node.identity() for node in group]))
+        return [node.identity() for node in group]
     ids: list[int] = []
     for text in group.text.split(","):
         first, _, last = text.strip().partition(":")
         try:
             low, high = int(first), int(last or first)
         except ValueError:
-            raise group.refuse(f"{text.strip()[:40]!r} is no node number") from None
-        if not 0 <= high - low < len(numbers.ids):
-            raise group.refuse(f"there are no nodes {low} to {high}")
+            raise group.refuse(f"{text.strip()[:40]!r} is no number") from None
+        if not 0 <= high - low < most:
+            raise group.refuse(f"there are no items {low} to {high}")
         ids += range(low, high + 1)
-    return np.array(numbers.of(group, ids))
+    return ids
 
 
 def node_set(geometry: Geometry, name: str, node: Node) -> Indices:

@@ -5,6 +5,7 @@ Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,14 +35,18 @@ _VOLUMETRIC = {
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid material: its number in the file and its centre of mass (3,), mm; None: to be found."""
+    """A rigid material: its number in the file and its centre of mass (3,), mm; NaN: to be found."""
 
     number: int
-    centre: Array | None
+    centre: Array
 
 
-def read_materials(section: Node) -> tuple[dict[str, Material], dict[str, RigidBody]]:
-    """Deformable and rigid materials by name.
+def read_materials(
+    section: Node, used: Container[str]
+) -> tuple[dict[str, Material], dict[str, RigidBody], tuple[str, ...]]:
+    """Deformable and rigid materials by name, and a note for those that limbfit does not have.
+
+    Those are an error where a part is made of one (``used``: their names).
 
     Raises
     ------
@@ -50,7 +55,7 @@ def read_materials(section: Node) -> tuple[dict[str, Material], dict[str, RigidB
     """
     soft: dict[str, Material] = {}
     rigid: dict[str, RigidBody] = {}
-    numbers = set()
+    numbers, notes = set(), list[str]()
     for node in section:
         name, number = node.attribute("name"), node.identity()
         if name in soft or name in rigid or number in numbers:
@@ -58,14 +63,17 @@ def read_materials(section: Node) -> tuple[dict[str, Material], dict[str, RigidB
         numbers.add(number)
         if node.attribute("type") == "rigid body":
             centre = node.find("center_of_mass")
-            rigid[name] = RigidBody(number, None if centre is None else np.array(centre.numbers(3)))
+            rigid[name] = RigidBody(number, np.array([np.nan] * 3 if centre is None else centre.numbers(3)))
             continue
         try:
             soft[name] = _law(node)
         except ProblemError as error:
+            if name not in used:
+                notes.append(f"{node.place}: material {name!r} not read: no part is made of it")
+                continue
             what = f"material {name}: {error.what}"
             raise ProblemError(what, place=error.place or node.place, remedy=error.remedy) from None
-    return soft, rigid
+    return soft, rigid, tuple(notes)
 
 
 def _law(node: Node) -> Material:

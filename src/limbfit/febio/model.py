@@ -7,7 +7,7 @@ understood is an error that names its line, never skipped (FEBio User Manual 4.0
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import Material
-from .controls import Curve, Phase, read_curves, read_phases
+from .controls import Phase, read_phases
+from .curves import Curve, read_curves
 from .geometry import Geometry, Indices, Part, node_set, read_geometry
+from .mass import centre_of_mass
 from .materials import RigidBody, read_materials
 from .requests import Request, read_requests
 from .tree import Node, read_tree
@@ -109,11 +111,17 @@ def _model(root: Node) -> FebModel:
             raise section.refuse("this section is not supported")
         if section.tag == "Module" and section.attributes.get("type", "solid") != "solid":
             raise section.refuse(f"module {section.attributes['type']!r} is not supported, only solid")
-    materials, rigid = read_materials(root.child("Material"))
+    used = {domain.attributes.get("mat", "") for domain in root.child("MeshDomains")}
+    materials, bodies, unread = read_materials(root.child("Material"), used)
+    rigid = dict(bodies)
     geometry = read_geometry(root, (*materials, *rigid))
+    for name, body in bodies.items():
+        if np.isnan(body.centre).any():
+            parts = [part for part in geometry.parts.values() if part.material == name]
+            rigid[name] = replace(body, centre=centre_of_mass(geometry.points, parts))
     load = root.find("LoadData")
     curves = read_curves(load)
-    requests, notes = read_requests(root.find("Output"))
+    requests, notes = read_requests(root.find("Output"), geometry)
     return FebModel(
         geometry,
         materials,
@@ -124,7 +132,7 @@ def _model(root: Node) -> FebModel:
         curves,
         read_phases(root, curves),
         requests,
-        notes,
+        (*unread, *notes),
     )
 
 
@@ -159,9 +167,6 @@ def _driven(bc: Node, curves: Mapping[int, Curve]) -> tuple[int, float, int]:
         return COMPONENTS.index(dof), 0.0, 0
     if not (number.isdecimal() and int(number) in curves):
         raise value.refuse(f"there is no load curve {number!r}" if number else "needs a load curve")
-    curve = curves[int(number)]
-    if curve.interpolate != "LINEAR":
-        raise value.refuse(f"load curve {number} is {curve.interpolate}; a displacement needs a linear one")
     return COMPONENTS.index(dof), factor, int(number)
 
 

@@ -9,20 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import ELEMENTS, History, Indenter, Material, Problem, RigidSurface, StepControl, Support
-from ..fe.elements import face_quadrature, reference_gradients
-from ..fe.materials import prony_factors
+from ..fe import ELEMENTS, History, Indenter, Problem, RigidSurface, StepControl, Support
+from ..fe.elements import reference_gradients
+from ..fe.indenter import SHARP_EDGE
 from ..mesh import Mesh
 from .controls import step_times
 from .geometry import boundary, refuse_part, triangles
-from .model import Contact, FebModel, Motion
+from .model import FebModel, Motion
+from .penalty import mean_penalty, thinnest
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-# FEBio's penalty acts over the current area of the skin, limbfit's over that at rest: what touches a punch
-# has stretched by that much at the peak of the four reference cases with contact (docs/contact.md).
-CURRENT_AREA = 1.21
 
 
 @dataclass(frozen=True)
@@ -68,12 +65,17 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     faces, placed = np.zeros((0, 3), np.int64), None
     if model.contact is not None:
         faces, name = contact_faces(model, body), touching_body(model)
-        placed = _tool(model, driven, name) if indenter is None else _placed(model, driven, name, indenter)
+        depth = thinnest(body.mesh, faces)
+        placed = (
+            _tool(model, driven, name, depth) if indenter is None else _placed(model, driven, name, indenter)
+        )
     elif model.rigid_motions:
         raise ProblemError("the rigid body touches nothing: the input has no contact")
     fixed, supports = _supports(model, body.number, driven)
-    rule = "nodes" if model.contact and model.contact.rule == "sliding-node-on-facet" else "gauss"
     element = next(iter(model.parts_of(model.materials).values())).element
+    rule = "gauss7" if body.mesh.cell_type == "tet10" else "gauss"  # FEBio's quadrature
+    if model.contact and model.contact.rule == "sliding-node-on-facet":
+        rule = "nodes"
     return Problem(
         mesh=body.mesh,
         materials={
@@ -165,7 +167,10 @@ def drive(model: FebModel) -> Drive:
     moving = [m for m in (*model.rigid_motions, *model.motions) if m.factor != 0.0]
     if not moving:
         raise ProblemError("nothing moves: there is no prescribed displacement")
-    knots = np.unique(np.concatenate([model.curves[m.curve].points[:, 0] for m in moving]))
+    corners = [model.curves[m.curve].corners for m in moving]
+    # FEBio knows a curve at the ends of its steps only: there are the knots of what is not linear.
+    every = step_times(model.phases, model.curves) if any(c is None for c in corners) else np.zeros(0)
+    knots = np.unique(np.concatenate([every, *(c for c in corners if c is not None)]))
     times = np.concatenate([[0.0], knots[(knots > 0.0) & (knots < end * (1.0 - 1e-9))], [end]])
     base = model.curves[moving[0].curve].at(times)
     if not base.any():
@@ -229,8 +234,11 @@ def _along(model: FebModel, driven: Drive, name: str) -> Array:
     return driven.axis
 
 
-def _tool(model: FebModel, driven: Drive, name: str) -> Indenter:
-    """The faces of a rigid body as an indenter whose axis passes through the middle of the body."""
+def _tool(model: FebModel, driven: Drive, name: str, depth: float) -> Indenter:
+    """The faces of a rigid body as an indenter whose axis passes through the middle of the body.
+
+    Its sharp edges are rounded by no more than the elements that it touches are deep (``depth``, mm).
+    """
     axis = _along(model, driven, name)
     faces = triangles(boundary(model.parts_of({name: None}).values()))
     used, faces = np.unique(faces, return_inverse=True)
@@ -243,20 +251,20 @@ def _tool(model: FebModel, driven: Drive, name: str) -> Indenter:
     except ProblemError as error:
         part_name, part = next(iter(model.parts_of({name: None}).items()))
         raise refuse_part(part, part_name, error.what) from None
-    return Indenter("stl", surface=surface, centre=middle @ frame, axis=axis)
+    sharp = min(SHARP_EDGE, depth / surface.width)
+    return Indenter("stl", surface=surface, centre=middle @ frame, axis=axis, sharp=sharp)
 
 
 def _placed(model: FebModel, driven: Drive, name: str, indenter: Indenter) -> Indenter:
     axis = _along(model, driven, name)
     centre = model.rigid[name].centre
-    if centre is None:
-        raise ProblemError(f"the rigid body {name!r} has no center_of_mass")
     foremost = float(((rigid_corners(model, name) - centre) @ axis).max())
     return replace(indenter, centre=centre + foremost * axis, axis=axis)
 
 
 def step_control(model: FebModel, problem: Problem, **settings: Any) -> StepControl:
-    """FEBio's time steps, a tolerance no looser than its own and, where it penalises contact, its penalty.
+    """FEBio's steps in time, its course of the stress in them, a tolerance no looser than its own and, where
+    it penalises contact, its penalty.
 
     Augmented and nodal contact are limbfit's own, which keeps the penetration below 1 % of the depth.
     """
@@ -264,60 +272,16 @@ def step_control(model: FebModel, problem: Problem, **settings: Any) -> StepCont
     finest = min(phase.tolerance for phase in model.phases)
     chosen: dict[str, Any] = {
         "times": tuple(times),
+        "stress": "linear",
         "tolerance": min(StepControl.tolerance, max(0.1 * finest, 1e-11)),
     }
-    contact = model.contact
-    if contact is not None and not contact.augmented and contact.rule != "sliding-node-on-facet":
-        chosen |= {"penalty": mean_penalty(contact, problem, float(times[0])), "penetration": 1.0}
+    if penalised(model):
+        assert model.contact is not None
+        chosen |= {"penalty": mean_penalty(model.contact, problem, float(times[0])), "penetration": 1.0}
     return StepControl(**{**chosen, **settings})
 
 
-def mean_penalty(contact: Contact, problem: Problem, dt: float) -> float:
-    """FEBio's penalty of ``contact`` as `StepControl.penalty`, 1/mm.
-
-    Automatic: ``penalty E A / V`` of each face and the element behind it, with Young's modulus
-    ``9 k mu / (3 k + mu)`` over the first step of ``dt`` s; the mean over the faces.  ``sliding-elastic``
-    acts over the current area, ``sliding-facet-on-facet`` over that at rest.
-    """
-    materials = [problem.materials[name] for name in problem.mesh.region_names]
-    over = float(np.mean([material.instantaneous_modulus for material in materials]))
-    penalty = contact.penalty / over
-    if contact.rule == "sliding-elastic":
-        penalty *= CURRENT_AREA
-    if not contact.automatic:
-        return penalty
-    mesh, faces = problem.mesh, np.asarray(problem.contact_faces)
-    behind = _cells_behind(mesh, faces)
-    _, areas = face_quadrature(problem.formulation, mesh.points, faces, problem.contact_rule)
-    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
-    stiff = np.array([_young(material, dt) for material in materials])
-    own = stiff[mesh.regions[behind]] * areas.sum(axis=1) / weights.sum(axis=1)
-    return penalty * float(own.mean())
-
-
-def _cells_behind(mesh: Mesh, faces: Indices) -> Indices:
-    """The cell (f,) that each face belongs to."""
-    corners = faces[:, : 4 if mesh.cell_type == "hex8" else 3]
-    touched = np.flatnonzero(np.isin(mesh.cells, corners).sum(axis=1) >= corners.shape[1])
-    owner = {int(cell): set(mesh.cells[cell].tolist()) for cell in touched}
-    by_node: dict[int, list[int]] = {}
-    for cell, nodes in owner.items():
-        for node in nodes:
-            by_node.setdefault(node, []).append(cell)
-    found = []
-    for face in corners.tolist():
-        cells = [cell for cell in by_node.get(face[0], ()) if set(face) <= owner[cell]]
-        if len(cells) != 1:
-            raise ProblemError(f"a contact face belongs to {len(cells)} elements, not to one")
-        found.append(cells[0])
-    return np.array(found)
-
-
-def _young(material: Material, dt: float) -> float:
-    """Young's modulus at rest over a step of ``dt`` s, MPa."""
-    table = material.table()
-    mu = float(table.terms[:, 0].sum()) / 2.0
-    if len(table.prony):
-        ramp = prony_factors(dt, table.prony[:, 1])[1]
-        mu *= 1.0 + float(table.prony[:, 0] @ ramp)
-    return 9.0 * table.kappa * mu / (3.0 * table.kappa + mu)
+def penalised(model: FebModel) -> bool:
+    """Whether contact has a penalty of FEBio's; augmented and nodal contact are limbfit's own."""
+    contact = model.contact
+    return contact is not None and not contact.augmented and contact.rule != "sliding-node-on-facet"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Problem, Result
 from .logs import Log, read_log
-from .verdict import Verdict, judge
+from .verdict import SLACK, Verdict, judge
 
 Array = NDArray[np.float64]
 VARIABLE = "FEBIO_CMD"
@@ -147,7 +147,7 @@ def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: 
     times, force = (np.zeros(1), np.zeros(1)) if log is None else (log.times, axial_force(problem, log))
     if times[0] > 0.0:
         times, force = np.concatenate([[0.0], times]), np.concatenate([[0.0], force])
-    if times[-1] > problem.history.times[-1] * (1.0 + 1e-6):
+    if times[-1] > problem.history.times[-1] * (1.0 + SLACK):
         raise ProblemError(
             f"the table goes on to {times[-1]:.4g} s, the indentation to {problem.history.times[-1]:.4g} s",
             remedy="give the table of the same indentation",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
+from .geometry import Geometry, node_set
 from .tree import Node
 
 KNOWN = {
@@ -16,28 +17,40 @@ KNOWN = {
 
 @dataclass(frozen=True)
 class Request:
-    """One table per step: ``names`` of its columns, the ``items`` (FEBio's numbers; empty: all)."""
+    """One table per step: ``names`` of its columns, the ``items`` (ranges of FEBio's numbers; empty: all).
+
+    ``members`` are the items where a set is asked for.
+    """
 
     kind: str
     names: tuple[str, ...]
     file: str
     delimiter: str
     items: tuple[tuple[int, int], ...]
+    members: frozenset[int] | None = None
 
     def wants(self, number: int) -> bool:
         """Whether the item of that number is asked for."""
+        if self.members is not None:
+            return number in self.members
         return not self.items or any(low <= number <= high for low, high in self.items)
 
 
-def read_requests(section: Node | None) -> tuple[tuple[Request, ...], tuple[str, ...]]:
-    """The requests that limbfit can answer, and a note for everything else."""
+def read_requests(section: Node | None, geometry: Geometry) -> tuple[tuple[Request, ...], tuple[str, ...]]:
+    """The requests that limbfit can answer, and a note for everything else.
+
+    Raises
+    ------
+    ProblemError
+        For a set that does not exist, and items that are no numbers.
+    """
     requests, notes = [], list[str]()
     for output in section or ():
         if output.tag != "logfile":
             notes.append(f"{output.place}: not written")
             continue
         for entry in output:
-            if entry.tag not in KNOWN or {"node_set", "elem_set"} & set(entry.attributes):
+            if entry.tag not in KNOWN:
                 notes.append(f"{entry.place}: not written")
                 continue
             names = [name.strip() for name in entry.attribute("data").split(";")]
@@ -48,10 +61,22 @@ def read_requests(section: Node | None) -> tuple[tuple[Request, ...], tuple[str,
                 notes.append(f"{entry.place}: {what} not written; known are {', '.join(KNOWN[entry.tag])}")
             if known:
                 file = PurePosixPath(entry.attributes.get("file", "").replace("\\", "/")).name
-                requests.append(
-                    Request(entry.tag, known, file, entry.attributes.get("delim", " "), _items(entry))
-                )
+                delimiter, members = entry.attributes.get("delim", " "), _members(entry, geometry)
+                items = _items(entry) if members is None else ()
+                requests.append(Request(entry.tag, known, file, delimiter, items, members))
     return tuple(requests), tuple(notes)
+
+
+def _members(entry: Node, geometry: Geometry) -> frozenset[int] | None:
+    """The items of the set that an entry names, if it does."""
+    node, element = entry.attributes.get("node_set"), entry.attributes.get("elem_set")
+    if node is not None:
+        return frozenset(geometry.node_ids[node_set(geometry, node, entry)].tolist())
+    if element is None:
+        return None
+    if element not in geometry.element_sets:
+        raise entry.refuse(f"there is no element set {element!r}")
+    return frozenset(geometry.element_sets[element].tolist())
 
 
 def _items(entry: Node) -> tuple[tuple[int, int], ...]:

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from ..errors import ProblemError, RunError
 from ..fe import Material, Problem, StepControl, System
 from ..fe.stepping import schedule
-from .faceting import Tool, tool_mesh
+from .faceting import Tool, blunt, tool_mesh
+from .model import Contact
+from .penalty import explicit_penalty, mean_stiffness
 
 Array = NDArray[np.float64]
 
@@ -35,13 +37,14 @@ class FebSettings:
 
     Parameters
     ----------
-    penalty : times FEBio's automatic one; above 3, tet10 retry or stall.
-    steps : limbfit's step control, whose times FEBio must meet.
+    penalty : times FEBio's automatic one (above 3, tet10 retry or stall); None: an explicit one as stiff as
+        limbfit's contact.
+    steps : limbfit's step control: its times FEBio must meet, its penalty is the explicit one.
     force_file : name of the table of the indenter's force and position.
     title : one line in the head of the file.
     """
 
-    penalty: float = 3.0
+    penalty: float | None = None
     steps: StepControl = field(default_factory=StepControl)
     force_file: str = "forces.txt"
     title: str = ""
@@ -70,6 +73,41 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings) -> Tool
     return tool
 
 
+def contact_of(problem: Problem, settings: FebSettings) -> Contact:
+    """The contact that is written: FEBio's automatic penalty, or an explicit one as stiff as limbfit's."""
+    penalty, automatic = settings.penalty, settings.penalty is not None
+    if penalty is None:
+        penalty = explicit_penalty(problem, settings.steps)
+    return Contact("sliding-elastic", (PATCH, FRONT), penalty, automatic, False, 0)
+
+
+def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
+    """What FEBio still does otherwise with the input than limbfit does, a line each."""
+    assert problem.indenter is not None
+    own, automatic = explicit_penalty(problem, settings.steps), settings.penalty is not None
+    if automatic:
+        mean = mean_stiffness(contact_of(problem, settings), problem, first_step(problem))
+        contact = (
+            f"contact: {settings.penalty:g} times FEBio's automatic penalty, {mean:.3g} MPa/mm in the mean, "
+            f"where {own:.3g} were as stiff as limbfit's: the indenter sinks in further and the force is "
+            "smaller, most where tissue is thin"
+        )
+    else:
+        contact = (
+            f"contact: a penalty of {own:.3g} MPa/mm, as stiff as limbfit's; FEBio's acts along the skin's "
+            "normal and over its current area, limbfit's away from the indenter and over the area at rest"
+        )
+    lines = [contact, "indenter: facets, without the side walls", "time: FEBio's own steps"]
+    if not automatic:
+        lines.append("force: within 2 % of the peak of limbfit's, as far as these go")
+    if not blunt(problem.indenter):
+        lines.append(
+            "edge: FEBio's contact gets through with edges rounded by 2 mm, or a twentieth of the width; "
+            "under one as sharp as this it may stop before the end"
+        )
+    return tuple(lines)
+
+
 def check_exportable(problem: Problem, program: str) -> None:
     """Raise `ProblemError` where another program cannot be given the problem as it is."""
     name = problem.formulation.name
@@ -89,8 +127,8 @@ def check_exportable(problem: Problem, program: str) -> None:
 
 def _lines(problem: Problem, system: System, tool: Tool, settings: FebSettings) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="UTF-8"?>'
-    title = " ".join(settings.title.replace("--", "-").split())
-    yield f"<!-- limbfit: {escape(title)}; mm, N, s, MPa -->"
+    for words in (f"limbfit: {settings.title}; mm, N, s, MPa", *differences(problem, settings)):
+        yield f"<!-- {escape(' '.join(words.replace('--', '-').split()))} -->"
     yield '<febio_spec version="4.0">'
     yield '<Module type="solid"/>'
     yield from _control(problem, settings)
@@ -117,18 +155,35 @@ def _lines(problem: Problem, system: System, tool: Tool, settings: FebSettings) 
 
 
 def _control(problem: Problem, settings: FebSettings) -> Iterator[str]:
-    """BFGS with line search; a first step of a sixty-fourth of the loading, grown and cut by FEBio."""
-    end, peak = float(problem.history.times[-1]), problem.history.peak
-    count = int(np.ceil(end / (peak or end) * 64.0))
-    size = end / count
-    yield f"<Control><analysis>STATIC</analysis><time_steps>{count}</time_steps>"
+    """Steps that FEBio grows and halves; stiff contact needs a tangent in every iteration.
+
+    With an explicit penalty quasi-Newton updates stall.
+    """
+    end, size = float(problem.history.times[-1]), first_step(problem)
+    updates, reformations = (0, 60) if settings.penalty is None else (10, 25)
+    yield f"<Control><analysis>STATIC</analysis><time_steps>{round(end / size)}</time_steps>"
     yield f"<step_size>{size!r}</step_size>"
     yield "<plot_level>PLOT_MUST_POINTS</plot_level><output_level>OUTPUT_MAJOR_ITRS</output_level>"
     yield '<time_stepper type="default"><max_retries>8</max_retries><opt_iter>15</opt_iter>'
-    yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="2">1</dtmax></time_stepper>'
-    yield '<solver type="solid"><symmetric_stiffness>symmetric</symmetric_stiffness><max_refs>25</max_refs>'
+    yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="2">1</dtmax><aggressiveness>1</aggressiveness>'
+    yield "</time_stepper>"
+    yield '<solver type="solid"><symmetric_stiffness>symmetric</symmetric_stiffness>'
+    yield f"<max_refs>{reformations}</max_refs>"
     yield "<dtol>0.001</dtol><etol>0.01</etol><rtol>1e-05</rtol><lstol>0.9</lstol>"
-    yield '<qn_method type="BFGS"><max_ups>10</max_ups></qn_method></solver></Control>'
+    yield f'<qn_method type="BFGS"><max_ups>{updates}</max_ups></qn_method></solver></Control>'
+
+
+def largest_step(problem: Problem) -> float:
+    """The largest step, s: a sixteenth of the loading, half of that under sharp edges."""
+    assert problem.indenter is not None
+    history = problem.history
+    return history.loading_s / (16.0 if blunt(problem.indenter) else 32.0)
+
+
+def first_step(problem: Problem) -> float:
+    """The first step, s: a quarter of the largest at most, and a whole part of the time."""
+    end = float(problem.history.times[-1])
+    return end / float(np.ceil(4.0 * end / largest_step(problem)))
 
 
 def material_lines(number: int, name: str, material: Material) -> Iterator[str]:
@@ -232,7 +287,9 @@ def _contact(problem: Problem, settings: FebSettings) -> Iterator[str]:
     """The way of the reference cases; the search reaches as far as the punch goes in, and half again."""
     reach = max(1.5 * float(problem.history.displacement.max()), 2.0)
     yield '<Contact><contact name="indentation" type="sliding-elastic" surface_pair="indentation">'
-    yield f"<laugon>PENALTY</laugon><penalty>{settings.penalty!r}</penalty><auto_penalty>1</auto_penalty>"
+    contact = contact_of(problem, settings)
+    yield f"<laugon>PENALTY</laugon><penalty>{contact.penalty!r}</penalty>"
+    yield f"<auto_penalty>{contact.automatic:d}</auto_penalty>"
     yield "<two_pass>0</two_pass><symmetric_stiffness>1</symmetric_stiffness><search_tol>0.01</search_tol>"
     yield f"<search_radius>{reach!r}</search_radius></contact></Contact>"
 
@@ -240,11 +297,10 @@ def _contact(problem: Problem, settings: FebSettings) -> Iterator[str]:
 def _load_curves(problem: Problem, settings: FebSettings) -> Iterator[str]:
     """1: the advance of the indenter, mm; 2: the largest step, s, at the times that must be met."""
     history = problem.history
-    largest = (history.peak or float(history.times[-1])) / 16.0
     musts = np.concatenate([[0.0], schedule(history, settings.steps)])
     curves = [
         ("advance", "LINEAR", np.column_stack([history.times, history.displacement])),
-        ("must_points", "STEP", np.column_stack([musts, np.full(len(musts), largest)])),
+        ("must_points", "STEP", np.column_stack([musts, np.full(len(musts), largest_step(problem))])),
     ]
     yield "<LoadData>"
     for i, (name, interpolate, points) in enumerate(curves, 1):

@@ -1,0 +1,193 @@
+"""Load controllers of a FEBio input: curves through points, and expressions of the time.
+
+Source: FEBio User Manual 4.0, section 3.14; ``PointCurve::value`` for what lies between and beyond points.
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .tree import Node
+
+Array = NDArray[np.float64]
+INTERPOLATIONS = ("LINEAR", "STEP", "SMOOTH", "SMOOTH STEP")
+EXTENSIONS = ("CONSTANT", "EXTRAPOLATE", "REPEAT", "REPEAT OFFSET")
+LONGEST = 400  # characters of an expression
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A value over time: ``points (n, 2)``, time (s) and value, with what lies between and beyond them.
+
+    ``formula`` takes their place where it is given: the value at times (k,).
+    """
+
+    points: Array
+    interpolate: str
+    line: int
+    extend: str = "CONSTANT"
+    formula: Callable[[Array], Array] | None = field(default=None, compare=False)
+
+    def at(self, times: float | Array) -> Array:
+        """Values at times (s), of their shape."""
+        t = np.asarray(times, dtype=float)
+        if self.formula is not None:
+            return np.broadcast_to(self.formula(t), t.shape)
+        x, y = self.points.T
+        if len(x) == 1:
+            return np.full(t.shape, y[0])
+        offset = np.zeros(t.shape)
+        if self.extend.startswith("REPEAT"):
+            # FEBio keeps the last point itself, and begins anew after it
+            span = x[-1] - x[0]
+            rounds = np.where(t < x[0], np.floor((t - x[0]) / span), np.ceil((t - x[0]) / span) - 1.0)
+            rounds = np.where((t >= x[0]) & (t <= x[-1]), 0.0, rounds)
+            t = t - rounds * span
+            offset = rounds * (y[-1] - y[0]) * (self.extend == "REPEAT OFFSET")
+        inside = self._between(np.clip(t, x[0], x[-1]))
+        if self.extend == "EXTRAPOLATE":
+            inside = inside + self._beyond(t)
+        return np.asarray(inside + offset)
+
+    @property
+    def corners(self) -> Array | None:
+        """Times (n,) between which the value is linear; None where there are none such."""
+        if self.formula is None and self.interpolate == "LINEAR" and not self.extend.startswith("REPEAT"):
+            return np.asarray(self.points[:, 0])
+        return None
+
+    def _between(self, t: Array) -> Array:
+        x, y = self.points.T
+        if self.interpolate == "LINEAR" or (self.interpolate == "SMOOTH" and len(x) == 2):
+            return np.asarray(np.interp(t, x, y))
+        n = np.clip(np.searchsorted(x, t), 1, len(x) - 1)  # the interval's end
+        w = (t - x[n - 1]) / (x[n] - x[n - 1])
+        if self.interpolate == "STEP":
+            return np.where(t <= x[0], y[0], y[n])
+        if self.interpolate == "SMOOTH STEP":
+            return np.asarray(y[n - 1] + (y[n] - y[n - 1]) * w**3 * (10.0 - 15.0 * w + 6.0 * w**2))
+        before = self._parabola(t, np.maximum(n - 2, 0))
+        after = self._parabola(t, np.minimum(n - 1, len(x) - 3))
+        return np.asarray(before + (after - before) * w)
+
+    def _parabola(self, t: Array, first: NDArray[np.int64]) -> Array:
+        """The parabola through three points from ``first`` on, at ``t``."""
+        (a, b, c), (f, g, h) = (
+            (self.points[first + i, 0] for i in range(3)),
+            (self.points[first + i, 1] for i in range(3)),
+        )
+        return np.asarray(
+            f * (c - t) * (b - t) / ((c - a) * (b - a))
+            + g * (c - t) * (t - a) / ((c - b) * (b - a))
+            + h * (t - b) * (t - a) / ((c - b) * (c - a))
+        )
+
+    def _beyond(self, t: Array) -> Array:
+        """What the last slope adds before the first and after the last point."""
+        x = self.points[:, 0]
+        if self.interpolate in ("STEP", "SMOOTH STEP"):
+            return np.zeros(t.shape)
+        straight, tiny = self.interpolate == "LINEAR", 0.001 * (x[-1] - x[0])
+        ends = np.array([x[0], x[1] if straight else x[0] + tiny, x[-2] if straight else x[-1] - tiny, x[-1]])
+        a, b, c, d = self._between(ends)
+        low, high = (b - a) / (ends[1] - ends[0]), (d - c) / (ends[3] - ends[2])
+        return np.asarray(low * np.minimum(t - x[0], 0.0) + high * np.maximum(t - x[-1], 0.0))
+
+
+def read_curves(section: Node | None) -> dict[int, Curve]:
+    """Load curves by number.
+
+    Raises
+    ------
+    ProblemError
+        For controllers, interpolations and extensions that limbfit does not have.
+    """
+    curves: dict[int, Curve] = {}
+    for node in section or ():
+        number = node.identity()
+        if number in curves:
+            raise node.refuse(f"load controller {number} is there twice")
+        kind = node.attribute("type")
+        if kind == "math":
+            curves[number] = Curve(np.zeros((0, 2)), "MATH", node.line, formula=_formula(node.child("math")))
+        elif kind == "loadcurve":
+            curves[number] = _curve(node)
+        else:
+            raise node.refuse(f"load controllers of type {kind!r} are not supported, only loadcurve and math")
+    return curves
+
+
+def _curve(node: Node) -> Curve:
+    points = np.array([point.numbers(2) for point in node.child("points")]).reshape(-1, 2)
+    if not len(points) or (np.diff(points[:, 0]) <= 0).any():
+        raise node.refuse("a load curve needs points that go forward in time")
+    chosen = {}
+    for tag, known in (("interpolate", INTERPOLATIONS), ("extend", EXTENSIONS)):
+        chosen[tag] = node.string(tag, known[0]).upper()
+        if chosen[tag] not in known:
+            raise node.child(tag).refuse(f"{chosen[tag]!r} is not supported", "use " + ", ".join(known))
+    return Curve(points, chosen["interpolate"], node.line, chosen["extend"])
+
+
+_OPERATORS: dict[type, Callable[[Array, Array], Array]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: np.power,
+}
+_FUNCTIONS: dict[str, Callable[[Array], Array]] = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
+    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp, "ln": np.log, "sqrt": np.sqrt,
+    "abs": np.abs,
+}  # fmt: skip
+
+
+def _formula(node: Node) -> Callable[[Array], Array]:
+    """The expression of the time ``t`` that an element holds; only arithmetic is read, nothing is run."""
+    text = node.text.strip()
+    wrong = f"{text[:40]!r} is no expression of t that limbfit reads"
+    remedy = "use numbers, t, pi, + - * / ^ and " + ", ".join(_FUNCTIONS)
+    if len(text) > LONGEST or "**" in text:
+        raise node.refuse(wrong, remedy)
+    try:
+        tree = ast.parse(text.replace("^", "**"), mode="eval").body
+        _evaluate(tree, np.zeros(1))
+    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
+        raise node.refuse(wrong, remedy) from None
+
+    def value(t: Array) -> Array:
+        with np.errstate(all="ignore"):
+            found = np.asarray(_evaluate(tree, t), dtype=float)
+        if not np.isfinite(found).all():
+            raise node.refuse(f"{text[:40]!r} is not finite at a time of the analysis")
+        return found
+
+    return value
+
+
+def _evaluate(tree: ast.expr, t: Array) -> Array:
+    match tree:
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            return np.asarray(float(number))
+        case ast.Name(id="t"):
+            return t
+        case ast.Name(id="pi"):
+            return np.asarray(np.pi)
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -_evaluate(operand, t)
+        case ast.BinOp(op=ast.Pow(), right=ast.BinOp(op=ast.Pow())):
+            raise ValueError("a power of a power is read from the left by some, from the right by others")
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+            with np.errstate(all="ignore"):
+                return _OPERATORS[type(op)](_evaluate(left, t), _evaluate(right, t))
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
+            with np.errstate(all="ignore"):
+                return _FUNCTIONS[name](_evaluate(argument, t))
+    raise ValueError("not known")
