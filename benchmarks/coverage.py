@@ -6,11 +6,13 @@
 The truth is the study's identified model, on the emulator that ``limbfit uncertainty`` made of its solver.
 Every repeat records the true forces as the robot does (500 Hz, noise of 0.05 N), regularises them as the
 stage ``traces`` does (with the penalty that suits the site best: to find it anew by cross-validation takes
-twenty times as long), calibrates on the emulator, estimates the uncertainty as the stage ``calibrate`` does,
-and samples the posterior as ``limbfit uncertainty`` does (``--steps 0``: not). A touch-down that is off by
-as much as the study states of its own moves each curve. The noise that is left after regularising is
-correlated from point to point. With ``--misfit`` the model is wrong as well: a smooth error of so many
-percent of the largest force, of another shape than the one that the method assumes.
+twenty times as long), calibrates on the emulator, and states intervals as the stage ``calibrate`` does:
+from what it simulated and at most ten further simulations. Linearised intervals stand beside them, and those
+of the posterior on the whole emulator, as ``limbfit uncertainty`` samples it (``--steps 0``: not). The
+touch-down is found in a noisy record with an approach: what it is off by moves the curve, and what is stated
+of it is what the uncertainty knows. The noise that is left after regularising is correlated from point to
+point. With ``--misfit`` the model is wrong as well: a smooth error of so many percent of the largest force,
+of another shape than the one that the method assumes.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 from scipy.linalg import block_diag
 
 from limbfit import load_study
@@ -32,16 +35,17 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify import Emulator, Measured, SiteNoise, SiteResponse, Unknowns, record_noise
 from limbfit.identify.coverage import Coverage, coverage_study
 from limbfit.identify.noise import depth_slope
-from limbfit.phantom.record import RATE_HZ
+from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.context import Context
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.pipeline.stages.calibrate import unknowns
 from limbfit.pipeline.stages.traces import SiteRecord, site_record
 from limbfit.pipeline.store import Store
-from limbfit.traces import Regularised, TouchDown, Trace, regularise
+from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]
 BEFORE_S = 0.3  # in the air
+CLEARANCE_MM = 0.5
 SMOOTHINGS = tuple(10.0**k for k in range(-4, 4))  # s^3
 
 
@@ -49,14 +53,13 @@ SMOOTHINGS = tuple(10.0**k for k in range(-4, 4))  # s^3
 class Robot:
     """Makes records of the true ``forces`` at the sites of a study.
 
-    ``noise_N`` at 500 Hz with ``autocorrelation`` of neighbours; ``touch_down_mm`` (sites,) is the standard
-    deviation of a touch-down, ``smoothing`` (sites,) the penalty on roughness and ``responses``, (n, n) per
-    site, what such smoothing makes of a force; ``misfit`` is the error of the model over the largest force.
+    ``noise_N`` at 500 Hz with ``autocorrelation`` of neighbours; ``smoothing`` (sites,) is the penalty on
+    roughness and ``responses``, (n, n) per site, what such smoothing makes of a force; ``misfit`` is the
+    error of the model over the largest force.
     """
 
     records: tuple[SiteRecord, ...]
     forces: tuple[Array, ...]
-    touch_down_mm: tuple[float, ...]
     smoothing: tuple[float, ...]
     responses: tuple[Array, ...]
     noise_N: float
@@ -67,17 +70,32 @@ class Robot:
     def __call__(self, repeat: int, smoothed: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
         random = np.random.default_rng([self.seed, repeat])
         measured, noise = [], []
-        how = zip(self.touch_down_mm, self.smoothing, self.responses, strict=True)
+        how = zip(self.smoothing, self.responses, strict=True)
         sites = zip(self.records, self.forces, smoothed, how, strict=True)
-        for record, force, answer, (sd, smoothing, response) in sites:
+        for record, force, answer, (smoothing, response) in sites:
             true = force + self._wrong(random, record.times_s, force)
-            true = true + sd * random.standard_normal() * depth_slope(record.displacement_mm, force)
+            off, sd = self._touch_down(random, record, true)
+            true = true + off * depth_slope(record.times_s, record.displacement_mm, force)
             smooth, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
             curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
             measured.append(Measured(record.site.name, curve))
             site = record.site.name, record.times_s, residual, answer, record.displacement_mm, sd
             noise.append(record_noise(*site, response))
         return measured, noise
+
+    def _touch_down(
+        self, random: np.random.Generator, record: SiteRecord, force: Array
+    ) -> tuple[float, float]:
+        """How far the touch-down that is found in a noisy record is off, and what is stated of it, mm."""
+        times, depth = record.times_s, record.displacement_mm
+        speed = float(depth[1] - depth[0]) / float(times[1] - times[0])
+        time = np.arange(-CLEARANCE_MM / speed, times[-1], 1 / RATE_HZ)
+        path = np.where(time < 0, speed * time, np.interp(time, times, depth))
+        # Straight between the points of comparison the onset would have corners that no skin makes.
+        clean = PchipInterpolator(times, force)(np.maximum(time, 0.0))
+        moved = path + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size)
+        touch = find_touch_down(Trace(time, moved, clean + self._noise(random, time.size)))
+        return touch.displacement_mm, touch.uncertainty_mm
 
     def _wrong(self, random: np.random.Generator, times: Array, force: Array) -> Array:
         """A smooth error: a few waves of random phase, from half a wave to three over the record."""
@@ -143,12 +161,10 @@ def study_robot(
     context = Context(study, store, SerialExecutor(), lambda progress: None)
     found = store.read("uncertainty", "uncertainty.json")
     truth = np.array([row["calibrated"] for row in found["parameters"]])
-    traces = store.read("traces", "traces.json")["sites"]
     records = tuple(site_record(context, site) for site in study.fitted)
-    touch = tuple(float(traces[site.name]["touch_down_uncertainty_mm"]) for site in study.fitted)
     emulator = read_emulator(store["uncertainty"] / EMULATOR)
     forces = tuple(response.force_N for response in emulator(truth))
-    robot = Robot(records, forces, touch, (), (), noise_N, autocorrelation, misfit, seed)
+    robot = Robot(records, forces, (), (), noise_N, autocorrelation, misfit, seed)
     smoothing = tuple(best_smoothing(robot, *pair) for pair in zip(records, forces))
     responses = tuple(robot.response(*site) for site in zip(records, forces, smoothing))
     robot = replace(robot, smoothing=smoothing, responses=responses)
@@ -183,7 +199,7 @@ def main() -> None:
     parser.add_argument("study", type=Path)
     parser.add_argument("--repeats", type=int, default=200)
     parser.add_argument(
-        "--steps", type=int, default=1500, help="of the sampler; 0: linearised intervals only"
+        "--steps", type=int, default=1500, help="of the sampler; 0: what every run states only"
     )
     parser.add_argument("--noise", type=float, default=0.05, help="N, standard deviation at 500 Hz")
     parser.add_argument("--autocorrelation", type=float, default=0.0, help="of neighbouring samples")
@@ -201,6 +217,8 @@ def main() -> None:
         "autocorrelation": robot.autocorrelation,
         "misfit_percent": 100 * robot.misfit,
         "estimated_misfit_percent": float(np.median(found.linearised.misfit_percent)),
+        "further_simulations": found.further,
+        "stated": summary(found.stated),
         "linearised": summary(found.linearised),
         "sampled": None if found.sampled is None else summary(found.sampled),
         "cpu_seconds": resource.getrusage(resource.RUSAGE_SELF).ru_utime,

@@ -32,7 +32,7 @@ CUT_MM, NOISE_N, PENALTY_PER_MM = 90.0, 0.05, 150.0
 INDENTER = IndenterTable(width_mm=16.0, edge_radius_mm=4.0)
 TRUE_ELEMENT, TRUE_STEPS = (
     "tet10g8p0",
-    StepControl(load_steps=8, unload_steps=6, penalty=PENALTY_PER_MM, penetration=1.0),
+    StepControl(load_steps=8, unload_steps=6, penalty=PENALTY_PER_MM, hold_penalty=True),
 )
 TRUE_MESH = MeshSettings(edge_near_mm=3.0, edge_far_mm=30.0, near_radius_mm=12.0, growth=0.8, flatness=1.8)
 TRUE_SPACING_MM, STUDY_SPACING_MM = 2.0, 3.5  # at which the surfaces of truth and study are sampled

@@ -283,3 +283,78 @@ def test_impossible_bounds_are_bad_input():
         Unknowns(PAPER.names, PAPER.start, PAPER.lower * [1, 1, 0, 1, 1, 1, 1, 1], PAPER.upper)
     with pytest.raises(ProblemError, match="no parameter is left"):
         search_space(PAPER, (FIXED,) * 8)
+
+
+class Doubtful:
+    """The bars, of which one slips, or folds, in a part of the parameter space: its force is then another."""
+
+    def __init__(self, where, kind: str, factor: float = 1.0):
+        self.where, self.kind, self.factor = where, kind, factor
+        self.asked: list[bool] = []
+
+    def __call__(self, parameters):
+        responses = simulate(parameters)
+        self.asked.append(bool(self.where(parameters)))
+        if self.asked[-1]:
+            force, jacobian = (self.factor * one for one in (responses[1].force_N, responses[1].jacobian))
+            responses[1] = SiteResponse(force, jacobian, **{self.kind: "the force falls"})
+        return responses
+
+    def accepted(self, found) -> list[bool]:
+        return [bool(self.where(np.array(iterate.parameters))) for iterate in found.history]
+
+
+def too_soft(p):
+    """Around the one-material optimum of a record whose second site slips there."""
+    return p[0] < 4.0
+
+
+def test_a_slip_does_not_lure_the_search():
+    """Records as they look where the second bar slips: nearer to them, but another equilibrium's force."""
+    run = Doubtful(too_soft, "slipped", 0.7)
+    record = run(np.tile([3.5, 4.0, 2.5, 0.4], 2))
+    measured = [Measured(f"s{i}", one.force_N) for i, one in enumerate(record)]
+    found = calibrate(run, measured, PAPER, stages=[shared(PAPER.names)])
+    assert any(run.asked[1:])
+    assert not any(run.accepted(found))
+    assert not found.converged
+    assert "s1: the force falls" in found.reason
+
+
+def test_folds_that_the_search_can_keep_away_from_are_refused():
+    """Folds lie on the first long steps only: the answer is the true one."""
+    run = Doubtful(lambda p: p[1] > 8.0 or p[2] > 5.0, "folded")
+    found = calibrate(run, records(), PAPER)
+    assert found.parameters == pytest.approx(TRUTH, rel=1e-2)
+    assert not any(run.accepted(found))
+
+
+def test_an_optimum_is_not_given_up_for_folds():
+    """All around the truth elements fold: three trials of a stage are refused for it, and no more."""
+    run = Doubtful(lambda p: p[0] > 6.0, "folded")
+    found = calibrate(run, records(), PAPER)
+    assert found.converged, found.reason
+    assert found.parameters == pytest.approx(TRUTH, rel=1e-2)
+    assert run.accepted(found)[-1]
+    assert 3 <= found.history[-1].failures <= 6
+    assert found.evaluations < 30
+
+
+@pytest.mark.parametrize("kind", ["slipped", "folded"])
+def test_a_start_in_doubt_is_left_where_it_can_be(kind):
+    run = Doubtful(lambda p: abs(p[0] - 4.7) < 0.01, kind)
+    found = calibrate(run, records(), PAPER)
+    assert found.parameters == pytest.approx(TRUTH, rel=2e-3)
+    everywhere = Doubtful(lambda p: True, kind)
+    assert calibrate(everywhere, records(), PAPER).parameters == pytest.approx(TRUTH, rel=2e-3)
+
+
+def test_a_doubtful_run_taken_up_again_gives_the_same_answer():
+    run = Doubtful(lambda p: p[0] > 6.0, "folded")
+    states = []
+    found = calibrate(run, records(), PAPER, on_iterate=states.append)
+    for state in states[:: max(len(states) // 4, 1)]:
+        stored = State.from_dict(json.loads(json.dumps(state.to_dict())))
+        again = calibrate(run, records(), PAPER, state=stored)
+        assert np.array_equal(again.parameters, found.parameters)
+        assert again.evaluations == found.evaluations

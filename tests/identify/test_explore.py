@@ -34,8 +34,8 @@ def test_an_exploration_spends_its_runs_and_holds_the_truth():
     earlier = [np.array(i.parameters) for i in found.history]
     settings = ExploreSettings(runs=24, batch=4, steps=600, checked=1)
     done = explore(many, data, PAPER, SPACE, known, earlier, settings)
-    # A check asks for the optimum and two ends of a profile.
-    assert len(asked) <= len(earlier) + 24 + 3
+    # A check asks for the optimum and two ends of a profile, the narrowest and the widest.
+    assert len(asked) <= len(earlier) + 24 + 5
     assert done.good_enough
     assert max(done.rounds[-1].error_percent) < min(done.needed_percent)
     inside = [low < true < high for true, (low, high) in zip(TRUTH, done.posterior.intervals_95)]
@@ -111,3 +111,60 @@ def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
     rows = principal_axes(posterior, tied)
     assert rows.shape == (4, TRUTH.size)
     assert rows[:, :4] == pytest.approx(rows[:, 4:])
+
+
+@pytest.fixture(scope="module")
+def vague():
+    """Records that leave some parameters open, and what is found with few runs."""
+    data, found, known = calibrated(noise=0.5)
+
+    def many(points):
+        return [simulate(p) for p in points]
+
+    earlier = [np.array(i.parameters) for i in found.history]
+    settings = ExploreSettings(runs=8, batch=8, steps=200, checked=1)
+    return explore(many, data, PAPER, SPACE, known, earlier, settings)
+
+
+def test_profiles_say_where_they_are_extrapolated(vague):
+    low, high = vague.emulator.lower, vague.emulator.upper
+    for one in vague.profiles:
+        k = NAMES.index(one.name)
+        beyond = (one.values < low[k]) | (one.values > high[k])
+        assert np.all(one.extrapolated[beyond]), one.name
+        for at_bound, end, said in zip((0, 1), one.ends, one.ends_extrapolated):
+            outside = bool(np.any((end < low * (1 - 1e-9)) | (end > high * (1 + 1e-9))))
+            assert said == outside, (one.name, at_bound)
+        assert one.to_dict()["extrapolated"] == one.extrapolated.tolist()
+    ends = [end for one in vague.profiles for end in one.ends_extrapolated]
+    assert any(ends)
+    assert not all(ends)
+    assert any(not all(one.closed) for one in vague.profiles)
+
+
+def test_the_solver_is_asked_at_the_ends_of_the_widest_profile_too(vague):
+    widths = {one.name: one.interval_95[1] / one.interval_95[0] for one in vague.profiles}
+    checks = {check.why: check for check in vague.checks}
+    assert checks["narrowest"].name == min(widths, key=widths.get)
+    assert checks["widest"].name == max(widths, key=widths.get)
+    widest = next(one for one in vague.profiles if one.name == checks["widest"].name)
+    assert checks["widest"].extrapolated == widest.ends_extrapolated
+    assert None not in checks["widest"].solved
+
+
+def test_an_end_that_cannot_be_simulated_is_told():
+    data, found, known = calibrated(noise=0.5)
+
+    def failing(points):
+        runs = [list(simulate(p)) for p in points]
+        if len(points) == 5:  # the optimum and the ends of two profiles
+            last = runs[-1][0]
+            runs[-1][0] = SiteResponse(last.force_N, last.jacobian, False, "stopped")
+        return runs
+
+    earlier = [np.array(i.parameters) for i in found.history]
+    settings = ExploreSettings(runs=8, batch=8, steps=200, checked=1)
+    done = explore(failing, data, PAPER, SPACE, known, earlier, settings)
+    widest = next(check for check in done.checks if check.why == "widest")
+    assert widest.solved[1] is None
+    assert widest.solved[0] is not None

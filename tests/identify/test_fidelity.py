@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from itertools import combinations
+
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, Counted, coarsened, plain, records, simulate
+from bars import PAPER, SITES, TRUTH, coarsened, plain, records, simulate
 
 from limbfit.identify import CalibrationSettings, SiteResponse, calibrate
-from limbfit.identify.fidelity import Anchor, FidelitySettings, calibrate_corrected
+from limbfit.identify.fidelity import FidelitySettings, calibrate_corrected
 
 TIGHT = FidelitySettings(rounds=4, tolerance_percent=0.02)
 
@@ -130,32 +133,60 @@ def test_a_fine_simulation_that_always_fails_is_told():
             SiteResponse(r.force_N, r.jacobian, k != 2, "folded") for k, r in enumerate(plain(parameters))
         ]
 
-    found = calibrate_corrected(coarsened, fails, records(), PAPER).calibration
-    assert not found.converged
-    assert "the fine simulation fails: s2: folded" in found.reason
+    found = calibrate_corrected(coarsened, fails, records(), PAPER)
+    assert not found.calibration.converged
+    assert "the correction fails: s2: fine mesh: folded" in found.calibration.reason
+    json.dumps(found.to_dict(), allow_nan=False)  # as it is stored
+
+
+def too_weak(parameters):
+    """The same forces at the start, from which every change of a parameter has a third of its effect."""
+    damped = PAPER.start * (parameters / PAPER.start) ** (1 / 3)
+    slopes = damped / parameters / 3
+    return [SiteResponse(r.force_N, r.jacobian * slopes) for r in simulate(damped)]
+
+
+def fine_cost(parameters, data):
+    forces = [response.force_N for response in plain(np.array(parameters))]
+    parts = [np.mean(((f - d.force_N) / d.force_N.max()) ** 2) for f, d in zip(forces, data, strict=True)]
+    return float(np.sum(parts))
 
 
 def test_where_the_coarse_model_answers_too_weakly_the_best_corrected_iterate_is_the_answer():
     """A coarse model with a third of the fine one's slope sends the search three times too far."""
-    weak = 1 / 3
-
-    def coarse(parameters):
-        # The same forces at the start, from which every change of a parameter has a third of its effect.
-        damped = PAPER.start * (parameters / PAPER.start) ** weak
-        slopes = weak * damped / parameters
-        return [SiteResponse(r.force_N, r.jacobian * slopes) for r in simulate(damped)]
-
     data, fine = records(0.03), []
-    found = calibrate_corrected(coarse, counting(plain, fine), data, PAPER)
+    found = calibrate_corrected(too_weak, counting(plain, fine), data, PAPER)
 
     def cost(parameters):
-        forces = [response.force_N for response in plain(np.array(parameters))]
-        parts = [np.mean(((f - d.force_N) / d.force_N.max()) ** 2) for f, d in zip(forces, data, strict=True)]
-        return float(np.sum(parts))
+        return fine_cost(parameters, data)
 
     last = [one for one in found.rounds if one.stage == 1]
     assert cost(found.calibration.parameters) == pytest.approx(min(cost(one.parameters) for one in last))
     assert cost(found.calibration.parameters) < 0.2 * cost(found.calibration.stages[0].parameters)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_coarse_simulation_lost_half_way_back_leaves_the_correction_before():
+    """Its forces are zero: an anchor there would be 0/0."""
+    data, fine = records(0.03), []
+
+    def coarse(parameters):
+        between = [(np.log(a) + np.log(b)) / 2 for a, b in combinations(fine, 2)]
+        found = too_weak(parameters)
+        if any(np.allclose(np.log(parameters), middle) for middle in between):
+            return [SiteResponse(0 * r.force_N, 0 * r.jacobian, False, "lost") for r in found]
+        return found
+
+    found = calibrate_corrected(coarse, counting(plain, fine), data, PAPER)
+    failed = [one for one in found.rounds if one.reason]
+    assert failed
+    assert all("s0: coarse mesh: lost" in one.reason for one in failed)
+    assert all(one.scales == one.expected_percent == (None,) * 4 for one in failed)
+    json.dumps(found.to_dict(), allow_nan=False)
+    assert "the correction fails: s0: coarse mesh: lost" in found.calibration.reason
+    whole = [one for one in found.rounds if one.stage == 1 and not one.reason]
+    costs = [fine_cost(one.parameters, data) for one in whole]
+    assert fine_cost(found.calibration.parameters, data) == pytest.approx(min(costs))
 
 
 def test_corrections_that_cannot_settle_are_not_called_converged():
@@ -173,15 +204,6 @@ def test_two_equal_models_need_one_correction_per_stage():
     found = calibrate_corrected(simulate, plain, records(0.03), PAPER, CalibrationSettings())
     assert [one.stage for one in found.rounds][:3] == [-1, 0, 1]
     assert max(found.rounds[0].expected_percent) < 1e-9
-    assert found.anchor.scales == pytest.approx([1.0] * 4)
+    assert found.correction.scales == pytest.approx([1.0] * 4)
     alone = calibrate(simulate, records(0.03), PAPER)
     assert found.calibration.parameters == pytest.approx(alone.parameters, rel=0.02)
-
-
-def test_scale_of_an_anchor_is_the_least_squares_ratio():
-    force = np.array([0.0, 1.0, 2.0, 1.0])
-    anchor = Anchor(TRUTH, (force,), (1.1 * force + np.array([0, 0.1, -0.1, 0.1]),))
-    assert anchor.scales[0] == pytest.approx(1.1)
-    assert anchor.differences_percent[0] == pytest.approx(100 * np.mean([0, 0.2, 0.1, 0.2]) / 2.1)
-    assert len(NAMES) == len(TRUTH)
-    assert Counted(0.0)(TRUTH)[0].completed

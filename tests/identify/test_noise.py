@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.identify.noise import block_covariance, curve_noise, depth_slope, record_noise
+from limbfit.autoregressive import block_covariance
+from limbfit.identify.noise import curve_noise, depth_slope, record_noise
 
 
 def drift(rng, n, lag):
@@ -22,7 +23,15 @@ def test_the_covariance_of_means_is_that_of_sampled_means(lag):
     index = np.arange(n * samples)
     full = lag ** np.abs(index[:, None] - index[None, :])
     average = np.kron(np.eye(n), np.full((1, samples), 1 / samples))
-    assert block_covariance(1.0, lag, samples, n) == pytest.approx(average @ full @ average.T)
+    assert block_covariance(1.0, lag, np.full(n, samples)) == pytest.approx(average @ full @ average.T)
+
+
+def test_the_covariance_of_means_of_unequal_numbers():
+    samples = np.array([3, 10, 1, 6])
+    index = np.arange(samples.sum())
+    full = 0.8 ** np.abs(index[:, None] - index[None, :])
+    average = np.repeat(np.diag(1 / samples), samples, axis=1)
+    assert block_covariance(1.0, 0.8, samples) == pytest.approx(average @ full @ average.T)
 
 
 def test_a_record_tells_its_noise():
@@ -38,7 +47,7 @@ def test_a_record_tells_its_noise():
 def test_a_doubtful_touch_down_moves_the_whole_curve():
     depth = np.r_[np.linspace(0, 4, 20), np.linspace(4, 0, 20)[1:]]
     force = depth**2
-    slope = depth_slope(depth, force)
+    slope = depth_slope(np.arange(39.0), depth, force)
     assert slope == pytest.approx(2 * depth, abs=0.25)
     sure = record_noise("a", np.arange(39.0), np.zeros(400), force, depth)
     doubtful = record_noise("a", np.arange(39.0), np.zeros(400), force, depth, 0.05)
@@ -48,10 +57,43 @@ def test_a_doubtful_touch_down_moves_the_whole_curve():
 def test_a_tissue_that_has_let_go_does_not_feel_the_touch_down():
     depth = np.r_[np.linspace(0, 4, 20), np.linspace(4, 0, 20)[1:]]
     relaxed = np.r_[np.linspace(0, 4, 20) ** 2, np.maximum(np.linspace(4, -2, 20)[1:], 0.0) ** 2]
-    slope = depth_slope(depth, relaxed)
+    slope = depth_slope(np.arange(39.0), depth, relaxed)
     assert (slope[relaxed == 0][1:] == 0).all()
     half = np.r_[relaxed[:20], relaxed[:19][::-1] / 2]
-    assert depth_slope(depth, half)[20:-1] == pytest.approx(slope[1:19][::-1] / 2)
+    assert depth_slope(np.arange(39.0), depth, half)[20:-1] == pytest.approx(slope[1:19][::-1] / 2)
+
+
+@pytest.mark.parametrize("creep_mm", [0.0, 0.006])
+def test_a_creeping_hold_has_the_slope_of_its_depth(creep_mm):
+    """Its own dF/dd is that of relaxation over micrometres: thousands of N/mm."""
+    times = np.r_[np.linspace(0, 2, 20), np.linspace(2, 32, 60)[1:], np.linspace(32, 34, 20)[1:]]
+    depth = np.interp(times, [0, 2, 32, 34], [0, 4, 4 + creep_mm, 0])
+    force = depth**2 * np.where(times <= 2, 1.0, 0.5 + 0.5 * np.exp(-(times - 2)))
+    slope = depth_slope(times, depth, force)
+    held = (times > 2) & (times <= 32)
+    assert slope[held] == pytest.approx(8.0 * force[held] / 16.0, rel=0.06)
+    assert slope[times < 2] == pytest.approx(2 * depth[times < 2], abs=0.25)
+
+
+def test_later_cycles_have_the_slope_of_what_was_new():
+    times = np.linspace(0, 6, 121)
+    depth = np.interp(times, np.arange(7.0), [0, 4, 1, 4, 1, 5, 0])
+    share = np.where(times <= 1, 1.0, 0.8)
+    slope = depth_slope(times, depth, share * depth**2)
+    old = (times > 1) & (depth <= 4)
+    assert slope[old] == pytest.approx(share[old] * 2 * depth[old], abs=0.4)
+    new = (depth > 4.2) & (times < 5)
+    assert slope[new] == pytest.approx(0.8 * 2 * depth[new], rel=0.02)
+
+
+def test_points_that_are_close_share_the_samples():
+    """Half of the points in a tenth of the time have a tenth of the samples."""
+    times = np.r_[np.linspace(0, 1, 20), np.linspace(1, 10, 21)[1:]]
+    depth = np.interp(times, [0, 1, 10], [0, 4, 4])
+    noise = np.random.default_rng(2).standard_normal(5000)
+    sd = np.sqrt(np.diag(record_noise("a", times, noise, depth, depth).covariance))
+    assert sd[5] == pytest.approx(1 / np.sqrt(500 / 19), rel=0.1)
+    assert sd[30] == pytest.approx(1 / np.sqrt(4500 / 20), rel=0.1)
 
 
 def test_scatter_of_a_curve_is_told_from_its_bend():

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CalibrationError, ProblemError
-from .objective import Measured, Objective, Simulate, SiteResponse, check_responses, residuals
+from .objective import Measured, Objective, Simulate, SiteResponse, check_responses, new_doubts, residuals
 from .parameters import Grouping, Space, Unknowns, search_space, two_stages
 from .prediction import error_percent
 from .trust_region import FIRST_RADIUS, Point, Step, minimise
@@ -28,6 +28,8 @@ _RATIOS = (1.0, 0.5, 0.0)  # of the tissues' own starts, put on the start of the
 _PAPER_CHANGE = 0.01
 _PATIENCE = 4  # steps
 _TRIES = 3  # of a simulation that completed before
+EITHER = ("slipped", "folded")
+_FOLDS = 3  # trials of a stage that fold anew are refused; more are taken for what they are
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ class StageResult:
 class State:
     """All that is needed to go on: the current stage, its parameters and trust radius, and what went before.
 
+    ``folds``: trials of the stage that were refused for folded elements.
+
     ``parameters`` are exact: a run taken up again repeats the interrupted one to the last bit.
     """
 
@@ -92,6 +96,7 @@ class State:
     evaluations: int
     history: tuple[Iterate, ...] = ()
     stages: tuple[StageResult, ...] = ()
+    folds: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -106,6 +111,7 @@ class State:
             evaluations=int(content["evaluations"]),
             history=tuple(_iterate(entry) for entry in content["history"]),
             stages=tuple(_stage_result(entry) for entry in content["stages"]),
+            folds=int(content["folds"]),
         )
 
 
@@ -179,7 +185,8 @@ def calibrate(
     ----------
     simulate : from full parameters (p,) to one response per site, in the order of ``measured``. A response
     that
-        is not completed, or not finite, makes the trial step fail: a shorter one is tried.
+        is not completed, or not finite, makes the trial step fail: a shorter one is tried. So does one that
+        slipped where it did not before the step, and the first three of a stage that fold anew.
     measured : the records, at the times at which ``simulate`` gives the force.
     unknowns : names, start and bounds of the full parameters.
     stages : groupings (see ``search_space``), each started from the end of the one before; by default
@@ -239,19 +246,26 @@ class _Run:
         self.settings, self.stages = settings, stages
         self.evaluations = self.failures = 0
         self.failure = ""  # why the last one failed
+        self.folds = 0  # trials of this stage that were refused for what folds in them
+        self._here: tuple[SiteResponse, ...] = ()  # at the last accepted point
         self._responses: dict[bytes, tuple[SiteResponse, ...]] = {}
 
     def space(self, stage: int) -> Space:
         return search_space(self.unknowns, self.stages[stage])
 
-    def evaluate(self, space: Space, z: Array) -> Point | None:
-        """The point at z, simulated unless its responses are at hand; None where a simulation failed."""
+    def evaluate(self, space: Space, z: Array, bear: tuple[str, ...] = ()) -> Point | None:
+        """The point at z, simulated unless its responses are at hand; None where a simulation failed.
+
+        ``bear``: kinds of doubt that are no failure.
+        """
         parameters = space.expand(z)
         responses = self._responses.get(parameters.tobytes())
         if responses is None:
             self.evaluations += 1
             responses = tuple(self.simulate(parameters))
             self.failure = check_responses(responses, self.measured, len(parameters))
+            if not self.failure:
+                self.failure = self._doubt(responses, bear)
             if self.failure:
                 self.failures += 1
                 return None
@@ -263,23 +277,49 @@ class _Run:
         jacobian = np.concatenate([space.pull_back(jacobian, parameters), scale * rows @ space.tie])
         return Point(z, np.concatenate([residual, known]), jacobian)
 
+    def _doubt(self, responses: tuple[SiteResponse, ...], bear: tuple[str, ...]) -> str:
+        """Why a trial counts as failed though it completed, or empty.
+
+        A slip is the force of another equilibrium.  Folds come by and by: long steps into them are refused,
+        but no optimum is given up for them, nor does the search zigzag along their border.
+        """
+        slipped, folded = new_doubts(responses, self._here, self.measured)
+        if slipped and "slipped" not in bear:
+            return slipped
+        if not folded or "folded" in bear or self.folds >= _FOLDS:
+            return ""
+        self.folds += 1
+        return folded
+
     def responses(self, parameters: Array) -> tuple[SiteResponse, ...]:
         return self._responses[parameters.tobytes()]
 
-    def keep_only(self, parameters: Array) -> None:
-        self._responses = {parameters.tobytes(): self.responses(parameters)}
+    def accept(self, parameters: Array) -> None:
+        """Keep the responses of an accepted point alone; what is doubtful there may be so after it."""
+        self._here = self.responses(parameters)
+        self._responses = {parameters.tobytes(): self._here}
 
     def first(self) -> tuple[State, Point]:
-        """The start, or a place between it and the middle of the bounds where all simulations complete."""
+        """The start, or a place between it and the middle of the bounds where all simulations complete.
+
+        One where none slips is preferred; folded elements may be the mesh's doing, and are told.
+        """
         space = self.space(0)
         start, middle = space.reduce(np.log(self.unknowns.start)), (space.lower + space.upper) / 2
+        found: Point | None = None
         for share in _RESTARTS:
-            z = start + share * (middle - start)
-            point = self.evaluate(space, z)
-            if point is not None:
-                state = State(0, tuple(z.tolist()), FIRST_RADIUS, self.evaluations)
-                return replace(state, history=(self.iterate(0, point),)), point
-        raise CalibrationError(f"no simulation completes near the start parameters: {self.failure}")
+            point = self.evaluate(space, start + share * (middle - start), EITHER)
+            if point is None:
+                continue
+            if not any(one.slipped for one in self.responses(space.expand(point.z))):
+                found = point
+                break
+            found = found or point
+        if found is None:
+            raise CalibrationError(f"no simulation completes near the start parameters: {self.failure}")
+        self.accept(space.expand(found.z))
+        state = State(0, tuple(found.z.tolist()), FIRST_RADIUS, self.evaluations)
+        return replace(state, history=(self.iterate(0, found),)), found
 
     def iterate(self, stage: int, point: Point) -> Iterate:
         parameters = self.space(stage).expand(point.z)
@@ -298,7 +338,7 @@ class _Run:
             steps = () if len(state.stages) > state.stage else self._steps(space, point, state)
             for step in steps:
                 point = step.point
-                self.keep_only(space.expand(point.z))
+                self.accept(space.expand(point.z))
                 state = self._after(state, step)
                 yield state
             if len(state.stages) == len(self.stages):
@@ -310,9 +350,11 @@ class _Run:
         """The point at which a run was interrupted; its evaluation was counted then."""
         space = self.space(state.stage)
         for _ in range(_TRIES):
-            point = self.evaluate(space, np.array(state.z))
+            point = self.evaluate(space, np.array(state.z), EITHER)
             self.evaluations, self.failures = state.evaluations, state.history[-1].failures
             if point is not None:
+                self.accept(space.expand(point.z))
+                self.folds = state.folds
                 return point
         raise CalibrationError(f"the simulation of the stored iterate fails now: {self.failure}")
 
@@ -344,8 +386,9 @@ class _Run:
             counted = self.evaluations - sum(stage.evaluations for stage in stages)
             stages = (*stages, self._stage_result(state.stage, mine, counted, step))
         return State(
-            state.stage, tuple(step.point.z.tolist()), step.radius, self.evaluations, history, stages
-        )
+            state.stage, tuple(step.point.z.tolist()), step.radius, self.evaluations, history, stages,
+            self.folds,
+        )  # fmt: skip
 
     def _stage_result(self, stage: int, mine: list[Iterate], counted: int, step: Step) -> StageResult:
         last = mine[-1]
@@ -366,11 +409,13 @@ class _Run:
         own[np.abs(own) < 1e-12] = 0.0  # rounding of the mean must not cost a simulation
         for share in _RATIOS if own.any() else (0.0,):
             z = space.reduce(logarithms + share * own)
-            point = self.evaluate(space, z)
+            point = self.evaluate(space, z, ("folded",) if share else EITHER)
             if point is not None:
+                self.accept(space.expand(z))
                 break
         else:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
+        self.folds = 0
         history = (*state.history, self.iterate(stage, point))
         return State(stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages), point
 

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from scipy.special import bdtr
 
 from .calibration import CalibrationSettings, calibrate
+from .intervals import Kept, restated, sampled_uncertainty
 from .likelihood import Likelihood, StandIn
 from .noise import SiteNoise
 from .objective import Measured
 from .parameters import Unknowns, search_space, separate
-from .posterior import Posterior, principal_axes, sample_posterior
-from .uncertainty import DETERMINED, Uncertainty, estimate_uncertainty, verdict_of
+from .posterior import Posterior, sample_posterior
+from .uncertainty import DETERMINED, Uncertainty, estimate_uncertainty
 
 Array = NDArray[np.float64]
 
@@ -62,10 +63,17 @@ class Coverage:
 
 @dataclass(frozen=True)
 class CoverageStudy:
-    """Of the linearised intervals of a calibration, and of those sampled from the posterior, if they were."""
+    """Of the intervals that a calibration states, and of two others.
 
+    ``linearised`` ones are of the answer alone; ``sampled`` ones, if they were, of the posterior on the model
+    itself, as if the emulator knew all of it. ``further`` is how many simulations of single sites were made
+    after the calibration, on average.
+    """
+
+    stated: Coverage
     linearised: Coverage
     sampled: Coverage | None
+    further: float
 
 
 # Of one repeat: deviations (k,), what is determined (k,), and whether each parameter is held (p,).
@@ -78,23 +86,39 @@ def coverage_study(
     """Calibrate and judge ``repeats`` records of the forces at ``truth`` (p,), each with noise of its own.
 
     Each calibration starts about a tenth off the truth.
-    Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty``, and
-    with ``steps`` of the sampler the posterior around it.
+    Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty`` and
+    ``sampled_uncertainty`` with what was simulated, and with ``steps`` of the sampler the posterior on the
+    model itself.
     """
     clean = [response.force_N for response in simulate(truth)]
     settings = CalibrationSettings(relative_tolerance=1e-4, max_iterations=60)
-    linear, sampled, misfit = [], [], []
+    stages = (separate(unknowns.names),)
+    space = search_space(unknowns, stages[0])
+    linear, stated, sampled, misfit, further = [], [], [], [], []
     for repeat in range(repeats):
         measured, noise = record(repeat, clean)
         off_truth = np.random.default_rng(repeat).normal(0.0, _START_SD, truth.size)
         start = unknowns.from_start(truth * np.exp(off_truth))
-        found = calibrate(simulate, measured, start, settings, stages=(separate(unknowns.names),))
-        u = estimate_uncertainty(found.parameters, found.responses, measured, unknowns, noise)
-        linear.append(_linearised(u, truth))
+        kept = Kept()
+        found = calibrate(kept.of(simulate), measured, start, settings, stages=stages)
+        u = estimate_uncertainty(
+            found.parameters, found.responses, measured, unknowns, noise, settings=settings
+        )
+        linear.append(_judged(u, truth))
+        asked = Kept()
+        ours = sampled_uncertainty(u, measured, unknowns, space, kept, asked.of(simulate))
+        stated.append(_judged(ours, truth))
+        further.append(len(asked.points) * len(measured))
         misfit.append(100 * u.residual_model.misfit_elsewhere)
         if steps:
-            sampled.append(_sampled(_posterior(simulate, measured, u, unknowns, steps), unknowns, truth))
-    return CoverageStudy(_coverage(linear, misfit), _coverage(sampled, misfit) if steps else None)
+            draws = _posterior(simulate, measured, u, unknowns, steps)
+            sampled.append(_judged(restated(u, draws, unknowns, space), truth))
+    return CoverageStudy(
+        _coverage(stated, misfit),
+        _coverage(linear, misfit),
+        _coverage(sampled, misfit) if steps else None,
+        float(np.mean(further)),
+    )
 
 
 def _coverage(judged: Sequence[Judged], misfit_percent: Sequence[float]) -> Coverage:
@@ -102,9 +126,10 @@ def _coverage(judged: Sequence[Judged], misfit_percent: Sequence[float]) -> Cove
     return Coverage(deviations, determined, held, np.array(misfit_percent))
 
 
-def _linearised(known: Uncertainty, truth: Array) -> Judged:
-    off = np.log(known.parameters / truth)
-    deviations = [c.weights @ off / np.log(c.factor_95) for c in known.combinations]
+def _judged(known: Uncertainty, truth: Array) -> Judged:
+    deviations = [
+        (c.middle_log - c.weights @ np.log(truth)) / np.log(c.factor_95) for c in known.combinations
+    ]
     low, high = known.intervals_95.T
     determined = [c.verdict == DETERMINED for c in known.combinations]
     return np.array(deviations), np.array(determined), (low <= truth) & (truth <= high)
@@ -118,16 +143,3 @@ def _posterior(
     likelihood = Likelihood(simulate, measured, known.residual_model, unknowns, space)
     best = likelihood.best((known.parameters, known.centre))
     return sample_posterior(likelihood, best.z, likelihood.covariance(best.z), steps=steps)
-
-
-def _sampled(posterior: Posterior, unknowns: Unknowns, truth: Array) -> Judged:
-    axes = principal_axes(posterior, search_space(unknowns, separate(unknowns.names)))
-    drawn = np.log(posterior.draws) @ axes.T
-    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
-    half = (high - low) / 2
-    prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
-    shares = drawn.std(axis=0) / np.linalg.norm(axes * prior_sd, axis=1)
-    determined = [verdict_of(float(np.exp(h)), s) == DETERMINED for h, s in zip(half, shares)]
-    least, most = posterior.intervals_95.T
-    off = ((high + low) / 2 - axes @ np.log(truth)) / half
-    return off, np.array(determined), (least <= truth) & (truth <= most)

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 _LENGTHS = (1.0, 2.0, 4.0, 8.0)  # of the kernel, in half-widths of the points
 _NUGGETS = (1e-9, 1e-7, 1e-5)  # variance that the solver's own tolerances add, over that of the kernel
 _TRUSTED_CONDITION = 1e6
+_ROUNDING = 1e-9  # of half a width: runs and questions may both lie on a bound
 _SMALLEST_WIDTH = 0.02  # of the points, in the logarithm
 
 
@@ -130,17 +131,24 @@ class Emulator:
         rows = _cross(at, self._unit, self.length, self._quadratic, 0)
         return self._soft * np.sinh(rows @ self._weights)
 
+    def forces_and_doubt(self, parameters: Array) -> tuple[Array, Array]:
+        """``forces`` (m, N), and the emulator's own expected error there: one sd (m, sites) in N."""
+        at = self._to_unit(np.atleast_2d(parameters))
+        rows = _cross(at, self._unit, self.length, self._quadratic, 0)
+        force = self._soft * np.sinh(rows @ self._weights)
+        variance = np.maximum(1.0 - np.einsum("mi,mi->m", rows @ self._inverse, rows), 0.0)
+        spread = self._spread * np.hypot(force, self._soft)
+        sd = np.stack([spread[:, s].mean(axis=1) for s in self._sites], axis=1)
+        return force, np.sqrt(variance)[:, None] * sd
+
     def error_percent(self, parameters: Array) -> Array:
         """Expected error of the emulator itself (sites,), in percent of the largest force: one sd."""
-        row = _cross(self._to_unit(np.asarray(parameters)), self._unit, self.length, self._quadratic, 0)[0]
-        variance = max(1.0 - float(row @ self._inverse @ row), 0.0)
-        force = self.forces(parameters)[0]
-        sd = np.sqrt(variance) * self._spread * np.hypot(force, self._soft)
-        return np.array([100 * sd[s].mean() / max(force[s].max(), 1e-12) for s in self._sites])
+        force, doubt = (found[0] for found in self.forces_and_doubt(np.asarray(parameters)))
+        return np.array([100 * sd / max(force[s].max(), 1e-12) for sd, s in zip(doubt, self._sites)])
 
     def inside(self, parameters: Array, margin: float = 0.1) -> bool:
         """Whether the parameters (p,) lie in the box of the points, widened by a share of its width."""
-        return bool(np.all(np.abs(self._to_unit(np.asarray(parameters))) <= 1 + 2 * margin))
+        return bool(np.all(np.abs(self._to_unit(np.asarray(parameters))) <= 1 + 2 * margin + _ROUNDING))
 
     def check(self, parameters: Array, responses: Sequence[SiteResponse]) -> Array:
         """Error (sites,) of the emulated force at a simulation that it may not know, in percent."""

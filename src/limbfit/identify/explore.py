@@ -19,7 +19,7 @@ from .likelihood import Likelihood, Optimum
 from .objective import Measured, SiteResponse
 from .parameters import Space, Unknowns
 from .posterior import Posterior, sample_posterior
-from .profile import EndCheck, Profile, check_ends, profile
+from .profile import EndCheck, Profile, check_ends, chosen_for_checks, profile
 from .uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ _QUANTILE = 0.9  # of those errors
 class ExploreSettings:
     """``runs`` more simulations of all sites at most, ``batch`` of them in a round; ``steps`` of the sampler.
 
-    ``checked`` profiles have their ends simulated.
+    Of the ``checked`` narrowest profiles and, beside them, the widest the ends are simulated.
     """
 
     runs: int = 24
@@ -219,7 +219,8 @@ class _Exploration:
         profiles = []
         for k in range(len(sd)):
             self.tell(f"profile {k + 1} of {len(sd)}")
-            profiles.append(profile(self.likelihood, self.best, k, float(sd[k]), float(freedom[k])))
+            of = self.likelihood, self.best, k, float(sd[k]), float(freedom[k])
+            profiles.append(profile(*of, inside=lambda p: self.emulator.inside(p, margin=0.0)))
         return Explored(
             emulator=self.emulator,
             likelihood=self.likelihood,
@@ -234,22 +235,20 @@ class _Exploration:
         )
 
     def _checks(self, profiles: Sequence[Profile]) -> tuple[EndCheck, ...]:
-        """The solver's word at the ends of the narrowest profiles: on those the verdict rests."""
-        order = sorted(profiles, key=lambda one: np.log(one.interval_95[1] / one.interval_95[0]))
-        chosen = order[: self.settings.checked]
+        """The solver's word at the ends of profiles."""
+        chosen = chosen_for_checks(profiles, self.settings.checked)
         if not chosen:
             return ()
         self.tell("checking the ends of profiles with the solver")
-        wanted = [self.best.parameters, *(end for one in chosen for end in one.ends)]
-        found = list(self.simulate(wanted))
-        if not all(r.completed for r in found[0]):
+        wanted = [self.best.parameters, *(end for _, one in chosen for end in one.ends)]
+        at_best, *found = self.simulate(wanted)
+        if not all(r.completed for r in at_best):
             return ()
-        checks = []
-        for i, one in enumerate(chosen):
-            pair = found[1 + 2 * i : 3 + 2 * i]
-            if all(r.completed for run in pair for r in run):
-                checks.append(check_ends(self.likelihood, self.best, found[0], one, pair))
-        return tuple(checks)
+        pairs = zip(found[::2], found[1::2], strict=True)
+        return tuple(
+            check_ends(self.likelihood, self.best, at_best, one, pair, why)
+            for (why, one), pair in zip(chosen, pairs, strict=True)
+        )
 
 
 def _tuple(values: Array) -> tuple[float, ...]:

@@ -1,10 +1,7 @@
 """Coarse to fine: calibrate on cheap simulations whose forces are corrected by a few dear ones.
 
-``F(p) = F_fine(a) + s (F_coarse(p) - F_coarse(a))`` per site, with the anchor ``a`` and the scalar ``s`` that
-takes the coarse curve there to the fine one in least squares: exact in value at the anchor, scaled in slope
-(space mapping with a zero-order output map: Bandler 2004; the scaled slope is that of manifold mapping with
-one singular direction: Echeverria and Hemker 2005). Anchored anew at each optimum, the end of the iteration
-fits the fine forces themselves; only its derivatives are the coarse ones, scaled.
+The correction (:class:`CoarseToFine`) is anchored anew at each optimum: the end of the iteration fits the
+fine forces themselves; only its derivatives are the coarse ones, scaled.
 """
 
 from __future__ import annotations
@@ -25,7 +22,8 @@ from .calibration import (
     calibrate,
     iterate_at,
 )
-from .objective import Measured, Simulate, SiteResponse, check_responses
+from .correction import CoarseToFine
+from .objective import Measured, Simulate, SiteResponse, check_responses, new_doubts
 from .parameters import Grouping, Unknowns, search_space, two_stages
 from .trust_region import FIRST_RADIUS
 
@@ -37,48 +35,25 @@ _TRIES = 3  # of the fine simulations of a correction
 
 
 @dataclass(frozen=True)
-class Anchor:
-    """Where coarse and fine forces are both known: parameters (p,), forces (n,) per site, in N."""
-
-    parameters: Array
-    coarse: tuple[Array, ...]
-    fine: tuple[Array, ...]
-
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """Per site the factor that takes the coarse curve to the fine one."""
-        return tuple(float(f @ c / (c @ c)) for f, c in zip(self.fine, self.coarse))
-
-    @property
-    def differences_percent(self) -> tuple[float, ...]:
-        """Mean absolute difference of fine and coarse force, in percent of the largest fine one, per site."""
-        return tuple(
-            float(100 * np.mean(np.abs(f - c)) / np.max(np.abs(f))) for f, c in zip(self.fine, self.coarse)
-        )
-
-
-def corrected(response: SiteResponse, coarse_N: Array, fine_N: Array, scale: float) -> SiteResponse:
-    """A coarse response (force and derivatives) brought to the fine one of an anchor."""
-    if not response.completed:
-        return response
-    force = fine_N + scale * (response.force_N - coarse_N)
-    return replace(response, force_N=force, jacobian=scale * response.jacobian)
-
-
-@dataclass(frozen=True)
 class Round:
     """One correction: the stage (-1: before any), its anchor, how far fine forces were from the expected.
 
     ``expected_percent``: mean absolute difference of the fine forces from the corrected coarse ones, in
-    percent of the largest, per site; nan where the fine simulation failed, and then ``reason`` says why.
+    percent of the largest, per site. Sites that could not be corrected have None; ``reason`` says why, and
+    then the correction before stands.
     """
 
     stage: int
     parameters: tuple[float, ...]
-    scales: tuple[float, ...]
-    difference_percent: tuple[float, ...]
-    expected_percent: tuple[float, ...]
+    scales: tuple[float | None, ...]
+    difference_percent: tuple[float | None, ...]
+    expected_percent: tuple[float | None, ...]
     reason: str = ""
+
+    def settles(self, allowed_percent: float) -> bool:
+        """Whether every site was corrected, and came out as expected."""
+        known = [one for one in self.expected_percent if one is not None]
+        return not self.reason and max(known, default=0.0) <= allowed_percent
 
 
 @dataclass(frozen=True)
@@ -95,7 +70,7 @@ class _Model:
     """The corrected coarse model; remembers coarse responses, which the anchors need again."""
 
     coarse: Simulate
-    anchor: Anchor | None = None
+    correction: CoarseToFine | None = None
     _known: dict[bytes, tuple[SiteResponse, ...]] = field(default_factory=dict)
 
     def plain(self, parameters: Array) -> tuple[SiteResponse, ...]:
@@ -104,12 +79,9 @@ class _Model:
             self._known[key] = tuple(self.coarse(parameters))
         return self._known[key]
 
-    def __call__(self, parameters: Array) -> tuple[SiteResponse, ...]:
+    def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
         responses = self.plain(parameters)
-        if self.anchor is None:
-            return responses
-        parts = zip(responses, self.anchor.coarse, self.anchor.fine, self.anchor.scales, strict=True)
-        return tuple(corrected(*part) for part in parts)
+        return responses if self.correction is None else self.correction(responses)
 
 
 @dataclass(frozen=True)
@@ -118,7 +90,7 @@ class Corrected:
 
     calibration: Calibration
     rounds: tuple[Round, ...]
-    anchor: Anchor | None
+    correction: CoarseToFine | None
 
     def to_dict(self) -> dict[str, Any]:
         return {"rounds": [vars(one) for one in self.rounds]}
@@ -179,7 +151,7 @@ class _Standing:
 
     state: State
     iterate: Iterate
-    anchor: Anchor
+    correction: CoarseToFine
 
     @property
     def cost(self) -> float:
@@ -221,12 +193,12 @@ class _Outer:
         for number in range(self.fidelity.rounds):
             inner = self._inner(stage, _LOOSE if number == 0 or not is_last else 1.0)
             reached = self._correct(stage)
-            settled = not reached.reason and max(reached.expected_percent) <= allowed
+            settled = reached.settles(allowed)
             if best is not None and not reached.reason and not settled and self._cost() > best.cost:
                 self._go_half_way_back(stage, best)
                 reached = self._correct(stage)
             if reached.reason:
-                reason = f"the fine simulation fails: {reached.reason}"
+                reason = f"the correction fails: {reached.reason}"
                 break
             if best is None or self._cost() < best.cost:
                 best = self._standing()
@@ -274,12 +246,12 @@ class _Outer:
 
     def _standing(self) -> _Standing:
         assert self.state is not None
-        assert self.model.anchor is not None
-        return _Standing(self.state, self.history[-1], self.model.anchor)
+        assert self.model.correction is not None
+        return _Standing(self.state, self.history[-1], self.model.correction)
 
     def _return_to(self, best: _Standing) -> None:
         assert self.state is not None
-        self.model.anchor = best.anchor
+        self.model.correction = best.correction
         here = replace(best.iterate, evaluations=self.state.evaluations)
         self.history = (*self.history, here)
         self.state = replace(best.state, history=(here,))
@@ -306,29 +278,26 @@ class _Outer:
 
     def _anchor(self, stage: int, parameters: Array) -> Round:
         """Simulate the fine forces, and correct the model by them unless that fails."""
-        expected = [response.force_N for response in self.model(parameters)]
+        expected, coarse = self.model(parameters), self.model.plain(parameters)
         for _ in range(_TRIES):
-            responses = self.fine(parameters)
-            reason = check_responses(responses, self.measured, 0)
-            if not reason:
+            fine = self.fine(parameters)
+            if all(response.completed for response in fine):
                 break
-        anchor = Anchor(
-            parameters,
-            tuple(response.force_N for response in self.model.plain(parameters)),
-            tuple(response.force_N for response in responses),
-        )
-        nothing = tuple(float("nan") for _ in self.measured)
+        correction = CoarseToFine(coarse, fine)
+        reasons = [f"{m.name}: {text}" for m, text in zip(self.measured, correction.reasons) if text]
+        slipped, _ = new_doubts(fine, coarse, self.measured)
+        reasons += [slipped] if slipped else []
         found = Round(
             stage,
             tuple(parameters.tolist()),
-            nothing if reason else anchor.scales,
-            nothing if reason else anchor.differences_percent,
-            nothing if reason else replace(anchor, coarse=tuple(expected)).differences_percent,
-            reason,
+            correction.scales,
+            correction.differences_percent,
+            CoarseToFine(expected, fine).differences_percent,
+            "; ".join(reasons),
         )
         self.rounds = (*self.rounds, found)
-        if not reason:
-            self.model.anchor = anchor
+        if not reasons:
+            self.model.correction = correction
         return found
 
     def result(self) -> Corrected:
@@ -342,6 +311,6 @@ class _Outer:
             history=self.history,
             evaluations=self.state.evaluations,
             settings=self.settings,
-            responses=self.model(parameters),
+            responses=tuple(self.model(parameters)),
         )
-        return Corrected(calibration, self.rounds, self.model.anchor)
+        return Corrected(calibration, self.rounds, self.model.correction)

@@ -6,8 +6,8 @@ an unknown of its own: a factor on all misfits, 1 where it was estimated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -37,6 +37,10 @@ class StandIn(Protocol):
         ...
 
 
+Doubting = Callable[[Array], tuple[Array, Array]]
+_LEAST_MISFIT = 1e-7  # over the largest force: much less than any noise
+
+
 @dataclass(frozen=True)
 class Optimum:
     """The most probable z (k,) of a space: ``parameters`` (p,), ``minus_2_log`` of the likelihood there."""
@@ -50,6 +54,8 @@ class Likelihood:
     """The records' likelihood over a search space, with the emulator in place of the solver.
 
     Coordinates ``z`` (k,) are those of ``space``. Stated priors of ``unknowns`` count as data; bounds hold.
+    ``doubting`` gives forces (m, N) and their expected error (m, sites), one sd in N, at parameters (m, p):
+    it counts as misfit that grows away from what was simulated (Kennedy and O'Hagan 2001).
     """
 
     def __init__(
@@ -59,23 +65,34 @@ class Likelihood:
         model: ResidualModel,
         unknowns: Unknowns,
         space: Space,
+        doubting: Doubting | None = None,
     ) -> None:
+        self.doubting = doubting
+        if doubting is not None:  # an expected error has the shape of misfit, which none would not have
+            model = replace(model, misfit=np.maximum(model.misfit, _LEAST_MISFIT))
         self.emulator, self.measured, self.model = emulator, tuple(measured), model
         self.unknowns, self.space = unknowns, space
         spectra = model.spectra()
         sizes = np.cumsum([0, *(len(s.values) for s in spectra)])
-        self._transform = np.zeros((sizes[-1], sizes[-1]))
-        for spectrum, a, b in zip(spectra, sizes[:-1], sizes[1:]):
-            self._transform[a:b, a:b] = spectrum.transform
+        self._sites = tuple(
+            (spectrum.transform, slice(a, b)) for spectrum, a, b in zip(spectra, sizes[:-1], sizes[1:])
+        )
         self._misfit = np.concatenate([s.values for s in spectra])
+        self._site = np.repeat(np.arange(len(spectra)), np.diff(sizes))
+        unit = model.misfit * model.peaks_N if doubting is not None else np.ones(len(spectra))
+        self._per_N2 = self._misfit / unit[self._site] ** 2
         self._constant = sum(s.log_determinant for s in spectra) + sizes[-1] * np.log(2 * np.pi)
-        self._target = self._transform @ np.concatenate([site.force_N for site in measured])
+        self._target = self._whiten(np.concatenate([site.force_N for site in measured]))
         self._rows, self._known = unknowns.prior_rows()
 
     @property
     def has_misfit(self) -> bool:
         """Whether the size of the misfit makes any difference."""
         return bool(self._misfit.max(initial=0.0) > 1e-6)
+
+    def _whiten(self, forces: Array) -> Array:
+        """Forces of all sites (N, ...) where noise has variance 1 and misfit is diagonal."""
+        return np.concatenate([transform @ forces[where] for transform, where in self._sites])
 
     def parameters(self, z: Array) -> Array:
         """The full parameters (m, p) at z (m, k)."""
@@ -88,8 +105,13 @@ class Likelihood:
         """
         z = np.atleast_2d(z)
         p = self.parameters(z)
-        residual = self.emulator.forces(p) @ self._transform.T - self._target
+        if self.doubting is None:
+            forces, doubt = self.emulator.forces(p), np.zeros((1, len(self.measured)))
+        else:
+            forces, doubt = self.doubting(p)
+        residual = self._whiten(forces.T).T - self._target
         variances = 1.0 + np.atleast_1d(factor)[:, None] ** 2 * self._misfit
+        variances = variances + doubt[:, self._site] ** 2 * self._per_N2
         beliefs = np.log(p) @ self._rows.T - self._known
         found = np.sum(residual**2 / variances + np.log(variances), axis=1) + np.sum(beliefs**2, axis=1)
         found = np.where(np.isfinite(found), found, np.inf) + self._constant
@@ -99,7 +121,7 @@ class Likelihood:
     def at_responses(self, responses: Sequence[SiteResponse], parameters: Array) -> float:
         """The same with the forces of the solver, to check the emulator by."""
         forces = np.concatenate([response.force_N for response in responses])
-        residual = self._transform @ forces - self._target
+        residual = self._whiten(forces) - self._target
         variances = 1.0 + self._misfit
         beliefs = self._rows @ np.log(parameters) - self._known
         return float(np.sum(residual**2 / variances + np.log(variances)) + beliefs @ beliefs + self._constant)
@@ -113,9 +135,9 @@ class Likelihood:
         slopes = np.concatenate([self.space.pull_back(r.jacobian, parameters) for r in responses])
         if not (np.isfinite(forces).all() and np.isfinite(slopes).all()):
             return None
-        residual = (self._transform @ forces - self._target) / sd
+        residual = (self._whiten(forces) - self._target) / sd
         beliefs = self._rows @ np.log(parameters) - self._known
-        jacobian = np.concatenate([self._transform @ slopes / sd[:, None], self._rows @ self.space.tie])
+        jacobian = np.concatenate([self._whiten(slopes) / sd[:, None], self._rows @ self.space.tie])
         return Point(z, np.concatenate([residual, beliefs]), jacobian)
 
     def optimum(self, start: Array, held: int | None = None, factor: float = 1.0) -> Optimum:

@@ -1,7 +1,7 @@
 """What a record adds to the force: sensor noise as its own scatter shows it, and the doubt about touch-down.
 
 The forces compared are a smoothed record at a few points. Slow noise passes the smoothing unchanged, fast
-noise does not. So the compared points are given the covariance that means of the same number of samples have,
+noise does not. So the compared points are given the covariance that means of their share of the samples have,
 which keeps what the smoothing keeps and claims no knowledge of what it removed.
 """
 
@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import toeplitz
+
+from ..autoregressive import block_covariance, lag_one
+from ..phases import find_phases
 
 Array = NDArray[np.float64]
 
 _LEAST_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
-_MOST_CORRELATED = 0.999
 
 
 @dataclass(frozen=True)
@@ -53,13 +54,14 @@ def record_noise(
     smoothing : (n, n) of the curve, which that slope passes too; by default none.
     """
     residual = residual_N - residual_N.mean()
-    n, sd = len(times_s), float(residual.std())
-    lag = _lag_one(residual)
-    samples = max(round(residual.size / n), 1)
-    slope = touch_down_sd_mm * depth_slope(displacement_mm, force_N)
+    sd = float(residual.std())
+    lag = lag_one(residual)
+    samples = _samples_of_points(times_s, residual.size)
+    slope = touch_down_sd_mm * depth_slope(times_s, displacement_mm, force_N)
     slope = slope if smoothing is None else smoothing @ slope
     floor = (_LEAST_SHARE * force_N.max()) ** 2
-    covariance = block_covariance(sd, lag, samples, n) + np.outer(slope, slope) + floor * np.eye(n)
+    covariance = block_covariance(sd, lag, samples) + np.outer(slope, slope)
+    covariance += floor * np.eye(len(times_s))
     return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm)
 
 
@@ -74,32 +76,33 @@ def curve_noise(name: str, times_s: Array, residual_N: Array, force_N: Array) ->
     return SiteNoise(name, times_s, sd**2 * np.eye(len(times_s)), sd, 0.0)
 
 
-def block_covariance(sd: float, autocorrelation: float, samples: int, n: int) -> Array:
-    """Covariance (n, n) of means of ``samples`` neighbours of a first-order autoregressive noise."""
-    lags = np.arange(samples)
-    powers = autocorrelation**lags
-    own = (samples + 2 * float(((samples - lags) * powers)[1:].sum())) / samples**2
-    # Sum over a in one block, b in the next but j: powers that factor into two geometric sums.
-    between = autocorrelation * (float(powers.sum()) / samples) ** 2
-    row = np.r_[own, between * autocorrelation ** (samples * np.arange(n - 1, dtype=float))]
-    return sd**2 * toeplitz(row)
+def _samples_of_points(times_s: Array, samples: int) -> NDArray[np.int64]:
+    """How many of the samples (n,) belong to each point: its share of the time, and one at least."""
+    steps = np.diff(times_s)
+    widths = np.r_[steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]]
+    return np.maximum(np.round(samples * widths / widths.sum()).astype(np.int64), 1)
 
 
-def depth_slope(displacement_mm: Array, force_N: Array) -> Array:
+def depth_slope(times_s: Array, displacement_mm: Array, force_N: Array) -> Array:
     """dF/dd (n,) N/mm at every point.
 
-    On the way out it is that of the same depth on the way in, as much smaller as the force is, and none where
-    the tissue has let go.
+    Where the indenter goes deeper than before it is the slope of the curve itself. In a hold, on the way out
+    and in later cycles it is that of the same depth when it was new, as much smaller as the force is, and
+    none where the tissue has let go.
     """
-    top = int(np.argmax(displacement_mm)) + 1
-    depth, force = displacement_mm[:top], force_N[:top]
-    slope = np.interp(displacement_mm, depth, np.gradient(force, depth))
-    entering = np.interp(displacement_mm, depth, force)
+    slope, new = np.zeros_like(force_N), np.zeros(len(force_N), dtype=bool)
+    deepest = -np.inf
+    for phase in find_phases(times_s, displacement_mm):
+        inside = np.flatnonzero((times_s >= phase.start_s) & (times_s <= phase.end_s))
+        so_far = np.maximum.accumulate(displacement_mm[inside])
+        inside = inside[displacement_mm[inside] > np.r_[-np.inf, so_far[:-1]]]
+        if phase.kind != "load" or len(inside) < 2:
+            continue
+        rising = np.gradient(force_N[inside], displacement_mm[inside])
+        deeper = displacement_mm[inside] > deepest
+        slope[inside[deeper]], new[inside[deeper]] = rising[deeper], True
+        deepest = max(deepest, float(displacement_mm[inside[-1]]))
+    depth = displacement_mm[new]
+    entering = np.interp(displacement_mm, depth, force_N[new])
     share = np.clip(force_N / np.maximum(entering, 1e-6 * force_N.max()), 0.0, 1.0)
-    return np.where(np.arange(len(slope)) < top, slope, share * slope)
-
-
-def _lag_one(residual: Array) -> float:
-    squares = float(residual @ residual)
-    lag = float(residual[1:] @ residual[:-1]) / squares if squares > 0 else 0.0
-    return float(np.clip(lag, 0.0, _MOST_CORRELATED))
+    return np.where(new, slope, share * np.interp(displacement_mm, depth, slope[new]))

@@ -19,6 +19,8 @@ from ..errors import CalibrationError, TraceError
 Array = NDArray[np.float64]
 Objective = Literal["pointwise", "paper"]
 
+_EXACT = 1e-4  # of the largest force: where all residuals vanish, equation 8 squared has no curvature
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -40,12 +42,21 @@ class Measured:
 
 @dataclass(frozen=True)
 class SiteResponse:
-    """What a simulation gives: force (n,) N and its derivatives (n, p); ``reason`` where it failed."""
+    """What a simulation gives: force (n,) N and its derivatives (n, p); ``reason`` where it failed.
+
+    ``site``: its name, where it is known; ``doubts``: what is doubtful about a completed one, among it why it
+    ``slipped`` or ``folded``, or empty.  One that slipped has lost its equilibrium, and its force is that of
+    another one; one with folded elements has lost stiffness by and by.
+    """
 
     force_N: Array
     jacobian: Array
     completed: bool = True
     reason: str = ""
+    site: str = ""
+    doubts: tuple[str, ...] = ()
+    slipped: str = ""
+    folded: str = ""
 
 
 Simulate = Callable[[Array], Sequence[SiteResponse]]
@@ -72,6 +83,20 @@ def check_responses(responses: Sequence[SiteResponse], measured: Sequence[Measur
     return ""
 
 
+def new_doubts(
+    responses: Sequence[SiteResponse], before: Sequence[SiteResponse], measured: Sequence[Measured]
+) -> tuple[str, str]:
+    """What slipped, and what folded, that did not at the responses ``before`` (none: nowhere); or empty."""
+
+    def first(kind: str) -> str:
+        known = [getattr(one, kind) for one in before] or [""] * len(measured)
+        rows = zip(measured, responses, known, strict=True)
+        new = (f"{m.name}: {getattr(r, kind)}" for m, r, old in rows if getattr(r, kind) and not old)
+        return next(new, "")
+
+    return first("slipped"), first("folded")
+
+
 def residuals(
     objective: Objective, responses: Sequence[SiteResponse], measured: Sequence[Measured]
 ) -> tuple[Array, Array]:
@@ -86,6 +111,29 @@ def _pointwise(response: SiteResponse, site: Measured) -> tuple[Array, Array]:
 
 
 def _mean_squares(response: SiteResponse, site: Measured) -> tuple[Array, Array]:
+    """Equation 8's entry R of a site, and its whole second derivative in first derivatives of the force.
+
+    Least squares takes R's slope g alone, as g g'. There is one entry per site, fewer than parameters, so the
+    rest of the Hessian, R times the second derivative of R, decides where the minimum is; its part
+    ``2 w R J'J / n`` comes as rows whose residual is zero.
+    """
     difference = response.force_N - site.force_N
-    jacobian = 2 * difference @ response.jacobian / difference.size
-    return np.array([site.weight * np.mean(difference**2)]), site.weight * jacobian[None]
+    value = site.weight * float(np.mean(difference**2))
+    share = 2 * site.weight / difference.size
+    slope = share * difference @ response.jacobian
+    bend = np.sqrt(share * value) * response.jacobian
+    return np.r_[value, np.zeros(difference.size)], np.vstack([slope, bend])
+
+
+def curvature(objective: Objective, difference_N: Array, site: Measured) -> Array:
+    """Second derivative (n, n) of a site's cost with respect to its force (n,).
+
+    ``difference_N`` (n,) is that force less the measured one. Half the square of the residuals is the cost.
+    With derivatives J of the force, its gradient changes by ``-J' W`` times a change of the record and, but
+    for the force's own second derivatives, by ``J' W J`` times a step; W is this matrix.
+    """
+    n = difference_N.size
+    if objective == "pointwise":
+        return site.scale**2 * np.eye(n)
+    square = max(float(difference_N @ difference_N), n * (_EXACT * float(site.force_N.max())) ** 2)
+    return 2 * (site.weight / n) ** 2 * (square * np.eye(n) + 2 * np.outer(difference_N, difference_N))

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..phases import boundaries, find_phases
 from .objective import Measured, Simulate, SiteResponse, check_responses
 from .plausibility import UNITS, Flag
 
@@ -247,17 +248,30 @@ def as_driven(response: SiteResponse, own: History, other: History) -> SiteRespo
     ----------
     own, other : times (n,) s and depths (n,) mm of its record and of the other one.
     """
-    (time, depth), (other_time, other_depth) = own, other
+    (time, depth), (_, other_depth) = own, other
     deep = depth.max()
-    top = int(np.argmax(depth))
-    rising = slice(0, top + 1)
+    rising = np.zeros(len(time), dtype=bool)
+    for phase in find_phases(time, depth):
+        if phase.kind == "load":
+            rising |= (time >= phase.start_s) & (time <= phase.end_s)
     loading, force = depth[rising], response.force_N[rising]
     used = (loading > 0.3 * deep) & (force > 0)
     exponent = float(np.polyfit(np.log(loading[used]), np.log(force[used]), 1)[0]) if used.sum() > 2 else 1.0
     factor = (other_depth.max() / deep) ** np.clip(exponent, 0.5, 4.0)
-    at = other_time / other_time[-1] * time[-1]
+    at = _same_moment(own, other)
     columns = [np.interp(at, time, column) for column in response.jacobian.T]
     return SiteResponse(factor * np.interp(at, time, response.force_N), factor * np.stack(columns, axis=1))
+
+
+def _same_moment(own: History, other: History) -> Array:
+    """The times (n,) of a site's own record at which it has come as far as the other one at its times.
+
+    As far in the same phase; in the same share of the whole where they do not have the same phases.
+    """
+    mine, theirs = find_phases(*own), find_phases(*other)
+    if [phase.kind for phase in mine] == [phase.kind for phase in theirs]:
+        return np.asarray(np.interp(other[0], boundaries(theirs), boundaries(mine)))
+    return other[0] / other[0][-1] * own[0][-1]
 
 
 def best_correction(
@@ -274,7 +288,8 @@ def best_correction(
     ----------
     exchange : at parameters (p,), the responses of the first site to the second's record, and of the second
         to the first's, each at the times of the record; may be an approximation (``as_driven``).
-    exactly : the same by simulation, asked for the few exchanges that may matter, which it then judges.
+    exactly : the same by simulation, asked for the few exchanges that may matter, which it then judges; one
+        that fails is not judged.
     """
     as_is = Sites(simulate, measured, start)
     before = as_is.errors(as_is.without())
@@ -286,7 +301,8 @@ def best_correction(
     swaps = [exchanged(simulate, measured, start, pair, exchange, before) for pair in pairs]
     if exactly is not None:
         likely = sorted((s for s in swaps if s.gain > GAIN / 2), key=lambda s: -s.gain)[:_LOOKED_AT]
-        swaps = [exchanged(simulate, measured, start, _pair(s), exactly, before) for s in likely]
+        known = [_pair(s) for s in likely if all(r.completed for r in exactly(start, *_pair(s)))]
+        swaps = [exchanged(simulate, measured, start, pair, exactly, before) for pair in known]
     convincing = [found for found in (*units, *swaps) if found.convinces]
     return max(convincing, key=lambda found: found.gain, default=None)
 

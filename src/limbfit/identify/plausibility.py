@@ -36,6 +36,7 @@ _BOTH = 4.0  # of two sites together, exchanged
 _DROP = 12.0  # by which a hypothesis must lower chi-square
 _EXPLAINED = 16.0  # the chi-square (of 4) up to which a hypothesis explains what it names
 AXIS_DEG, OFF_SKIN_MM, HINT_MM, DEPTH_SHARE = 25.0, 3.0, 12.0, 0.8
+SAME_PLACE_MM, REPEATABLE = 2.0, 1.15  # sites so close are one, and what repeats there differ by at most
 
 # Recorded over true number: force, displacement, time.
 UNITS: dict[str, tuple[float, float, float]] = {
@@ -97,9 +98,10 @@ def explained(found: Sequence[Flag], in_records: Sequence[Flag]) -> list[Flag]:
 class RecordFacts:
     """A site and its record in numbers; what is not known (yet) is None.
 
-    ``step_s`` is the time between samples, ``radius_mm`` that of a circle of the punch's area,
-    ``thickness_mm`` the soft tissue under the indenter along its axis, ``axis_deg`` the angle between that
-    axis and the skin's inward normal, ``hint_mm`` how far its marker is from where the site was said to be.
+    ``position_mm`` (LPS) is its place on the skin, ``step_s`` the time between samples, ``radius_mm`` that of
+    a circle of the punch's area, ``thickness_mm`` the soft tissue under the indenter along its axis,
+    ``axis_deg`` the angle between that axis and the skin's inward normal, ``hint_mm`` how far its marker is
+    from where the site was said to be.
     """
 
     site: str
@@ -112,6 +114,7 @@ class RecordFacts:
     axis_deg: float | None = None
     off_skin_mm: float | None = None
     hint_mm: float | None = None
+    position_mm: tuple[float, float, float] | None = None
 
     @property
     def modulus_kPa(self) -> float:
@@ -130,7 +133,7 @@ def layer_factor(radius_over_thickness: float) -> float:
 
 def implausible(facts: Sequence[RecordFacts]) -> tuple[Flag, ...]:
     """Flags on the records of a study: each against the others, and against what limbs are like."""
-    return (*_places(facts), *_absolute(facts), *_against_others(facts))
+    return (*_places(facts), *_shared_places(facts), *_absolute(facts), *_against_others(facts))
 
 
 def _places(facts: Sequence[RecordFacts]) -> list[Flag]:
@@ -155,6 +158,26 @@ def _places(facts: Sequence[RecordFacts]) -> list[Flag]:
             what = f"it goes {f.depth_mm:.1f} mm deep where the soft tissue is {f.thickness_mm:.1f} mm thick"
             cause = "another place, another limb, or a wrong unit of displacement"
             flags.append(Flag((f.site,), "depth", what, {"depth_share": share}, cause, "check the record"))
+    return flags
+
+
+def _shared_places(facts: Sequence[RecordFacts]) -> list[Flag]:
+    """Sites at one place whose records differ by more than repeats do."""
+    flags = []
+    for one, two in combinations(facts, 2):
+        if one.position_mm is None or two.position_mm is None:
+            continue
+        apart = float(np.linalg.norm(np.subtract(one.position_mm, two.position_mm)))
+        ratio = one.modulus_kPa / two.modulus_kPa
+        if apart > SAME_PLACE_MM or max(ratio, 1 / ratio) < REPEATABLE:
+            continue
+        what = (
+            f"they are at one place ({apart:.1f} mm apart), but the apparent modulus of the first record is "
+            f"{ratio:.2g} times that of the second"
+        )
+        numbers = {"apart_mm": apart, "modulus_ratio": ratio}
+        remedy = "give each site its own place"
+        flags.append(Flag((one.site, two.site), "place", what, numbers, "a position given twice", remedy))
     return flags
 
 

@@ -6,7 +6,7 @@ up to its bound is not determined on that side, whatever a covariance says.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +30,8 @@ class Profile:
 
     ``rise`` is that of minus twice the log-likelihood over its least; ``interval_95`` ends where it crosses
     ``threshold``, or at a bound where ``closed`` (low, high) says that it does not. ``ends`` are the full
-    parameters (2, p) there.
+    parameters (2, p) there. ``extrapolated`` (n,) and ``ends_extrapolated`` say where the emulator is asked
+    beyond its runs.
     """
 
     name: str
@@ -40,6 +41,8 @@ class Profile:
     interval_95: tuple[float, float]
     closed: tuple[bool, bool]
     ends: Array
+    extrapolated: NDArray[np.bool_]
+    ends_extrapolated: tuple[bool, bool]
 
     @property
     def verdict(self) -> str:
@@ -53,17 +56,27 @@ class Profile:
             "threshold": self.threshold,
             "interval_95": list(self.interval_95),
             "closed": list(self.closed),
+            "extrapolated": self.extrapolated.tolist(),
+            "ends_extrapolated": list(self.ends_extrapolated),
             "verdict": self.verdict,
         }
 
 
-def profile(likelihood: Likelihood, best: Optimum, k: int, sd: float, freedom: float = 1e6) -> Profile:
+def profile(
+    likelihood: Likelihood,
+    best: Optimum,
+    k: int,
+    sd: float,
+    freedom: float = 1e6,
+    inside: Callable[[Array], bool] = lambda parameters: True,
+) -> Profile:
     """The profile of coordinate k from the optimum outwards.
 
     Parameters
     ----------
     sd : a guess of the coordinate's standard deviation, for the steps.
     freedom : of the misfit's size: the threshold is the square of Student's 97.5 % quantile, 3.84 for many.
+    inside : whether the emulator's runs surround full parameters (p,); by default they do everywhere.
     """
     threshold = float(stdtrit(freedom, 0.975) ** 2)
     sides = [_side(likelihood, best, k, sign * sd, threshold) for sign in (-1.0, 1.0)]
@@ -79,6 +92,8 @@ def profile(likelihood: Likelihood, best: Optimum, k: int, sd: float, freedom: f
         interval_95=(float(np.exp(low.z[k])), float(np.exp(high.z[k]))),
         closed=(low_closed, high_closed),
         ends=np.stack([low.parameters, high.parameters]),
+        extrapolated=np.array([not inside(point.parameters) for point in track]),
+        ends_extrapolated=(not inside(low.parameters), not inside(high.parameters)),
     )
 
 
@@ -128,15 +143,29 @@ def _crossing(
 
 @dataclass(frozen=True)
 class EndCheck:
-    """The rise at the ends of a profile by the emulator and by the solver."""
+    """The rise at the ends of a profile by the emulator and by the solver, None where it has no answer.
+
+    ``why`` the profile was chosen; ``extrapolated`` says which end lies beyond the emulator's runs.
+    """
 
     name: str
+    why: str
     emulated: tuple[float, float]
-    solved: tuple[float, float]
+    solved: tuple[float | None, float | None]
+    extrapolated: tuple[bool, bool]
 
     @property
-    def largest_difference(self) -> float:
-        return max(abs(a - b) for a, b in zip(self.emulated, self.solved))
+    def largest_difference(self) -> float | None:
+        """Of the ends that were simulated; None where neither was."""
+        found = [abs(a - b) for a, b in zip(self.emulated, self.solved) if b is not None]
+        return max(found, default=None)
+
+
+def chosen_for_checks(profiles: Sequence[Profile], narrowest: int) -> list[tuple[str, Profile]]:
+    """The narrowest profiles, on which verdicts rest, and the widest, which goes farthest from the runs."""
+    order = sorted(profiles, key=lambda one: np.log(one.interval_95[1] / one.interval_95[0]))
+    chosen = [("narrowest", one) for one in order[:narrowest]]
+    return chosen + [("widest", one) for one in order[narrowest:][-1:]] if chosen else []
 
 
 def check_ends(
@@ -145,10 +174,18 @@ def check_ends(
     best_responses: Sequence[SiteResponse],
     found: Profile,
     responses: Sequence[Sequence[SiteResponse]],
+    why: str = "",
 ) -> EndCheck:
     """Compare a profile's two ends with ``responses`` of the solver there and at the optimum."""
     reference = likelihood.at_responses(best_responses, best.parameters)
-    solved = [likelihood.at_responses(run, p) - reference for run, p in zip(responses, found.ends)]
+
+    def solved(run: Sequence[SiteResponse], parameters: Array) -> float | None:
+        if not all(response.completed for response in run):
+            return None
+        return likelihood.at_responses(run, parameters) - reference
+
+    low, high = (solved(run, p) for run, p in zip(responses, found.ends, strict=True))
     z = [likelihood.space.reduce(np.log(p)) for p in found.ends]
     emulated = [float(likelihood.minus_2_log(at)[0]) - best.minus_2_log for at in z]
-    return EndCheck(found.name, (emulated[0], emulated[1]), (solved[0], solved[1]))
+    ends = emulated[0], emulated[1]
+    return EndCheck(found.name, why, ends, (low, high), found.ends_extrapolated)

@@ -1,12 +1,13 @@
 """What the data tell about the parameters, and what they do not.
 
 Linearised at the answer, in logarithms of the parameters. The residuals have one covariance C, noise of the
-records plus misfit of the model (``noise``, ``discrepancy``), and the covariance is that of the calibration's
-own least squares under C. What is most probable under C lies one generalised least-squares step away; where
-that step is longer than C explains, the rest of it is one more deviation. P is what the bounds say, the
-spread of a uniform distribution between them, and what stated priors say: where the data are silent, that is
-all that is known, and the interval says so. The size of the misfit is itself estimated from few independent
-residuals, so intervals take Student's quantiles (Satterthwaite 1946).
+records plus misfit of the model (``noise``, ``discrepancy``), and the covariance is that of the calibration
+as it was done, with its own objective and weights, under C (``estimator``). A stated prior is one more
+reading: its median is off the truth by its stated deviation. What is most probable under C lies one
+generalised least-squares step away; where that step is longer than C explains, the rest of it is one more
+deviation. The bounds count as the spread of a uniform distribution between them: where the data are silent,
+that is all that is known, and the interval says so. The size of the misfit is itself estimated from few
+independent residuals, so intervals take Student's quantiles (Satterthwaite 1946).
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
 
+from .calibration import CalibrationSettings
 from .discrepancy import ResidualModel, estimate_discrepancy
+from .estimator import Estimator
 from .noise import SiteNoise, curve_noise
 from .objective import Measured, SiteResponse
 from .parameters import Grouping, Space, Unknowns, search_space, separate
@@ -28,6 +31,7 @@ Array = NDArray[np.float64]
 
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
 GIVEN = "given, not identified"
+LINEARISED, SAMPLED = "linearised", "sampled"
 # A 95 % interval of at most -20 to +25 % is called determined, one of a half to twofold weakly so.
 _DETERMINED_FACTOR, _WEAK_FACTOR = 1.25, 2.0
 # Whatever the width: an interval that is hardly narrower than the bounds comes from the bounds.
@@ -40,11 +44,12 @@ _MOST_FREEDOM = 1e6
 class Combination:
     """A product of powers of the parameters, ``exp(weights @ log(parameters))``, and how well it is known.
 
-    ``sd_log`` is the standard deviation of its logarithm, ``factor_95`` the half-width of its 95 % interval
-    as a factor.
+    ``middle_log`` is the middle of the 95 % interval of its logarithm, ``factor_95`` half its width as a
+    factor, ``sd_log`` the logarithm's standard deviation.
     """
 
     weights: Array
+    middle_log: float
     sd_log: float
     factor_95: float
     text: str
@@ -53,11 +58,13 @@ class Combination:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Linearised uncertainty at the answer.
+    """What is known of the answer: linearised there, or with intervals that were sampled (``intervals``).
 
-    ``centre`` (p,) are the most probable parameters; ``covariance`` and ``correlation`` (p, p) are of the
-    logarithms; ``intervals_95`` (p, 2) are of the parameters, around them and kept between the bounds;
-    ``degrees_of_freedom`` (p,) belong to them. ``combinations`` are the principal axes of the covariance, the
+    ``method`` says which. ``centre`` (p,) are the most probable parameters; ``covariance`` (p, p) is that of
+    the answer's logarithms about the truth, always linearised, and ``sampling_covariance`` (p, p) the part of
+    it that records cause, the scatter of answers to other records with the same priors. ``correlation``
+    (p, p) is of the logarithms, ``intervals_95`` (p, 2) are of the parameters and lie between the bounds;
+    ``degrees_of_freedom`` (p,) belong to the linearised ones. ``combinations`` are the principal axes, the
     best known first.
     """
 
@@ -65,6 +72,7 @@ class Uncertainty:
     parameters: Array
     centre: Array
     covariance: Array
+    sampling_covariance: Array
     correlation: Array
     intervals_95: Array
     verdicts: tuple[str, ...]
@@ -72,6 +80,7 @@ class Uncertainty:
     combinations: tuple[Combination, ...]
     residual_model: ResidualModel
     degrees_of_freedom: Array
+    method: str = LINEARISED
 
     @property
     def sd_log(self) -> Array:
@@ -81,6 +90,7 @@ class Uncertainty:
         """JSON-like values."""
         model = self.residual_model
         return {
+            "method": self.method,
             "centre": dict(zip(self.names, self.centre.tolist())),
             "intervals_95": dict(zip(self.names, self.intervals_95.tolist())),
             "sd_log": dict(zip(self.names, self.sd_log.tolist())),
@@ -88,6 +98,7 @@ class Uncertainty:
             "at_bound": dict(zip(self.names, self.at_bound)),
             "correlation": self.correlation.tolist(),
             "covariance_log": self.covariance.tolist(),
+            "sampling_covariance_log": self.sampling_covariance.tolist(),
             "combinations": [
                 {
                     "text": c.text,
@@ -110,6 +121,7 @@ def estimate_uncertainty(
     unknowns: Unknowns,
     noise: Sequence[SiteNoise] | None = None,
     grouping: Grouping | None = None,
+    settings: CalibrationSettings | None = None,
 ) -> Uncertainty:
     """Covariance, intervals and verdicts at calibrated ``parameters`` (p,).
 
@@ -119,6 +131,7 @@ def estimate_uncertainty(
     noise : of each site's record (``record_noise``); by default white, from the scatter of the residuals
         (``curve_noise``), which suits curves that were not smoothed.
     grouping : of the last stage; by default every parameter is free.
+    settings : with which the parameters were found: the covariance is that of this estimator.
     """
     left = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
     if noise is None:
@@ -132,19 +145,19 @@ def estimate_uncertainty(
     prior = Beliefs.of(unknowns, space)
     peaks = np.array([site.force_N.max() for site in measured])
     model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision)
-    weights = [site.scale**2 for site in measured]
-    linear = _Linear.at(left, scaled, weights, model, prior, space, z)
+    estimator = Estimator.at(left, scaled, measured, prior.rows, settings or CalibrationSettings())
+    linear = _Linear.at(left, scaled, estimator, model, prior, space, z)
     return _told(np.asarray(parameters), linear, model, unknowns, space, prior)
 
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What is known before the data, in the search space: ``precision`` (k, k), ``sd`` (k,) of the bounds.
+    """What is known before the data, in the search space: ``bounds`` (k, k) is the precision of theirs.
 
-    ``rows @ z - target`` are the deviations from stated priors in their standard deviations.
+    ``sd`` (k,) are the deviations of a uniform distribution between them; ``rows @ z - target`` are the
+    deviations from stated priors in their standard deviations.
     """
 
-    precision: Array
     sd: Array
     rows: Array
     target: Array
@@ -154,21 +167,31 @@ class Beliefs:
         sd = (space.upper - space.lower) / np.sqrt(12.0)
         rows, target = unknowns.prior_rows()
         own = rows @ space.tie
-        return cls(np.diag(sd**-2) + own.T @ own, sd, own, target - rows @ space.fixed)
+        return cls(sd, own, target - rows @ space.fixed)
+
+    @property
+    def bounds(self) -> Array:
+        return np.diag(self.sd**-2)
+
+    @property
+    def precision(self) -> Array:
+        """Of bounds and priors together (k, k)."""
+        return self.bounds + self.rows.T @ self.rows
 
 
 @dataclass(frozen=True)
 class _Linear:
-    """Covariance about the calibrated ``z`` (k,), and the part of it that misfit causes.
+    """Covariance about the calibrated ``z`` (k,), and the parts of it that records and that misfit cause.
 
-    The calibration weighs all points alike, generalised least squares by noise and misfit; ``centre`` (k,) is
-    where the latter would go. Where the two are farther apart than noise and misfit explain, the rest counts
+    ``centre`` (k,) is where generalised least squares by noise and misfit would go, which the calibration's
+    own weights are not. Where the two are farther apart than noise and misfit explain, the rest counts
     as one more deviation: intervals must not say more than two readings of the same residuals agree on.
     """
 
     z: Array
     centre: Array
     covariance: Array
+    by_records: Array
     by_misfit: Array
     known_scale: float
 
@@ -177,31 +200,34 @@ class _Linear:
         cls,
         left: Sequence[Array],
         scaled: Sequence[Array],
-        weights: Sequence[float],
+        estimator: Estimator,
         model: ResidualModel,
         prior: Beliefs,
         space: Space,
         z: Array,
     ) -> _Linear:
-        """From residuals (n,), derivatives (n, k) and the calibration's weight of every site."""
-        A, g = prior.precision.copy(), prior.rows.T @ (prior.rows @ z - prior.target)
-        H, M, by_misfit = np.zeros_like(A), np.zeros_like(A), np.zeros_like(A)
-        for i, (r, J, w) in enumerate(zip(left, scaled, weights)):
-            weighted = np.linalg.solve(model.covariance(i), J)
-            A += J.T @ weighted
-            g += weighted.T @ r
-            H += w * J.T @ J
-            M += w**2 * J.T @ model.covariance(i) @ J
-            by_misfit += w**2 * J.T @ model.discrepancy(i) @ J
-        best = np.linalg.inv(A)  # the least covariance that any weights reach
+        """From residuals (n,), derivatives (n, k) of every site and the calibration's estimator there."""
+        total = [model.covariance(i) for i in range(len(left))]
+        best, centre = _most_probable(left, scaled, total, prior, z)
+        centre = np.clip(centre, space.lower, space.upper)
+        M, H = estimator.by_covariance(total), estimator.force_hessian
+        # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
         spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
-        inverse = np.linalg.inv(H / spread + prior.precision)
-        covariance = inverse @ (M / spread**2 + prior.precision) @ inverse
-        caused = inverse @ (by_misfit / spread**2) @ inverse
-        centre = np.clip(z - best @ g, space.lower, space.upper)
+        inverse = np.linalg.inv(estimator.hessian / spread + prior.bounds) / spread
+        by_records = inverse @ M @ inverse
+        beliefs = estimator.by_medians + spread**2 * prior.bounds
+        covariance = by_records + inverse @ beliefs @ inverse
+        misfits = [model.discrepancy(i) for i in range(len(left))]
+        by_misfit = inverse @ estimator.by_covariance(misfits) @ inverse
         apart = _unexplained(centre - z, covariance - best)
-        total = covariance + apart
-        return cls(z, centre, (total + total.T) / 2, caused + apart, model.known_scale)
+        return cls(
+            z=z,
+            centre=centre,
+            covariance=_symmetric(covariance + apart),
+            by_records=_symmetric(by_records),
+            by_misfit=by_misfit + apart,
+            known_scale=model.known_scale,
+        )
 
     def freedom(self, weights: Array) -> float:
         """Degrees of freedom of the variance of ``weights @ z`` (Satterthwaite 1946)."""
@@ -218,9 +244,26 @@ class _Linear:
         return float(min(stdtrit(self.freedom(weights), 0.975) * self.sd(weights), 50.0))
 
 
+def _most_probable(
+    left: Sequence[Array], scaled: Sequence[Array], covariances: Sequence[Array], prior: Beliefs, z: Array
+) -> tuple[Array, Array]:
+    """Of generalised least squares: the covariance (k, k), the least of any weights, and the answer (k,)."""
+    A, g = prior.precision.copy(), prior.rows.T @ (prior.rows @ z - prior.target)
+    for r, J, C in zip(left, scaled, covariances):
+        weighted = np.linalg.solve(C, J)
+        A += J.T @ weighted
+        g += weighted.T @ r
+    best = np.asarray(np.linalg.inv(A), dtype=np.float64)
+    return best, z - best @ g
+
+
+def _symmetric(matrix: Array) -> Array:
+    return (matrix + matrix.T) / 2
+
+
 def _unexplained(step: Array, expected: Array) -> Array:
     """The part (k, k) of the square of a step (k,) beyond the covariance that is ``expected`` of it."""
-    values, vectors = np.linalg.eigh((expected + expected.T) / 2)
+    values, vectors = np.linalg.eigh(_symmetric(expected))
     values = np.maximum(values, 1e-3 * max(float(values[-1]), 1e-30))
     ratio = float(np.mean((vectors.T @ step) ** 2 / values))
     return np.outer(step, step) * max(1.0 - 1.0 / max(ratio, 1e-30), 0.0)
@@ -246,6 +289,7 @@ def _told(
         parameters=parameters,
         centre=np.exp(space.logarithms(linear.centre)),
         covariance=covariance,
+        sampling_covariance=space.tie @ linear.by_records @ space.tie.T,
         correlation=covariance / np.outer(sd, sd),
         intervals_95=np.stack([low, high], axis=1),
         verdicts=tuple(verdicts),
@@ -286,7 +330,8 @@ def _combinations(
         factor = float(np.exp(linear.half_width(axis)))
         verdict = verdict_of(factor, sd / float(np.linalg.norm(axis * prior.sd)))
         weights = space.tie @ (axis / members)
-        found.append(Combination(weights, sd, factor, product_text(weights, names), verdict))
+        middle = float(weights @ space.logarithms(linear.z))
+        found.append(Combination(weights, middle, sd, factor, product_text(weights, names), verdict))
     return tuple(found)
 
 

@@ -1,0 +1,98 @@
+"""Intervals from what a calibration simulated anyway: on a bent valley, and where simulations fail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bars import NAMES, PAPER, TRUTH, records, simulate
+
+from limbfit.identify import Measured, SiteResponse, calibrate, estimate_uncertainty, separate
+from limbfit.identify.coverage import coverage_study
+from limbfit.identify.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
+from limbfit.identify.noise import SiteNoise
+from limbfit.identify.parameters import Unknowns, search_space
+from limbfit.identify.uncertainty import LINEARISED, SAMPLED
+
+# Forces tell log c + BEND (log m)^2 well and log m itself poorly: a valley that is bent.
+POINTS, ABOUT_N, BEND, SD_N = 40, 10.0, 1.0, 0.05
+TIME = np.linspace(-1.0, 1.0, POINTS)
+X = np.stack([np.ones(POINTS), 0.06 * TIME, TIME**2], axis=1)
+BENT = Unknowns(("t.c_kPa", "t.m", "t.gamma"), np.ones(3), np.full(3, 0.05), np.full(3, 20.0))
+BENT_TRUTH = np.array([1.2, 1.3, 0.9])
+
+
+class Valley:
+    """A closed-form model of one site; also what a sampler asks thousands of times."""
+
+    def forces(self, parameters):
+        a, b, c = np.log(np.atleast_2d(parameters)).T
+        return ABOUT_N + np.stack([a + BEND * b**2, b, c], axis=1) @ X.T
+
+    def __call__(self, parameters):
+        slopes = np.eye(3)
+        slopes[0, 1] = 2 * BEND * np.log(parameters[1])
+        return [SiteResponse(self.forces(parameters)[0], X @ slopes / parameters)]
+
+
+def valley_record(repeat, forces):
+    noise = SD_N * np.random.default_rng([3, repeat]).standard_normal(POINTS)
+    claimed = SiteNoise("s", np.arange(float(POINTS)), SD_N**2 * np.eye(POINTS), SD_N, 0.0)
+    return [Measured("s", forces[0] + noise)], [claimed]
+
+
+def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
+    found = coverage_study(Valley(), BENT_TRUTH, BENT, valley_record, repeats=24)
+    assert found.linearised.share < 0.85  # what it was
+    assert 0.9 <= found.stated.share <= 0.99
+    assert found.stated.by_parameter.min() > 0.85
+    assert found.further <= FURTHER_SIMULATIONS
+
+
+def near_the_truth(noise=0.03, grouping=None):
+    data, kept = records(noise, seed=4), Kept()
+    grouping = grouping or separate(NAMES)
+    found = calibrate(kept.of(simulate), data, PAPER.from_start(TRUTH), stages=(grouping,))
+    bounds = PAPER.from_start(TRUTH)
+    known = estimate_uncertainty(found.parameters, found.responses, data, bounds, grouping=grouping)
+    return data, kept, known, search_space(bounds, grouping)
+
+
+def test_further_simulations_are_few_and_asked_for_again_alike():
+    data, kept, known, space = near_the_truth()
+    asked = Kept(), Kept()
+    one, other = (sampled_uncertainty(known, data, PAPER, space, kept, again.of(simulate)) for again in asked)
+    assert one.method == SAMPLED
+    assert 0 < len(asked[0].points) * len(data) <= FURTHER_SIMULATIONS
+    assert np.array_equal(asked[0].points, asked[1].points)
+    assert np.array_equal(one.intervals_95, other.intervals_95)
+    assert [c.verdict for c in one.combinations] == [c.verdict for c in other.combinations]
+
+
+def test_failed_simulations_enter_no_interval():
+    data, kept, known, space = near_the_truth()
+
+    def failing(parameters):
+        good, *rest = simulate(parameters)
+        return [SiteResponse(100 * good.force_N, good.jacobian, False, "stopped"), *rest]
+
+    before = len(kept.points)
+    failing_kept = Kept([*kept.points], [*kept.responses])
+    assert not failing_kept.add(1.1 * TRUTH, failing(1.1 * TRUTH))
+    assert len(failing_kept.points) == before
+    found = sampled_uncertainty(known, data, PAPER, space, kept, failing)
+    assert found.method == SAMPLED
+    assert np.mean((found.intervals_95[:, 0] < TRUTH) & (found.intervals_95[:, 1] > TRUTH)) >= 0.75
+    alone = Kept(kept.points[:1], kept.responses[:1])
+    assert sampled_uncertainty(known, data, PAPER, space, alone, failing) is known
+    assert known.method == LINEARISED
+
+
+def test_fixed_and_tied_parameters_stay_so():
+    grouping = (0, 1, 2, 3, 4, 1, -1, 3)
+    data, kept, known, space = near_the_truth(grouping=grouping)
+    found = sampled_uncertainty(known, data, PAPER, space, kept, simulate)
+    assert len(found.combinations) == 5
+    assert found.intervals_95[1] == pytest.approx(found.intervals_95[5])
+    assert found.intervals_95[6] == pytest.approx([TRUTH[6], TRUTH[6]])
+    assert found.verdicts[6] == known.verdicts[6] == "given, not identified"
+    assert np.isfinite(found.correlation).all()
