@@ -19,13 +19,15 @@ FLOORS = [
     {"indentation"},
     {"study", "febio", "fields", "acquire"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
-    {"mesh"},
+    {"mesh", "phases", "autoregressive"},
     {"errors", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
 # The pipeline's own floors: its verbs stand in the folder itself above its rooms, what all share below them.
 INNER_FLOORS = ["experiments", "stages", "shared"]
-SHARED = {"causes", "context", "corrections", "keys", "provenance", "simulations", "store", "tabular"}
+SHARED = {
+    *("causes", "context", "corrections", "keys", "provenance", "simulations", "sources", "store", "tabular")
+}
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
 
 

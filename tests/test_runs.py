@@ -197,10 +197,10 @@ from limbfit.execution import ProcessExecutor
 with prompt_interrupt():
     with ProcessExecutor(2) as executor:
         list(executor.map(time.sleep, [0, 0], keys=["a", "b"]))
-        print("at work", flush=True)
         if sys.argv[1] == "deaf":  # a library that does not come back
             import signal
             signal.signal(signal.SIGINT, lambda *_: None)
+        print("at work", flush=True)
         list(executor.map(time.sleep, [60, 60], keys=["a", "b"]))
 """
 

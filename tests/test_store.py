@@ -86,7 +86,7 @@ def test_what_a_kill_between_renames_has_left_is_put_right(tmp_path):
     (tmp_path / ".run.json.1234.part").write_text("{")
     with lock(tmp_path):
         assert store.state("mesh", "a").state == "done"
-        assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "mesh", "sites"]
+        assert sorted(p.name for p in tmp_path.iterdir()) == [".holder", ".lock", "mesh", "sites"]
 
 
 def test_a_file_is_readable_by_whom_the_user_lets_read(tmp_path):

@@ -34,7 +34,7 @@ Names are loaded when first used, so that a worker process that only solves does
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+from ._version import __version__
 
 _HOME = {
     "LimbfitError": "errors",

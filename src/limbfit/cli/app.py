@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from .. import __version__
+from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
 from . import acquire, bench, commands, experiments, febio, geometry, runs, studio, trust

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
+from .._version import __version__
 from ..acquire import (
     Event,
     LineDevice,
@@ -288,7 +288,7 @@ def stored_surrogates(study: Study) -> dict[str, Surrogate]:
     for site in study.sites:
         for folder, column in (("predict", "force_simulated_N"), ("simulate", "force_N")):
             file = study.results / folder / f"{site.name}.csv"
-            if file.is_file():
+            if file.is_file() and (folder == "simulate" or column in read_curves(file)):
                 found[site.name] = _surrogate(file, column)
                 break
     if not found:

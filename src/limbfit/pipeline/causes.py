@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from .. import __version__
+from .._version import __version__
 from ..study import Study
 from .keys import Keys, Stage
-from .provenance import code_digest, input_files
+from .provenance import input_files
+from .sources import code_parts
 from .store import digest
 
 Parts = dict[str, dict[str, str]]
@@ -19,7 +20,7 @@ _FEW = 4  # causes of one kind that are named
 
 
 def parts_of(stage: Stage, known: Keys, study: Study, keys: Mapping[str, str]) -> Parts:
-    """Digests of the settings, inputs, rooms of code and keys of lower stages that make up a stage's key."""
+    """Digests of the settings, inputs, files of code and keys of lower stages that make up a stage's key."""
     stated = study.model_dump(mode="json")
     settings = dict(_leaves({table: stated[table] for table in stage.tables}, ""))
     for site in stated["sites"]:
@@ -29,7 +30,7 @@ def parts_of(stage: Stage, known: Keys, study: Study, keys: Mapping[str, str]) -
     return {
         "settings": {name: digest(value) for name, value in settings.items()},
         "inputs": {names.get(path, "labels corrected by hand"): known.digests[path][:16] for path in files},
-        "code": {room: code_digest((room,)) for room in stage.rooms} | {"limbfit": __version__},
+        "code": code_parts(stage.run) | {"limbfit": __version__},
         "stages": {below: keys[below] for below in stage.needs if below in keys},
     }
 
@@ -54,14 +55,17 @@ def causes(before: Mapping[str, Mapping[str, str]] | None, now: Parts) -> list[s
     }
     for kind, text in words.items():
         names = _different(before.get(kind, {}), now[kind])
-        shown = ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
-        found += [text.format(shown)] if names else []
-    rooms, then = _different(before.get("code", {}), now["code"]), before.get("code", {}).get("limbfit")
+        found += [text.format(_few(names))] if names else []
+    code, then = _different(before.get("code", {}), now["code"]), before.get("code", {}).get("limbfit")
     if then != __version__:
         found.append(f"limbfit was {then}, is {__version__}")
-    elif rooms:
-        found.append(f"code of {', '.join(rooms)} changed")
+    elif code:
+        found.append(f"code of {_few(code)} changed")
     return found or ["what it can be run with changed"]
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
 
 
 def _different(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -12,9 +12,10 @@ from ..indentation import read_indenter
 from ..study import Study
 from .context import Listener, Progress
 from .run import keys
-from .stages.geometry import given_anatomy, place_site
 from .stages.inputs import marked_image, study_image, study_labels
 from .stages.plausible import record_flags
+from .stages.sites import place_site
+from .stages.surfaces import given_anatomy
 from .stages.traces import read_site_trace
 from .store import Store
 
@@ -46,7 +47,9 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     for name, record in sites.items():
         facts.append(
             f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
-            f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} mm"
+            f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} "
+            f"mm; {record['phases_in_words']}"
+            + ("" if record["speed_unload_mm_s"] is not None else "; loading only, no unloading")
         )
     facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}

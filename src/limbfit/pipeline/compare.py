@@ -12,16 +12,28 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import Problem, Result, solve
-from ..febio import Contact, Log, Verdict, find_febio, mean_penalty, read_log, result_of_log
-from ..indentation import Parameters, steps_of
+from ..fe import Problem, Result, System, solve
+from ..fe.stepping import schedule
+from ..febio import (
+    SLACK,
+    FaceWise,
+    Log,
+    Verdict,
+    contact_of,
+    find_febio,
+    mean_penalty,
+    read_log,
+    result_of_log,
+)
+from ..indentation import Parameters, first_steps
 from ..study import Study
 from .context import Listener
-from .simulate import Indentation, prepare_site, run_febio_site, site_problem
+from .simulate import Indentation, feb_settings, prepare_site, run_febio_site, site_problem
 from .stages.traces import write_curves
 from .store import write_json
 
 Array = NDArray[np.float64]
+FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
 
 
 def compare_site(
@@ -72,22 +84,29 @@ def compare_site(
 def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Result:
     """limbfit's own result, as ``limbfit simulate`` gets it."""
     found.context.tell("compare", part, 3, f"site {found.site.name}: limbfit")
-    return solve(problem, steps_of(found.model), store="none")
+    return solve(problem, first_steps(found.model, found.context.study.tissues), store="none")
 
 
 def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
-    """limbfit with FEBio's contact penalty in the mean (see `mean_penalty`)."""
-    found.context.tell("compare", 2, 3, f"site {found.site.name}: limbfit with FEBio's penalty")
-    contact = Contact("sliding-elastic", ("", ""), found.context.study.febio.penalty, True, False, 0)
-    first = float(other.times[1]) if len(other.times) > 1 else float(problem.history.times[-1]) / 64.0
-    penalty = mean_penalty(contact, problem, first)
-    return solve(problem, replace(steps_of(found.model), penalty=penalty, penetration=1.0), store="none")
+    """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
+    found.context.tell("compare", 2, 3, f"site {found.site.name}: limbfit with FEBio's contact and steps")
+    settings = feb_settings(found, "")
+    end = float(problem.history.times[-1])
+    times = np.minimum(other.times[1:], end)  # a table has nine digits
+    if not len(times):  # FEBio got nowhere: all the way then
+        times = schedule(problem.history, settings.steps)
+    contact = contact_of(problem, settings)
+    penalty = mean_penalty(contact, problem, float(times[0]))
+    steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
+    system = System(problem)
+    weights = FaceWise(system, contact, times)
+    return solve(problem, steps, store="none", on_step=weights.after, system=system)
 
 
 def _of_log(problem: Problem, log: Log, file: Path) -> Result:
     """A table from elsewhere, complete where it reaches the end of the history."""
     reached, end = float(log.times[-1]), float(problem.history.times[-1])
-    reason = "" if reached > end * (1.0 - 1e-6) else f"the table ends at {reached:.4g} s of {end:.4g} s"
+    reason = "" if reached > end * (1.0 - SLACK) else f"the table ends at {reached:.4g} s of {end:.4g} s"
     verdict = Verdict("partial" if reason else "normal", reason, reached, "")
     try:
         return result_of_log(problem, log, verdict)
@@ -128,7 +147,7 @@ def _summary(found: Indentation, other: Result, runs: dict[str, Result]) -> dict
             "peak_force_N": other.peak_force,
             "steps": other.statistics["steps"],
             "seconds": other.statistics["seconds"]["total"] or None,
-            "penalty": found.context.study.febio.penalty,
+            "penalty": found.context.study.febio.penalty,  # times the automatic one; None: explicit
         },
         **{
             key: {

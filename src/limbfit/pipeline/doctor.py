@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from .. import __version__
+from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import THREAD_VARIABLES, ProcessExecutor, usable_cores
 from ..fe import OgdenQLV

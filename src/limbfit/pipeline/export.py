@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..febio import Range, in_indenter_frame, write_feb, write_inp, write_optimisation
+from ..febio import Range, differences, in_indenter_frame, write_feb, write_inp, write_optimisation
 from ..indentation import KPA, Parameters
 from ..study import Site, Study
 from .context import Listener
@@ -51,13 +52,14 @@ def export_study(
     for one in chosen:
         found = prepare_site(study, one.name, parameters=parameters, listener=listener)
         folder.mkdir(parents=True, exist_ok=True)
-        files = _write(found, to, folder)
+        files, notes = _write(found, to, folder)
         rows.append(
             {
                 "site": one.name,
                 "parameters": found.parameters,
                 "parameters_from": found.origin,
                 "files": [str(file) for file in files],
+                "notes": list(notes),
             }
         )
     return {"format": to, "sites": rows}
@@ -76,15 +78,19 @@ def _chosen(study: Study, to: str, site: str | None) -> Sequence[Site]:
     return study.sites
 
 
-def _write(found: Indentation, to: str, folder: Path) -> tuple[Path, ...]:
+def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """The files of a site, and what the other solver does otherwise."""
     name, problem = found.site.name, site_problem(found)
     settings = feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
         write_feb(problem, folder / f"{name}.feb", settings)
-        return (folder / f"{name}.feb",)
+        return (folder / f"{name}.feb",), differences(problem, settings)
     if to == "febio-optimize":
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
-        write_feb(in_indenter_frame(problem), model, settings)
+        # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
+        settings = replace(settings, penalty=None)
+        turned = in_indenter_frame(problem)
+        write_feb(turned, model, settings)
         record = site_record(found.context, found.site)
         inside = (record.times_s >= 0.0) & (record.times_s <= problem.history.times[-1])
         ranges = _ranges(found, problem.mesh.region_names)
@@ -92,10 +98,10 @@ def _write(found: Indentation, to: str, folder: Path) -> tuple[Path, ...]:
         write_optimisation(
             control, ranges, record.times_s[inside], record.force_N[inside], iterations=iterations
         )
-        return control, model
+        return (control, model), differences(turned, settings)
     program = "abaqus" if to == "inp" else to
     write_inp(problem, folder / f"{name}.inp", program, settings)
-    return (folder / f"{name}.inp",)
+    return (folder / f"{name}.inp",), ()
 
 
 def _ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, Range]:

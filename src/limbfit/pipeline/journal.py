@@ -16,7 +16,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, TextIO
 
-from .. import __version__
+from .._version import __version__
 from ..study import Study
 from .context import Listener, Progress
 from .store import disk_errors

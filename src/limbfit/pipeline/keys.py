@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from ..study import Study
-from .provenance import code_digest, input_files
+from .provenance import input_files
+from .sources import code_digest
 from .store import digest, file_digest
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage: what it stands on, the study tables it reads, the rooms whose code makes it."""
+    """A stage: what it stands on and the study tables it reads; its code is that of `sources.sources_of`."""
 
     name: str
     run: Callable[..., dict[str, Any]]
     needs: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     site_keys: tuple[str, ...] = ()
-    rooms: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Keys:
                 {table: stated[table] for table in stage.tables},
                 [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
                 None if read is None else {str(path): self.digests[path] for path in read},
-                code_digest(stage.rooms),
+                code_digest(stage.run),
                 [found.get(below) or known.get(below) for below in stage.needs],
                 *extra,
             )

@@ -5,19 +5,16 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Mapping
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from .. import __version__
 from ..anatomy.labelfiles import sidecar
 from ..fe import StepControl
 from ..study import Study
 from .corrections import hand_labels
 from .store import digest, file_digest
 
-PACKAGE = Path(__file__).parents[1]
 LIBRARIES = (
     "numpy",
     "scipy",
@@ -57,17 +54,6 @@ def machine() -> dict[str, Any]:
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         facts["memory_GB"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
     return facts
-
-
-@cache
-def code_digest(rooms: tuple[str, ...]) -> str:
-    """Digest of the source of some rooms: a stage is stale when the code that made it has changed."""
-    parts = []
-    for room in rooms:
-        place = PACKAGE / room
-        files = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
-        parts += [(str(file.relative_to(PACKAGE)), file_digest(file)) for file in files]
-    return digest(__version__, parts)
 
 
 def input_files(study: Study) -> dict[str, list[Path]]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
+from .._version import __version__
 from ..errors import InputError
 from ..study import Study, load_study
 from .context import Listener
@@ -138,6 +138,8 @@ def _forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
         a, b = (read_curves(folder / file.name).get("force_simulated_N") for folder in (then, now))
         if a is not None and b is not None:
             yield file.stem, float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300))
+        elif a is not b:  # one of them could not be predicted: all of the force is missing
+            yield file.stem, 1.0
 
 
 def _version_changes(known: Mapping[str, Any]) -> dict[str, list[str | None]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .. import __version__
+from .._version import __version__
 from ..errors import InputError
 from ..study import Study
 from .causes import causes, parts_of
@@ -16,60 +16,33 @@ from .journal import journal
 from .keys import Keys, Stage
 from .provenance import input_digests, machine, settings_record, versions
 from .stages.calibrate import run_calibrate
-from .stages.geometry import run_mesh, run_segment, run_sites, run_surfaces
+from .stages.mesh import run_mesh
 from .stages.predict import run_predict
 from .stages.report import run_report
+from .stages.segment import run_segment
+from .stages.sites import run_sites
+from .stages.surfaces import run_surfaces
 from .stages.traces import run_traces
 from .store import Store, lock, write_json
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted")
 _RECORD = ("trace", "touch_down_s", "peak_s")
 _UNSEEN: dict[str, Any] = {"region": "", **dict.fromkeys((*_RECORD, "axis", "edge"))}
-_IDENTIFY = (
-    *("calibration", "fidelity", "multistart", "objective", "parameters", "prediction", "trust_region"),
-    *("uncertainty", "noise", "discrepancy"),
-)
-_MECHANICS = (
-    *(
-        "fe",
-        "indentation",
-        "mesh",
-        "pipeline/simulations",
-        "pipeline/stages/traces",
-        "pipeline/stages/record_noise",
-    ),
-    *(f"identify/{name}" for name in _IDENTIFY),
-)
-_DOUBTS = (
-    "identify/outliers",
-    "identify/plausibility",
-    "pipeline/stages/outliers",
-    "pipeline/stages/plausible",
-)
-_GEOMETRY = ("anatomy", "pipeline/stages/geometry", "pipeline/stages/inputs", "pipeline/stages/marked_images")
 STAGES = (
-    Stage("segment", run_segment, (), ("image", "segmentation"), rooms=_GEOMETRY),
-    Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces"), rooms=_GEOMETRY),
-    Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE, _GEOMETRY),
-    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD), ("traces", "pipeline/stages/traces")),
-    Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",), (*_GEOMETRY, "mesh")),
+    Stage("segment", run_segment, (), ("image", "segmentation")),
+    Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces")),
+    Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE),
+    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD)),
+    Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",)),
     Stage(
         "calibrate",
         run_calibrate,
         ("sites", "traces", "mesh"),
         ("material", "calibration", "solver", "indenter"),
         ("name", "fitted", "weight", "edge"),
-        (*_MECHANICS, "pipeline/stages/calibrate"),
     ),
-    Stage(
-        "predict",
-        run_predict,
-        ("sites", "traces", "mesh", "calibrate"),
-        (),
-        ("name", "edge"),
-        (*_MECHANICS, *_DOUBTS, "pipeline/stages/predict", "fields"),
-    ),
-    Stage("report", run_report, ("predict",), ("study",), ("name", "region"), ("report", "pipeline")),
+    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge")),
+    Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError
 from ..execution import SerialExecutor
 from ..fe import Problem, Result
 from ..febio import FebSettings, find_febio, result_of_log, run_febio, write_feb
-from ..indentation import Parameters, SiteModel, build_problem, simulate_fields, steps_of
+from ..indentation import Parameters, SiteModel, build_problem, first_steps, simulate_fields
 from ..mesh import read_vtu
 from ..study import Site, Study
 from .context import Context, Listener
@@ -101,12 +99,12 @@ def simulate_site(
         fields = folder / f"{name}.vtu"
         result = simulate_fields(model, found.parameters, fields, played)
     context.tell("simulate", 1, 1, f"site {name}")
-    times = np.linspace(0.0, model.knots_s[-1], CURVE_POINTS)
+    times = model.curve_times(CURVE_POINTS)
     curve = folder / f"{name}.csv"
     write_curves(
         curve,
         time_s=times,
-        displacement_mm=np.interp(times, model.knots_s, model.knots_mm),
+        displacement_mm=model.history.at(times),
         force_N=result.force_at(times),
     )
     summary = _summary(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
@@ -149,7 +147,7 @@ def feb_settings(found: Indentation, force_file: str) -> FebSettings:
     """What is written for FEBio beside the problem."""
     study = found.context.study
     title = f"{study.study.name}, site {found.site.name}, parameters: {found.origin}"
-    return FebSettings(study.febio.penalty, steps_of(found.model), force_file, title)
+    return FebSettings(study.febio.penalty, first_steps(found.model, study.tissues), force_file, title)
 
 
 def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Result, Path]:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..execution import Executor
+from ..fe import Doubt
 from ..indentation import Simulation, SimulationJob, SiteModel, simulate
 from ..study import Site, Study
 from .context import Context
-from .provenance import code_digest
-from .store import EARLIER, RUNS, atomic, digest, file_digest
+from .sources import code_digest
+from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
 
-ROOMS = ("fe", "indentation", "mesh")  # whose code decides a simulation
-COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
-CURVE_POINTS = 81  # times, evenly over the indentation, at which measured and simulated force are compared
+CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 
 
 class SimulationCache:
@@ -93,7 +93,7 @@ class SimulationCache:
                 "reason": simulation.reason,
                 "penetration_mm": simulation.penetration_mm,
                 "facts": simulation.facts,
-                "warnings": list(simulation.warnings),
+                "doubts": [asdict(doubt) for doubt in simulation.doubts],
             }
             np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
 
@@ -110,8 +110,8 @@ def _load(file: Path) -> Simulation:
     with np.load(file, allow_pickle=False) as stored:
         facts: dict[str, Any] = json.loads(str(stored["facts"]))
         jacobian = stored.get("jacobian")
-        warnings = tuple(facts.pop("warnings"))
-        return Simulation(force_N=stored["force_N"], jacobian=jacobian, warnings=warnings, **facts)
+        doubts = tuple(Doubt(**one) for one in facts.pop("doubts"))
+        return Simulation(force_N=stored["force_N"], jacobian=jacobian, doubts=doubts, **facts)
 
 
 def job_digest(job: SimulationJob) -> str:
@@ -120,7 +120,7 @@ def job_digest(job: SimulationJob) -> str:
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
     return digest(
-        code_digest(ROOMS), model, job.tissues, job.parameters, job.times_s, job.sensitivities, job.start
+        code_digest(simulate), model, job.tissues, job.parameters, job.times_s, job.sensitivities, job.start
     )
 
 

@@ -21,15 +21,15 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, BinaryIO
 
+from filelock import FileLock, Timeout
+
 from ..errors import RunError
 
-try:
-    import fcntl
-except ImportError:  # Windows: no advisory lock there; the pid in the file still tells who runs
-    fcntl = None  # type: ignore[assignment]
-
 STAMP = "stage.json"
+LOCK, HOLDER = ".lock", ".holder"
+_PATIENCE_S = 0.5  # for one who only asks whether a study is held
 RUNS = "runs"  # a stage's kept simulations
+COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
 EARLIER = ".earlier"  # those of attempts with other inputs, while the stage is not complete
 _DRAFT, _OLD = ".part", ".old-"
 
@@ -230,28 +230,47 @@ def disk_errors(folder: Path) -> Iterator[None]:
 def lock(folder: Path) -> Iterator[None]:
     """Hold a study for one run; a second run is refused while the first lives.
 
-    The lock is the operating system's, on ``results/.lock``, so it goes with the process however that ends.
+    The lock is the operating system's, on ``results/.lock``, so it goes with the process however that ends;
+    ``results/.holder`` says whose it is.
     """
     if folder.is_symlink():
         raise RunError(f"{folder}: is a link, and nothing outside the study is written; make it a folder")
+    own = FileLock(folder / LOCK, timeout=_PATIENCE_S)
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        stream = (folder / ".lock").open("a+")
-    with stream:
-        if fcntl is not None:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                stream.seek(0)
-                holder = stream.read().strip() or "another process"
-                raise RunError(
-                    f"{folder}: {holder} is running this study; wait for it or end it (kill PID): its lock "
-                    "goes with it, and another run goes on where it stopped"
-                ) from None
-        stream.seek(0)
-        stream.truncate()
-        stream.write(f"process {os.getpid()} (since {datetime.now(UTC):%Y-%m-%d %H:%M} UTC)")
-        stream.flush()
+        try:
+            own.acquire()
+        except Timeout:
+            holder = holder_of(folder) or "another process"
+            raise RunError(
+                f"{folder}: {holder} is running this study; wait for it or end it (kill PID): its lock "
+                "goes with it, and another run goes on where it stopped"
+            ) from None
+    try:
         with disk_errors(folder):
+            since = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+            (folder / HOLDER).write_text(f"process {os.getpid()} (since {since})", encoding="utf-8")
             Store(folder).mend()
         yield
+    finally:
+        (folder / HOLDER).unlink(missing_ok=True)
+        own.release()
+
+
+def holder_of(folder: Path) -> str:
+    """Which process says that it holds a study, and since when; empty where none does."""
+    try:
+        return (folder / HOLDER).read_text(encoding="utf-8").strip()
+    except OSError:
+        return ""
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a run holds a study now."""
+    if not (folder / LOCK).is_file():
+        return False
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            return False
+    except Timeout:
+        return True

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 BoneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ().+_-]{0,39}$")]
 PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
 ParameterName = Literal["c_kPa", "m", "gamma", "tau_s"]
+KAPPA_RATIO = (10.0, 1e4)
 TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
@@ -169,39 +170,6 @@ class GeometryTable(Table):
         return self.layers or (Layer(name="skin", thickness_mm=self.skin_layer_mm),)
 
 
-class CoarseMeshTable(Table):
-    """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
-
-    edge_near_mm: Positive = 5.5
-    edge_far_mm: Positive = 30.0
-    near_radius_mm: Positive = 12.0
-    growth: Positive = 0.9
-    flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
-
-
-class MeshTable(Table):
-    """The mesh of each site: element and edge lengths near the indenter and far from it.
-
-    ``element``: linear tetrahedra, or quadratic ones with the pressure as it comes or constant in each.
-    With ``coarse``, parameters are searched on coarse meshes, whose forces these meshes correct.
-    """
-
-    element: Literal["tet4", "tet10", "tet10p0"] = "tet10p0"
-    edge_near_mm: Positive = 3.5
-    edge_far_mm: Positive = 12.0
-    near_radius_mm: Positive = 16.0
-    growth: Positive = 0.35
-    flatness: Annotated[float, Field(ge=1, le=2)] = 1.0
-    engine: Literal["mmg", "netgen"] = "mmg"
-    time_limit_s: Positive = 600.0
-    coarse: CoarseMeshTable | None = None
-
-    @property
-    def cell_type(self) -> Literal["tet4", "tet10"]:
-        """The cells of the mesh, whatever is solved on them."""
-        return "tet4" if self.element == "tet4" else "tet10"
-
-
 class IndenterTable(Table):
     """The rigid indenter; the paper's is a square of 20 mm.  ``file`` is the surface of shape ``stl``."""
 
@@ -283,7 +251,7 @@ class MaterialTable(Table):
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
     """
 
-    kappa_ratio: Positive = 100.0
+    kappa_ratio: float = 100.0
     start: TissueParameters = TissueParameters(c_kPa=4.7, m=3.0, gamma=1.2, tau_s=2.0)
     lower: TissueParameters = TissueParameters(c_kPa=0.047, m=2.0, gamma=0.01, tau_s=0.01)
     upper: TissueParameters = TissueParameters(c_kPa=47.0, m=20.0, gamma=10.0, tau_s=10.0)
@@ -293,6 +261,22 @@ class MaterialTable(Table):
         """Start, lower or upper bound of the four parameters of a tissue."""
         general = getattr(self, which).model_dump()
         return general | getattr(self.tissues.get(tissue, TissueRange()), which)
+
+    @field_validator("kappa_ratio")
+    @classmethod
+    def _nearly_incompressible(cls, ratio: float) -> float:
+        low, high = KAPPA_RATIO
+        if ratio < low:
+            raise ValueError(
+                f"give {low:g} or more: with less, Poisson's ratio is under 0.45, and soft tissue hardly "
+                "changes its volume"
+            )
+        if ratio > high:
+            raise ValueError(
+                f"give at most {high:g}: with that, the volume changes by some 0.01 % of the strain, and "
+                "with more, the equations lose digits"
+            )
+        return ratio
 
     @model_validator(mode="after")
     def _ordered(self) -> MaterialTable:
@@ -356,8 +340,9 @@ class CalibrationTable(Table):
 class UncertaintyTable(Table):
     """What ``limbfit uncertainty`` may spend, and how well geometry and contact are known (one deviation).
 
-    ``runs`` are simulations of all fitted sites beyond those of the calibration; ``checked`` profiles have
-    their ends simulated. ``sources`` = false leaves geometry, contact and discretisation out.
+    ``runs`` are simulations of all fitted sites beyond those of the calibration; of the ``checked``
+    narrowest profiles, and of the widest beside them, the ends are simulated. ``sources`` = false leaves
+    geometry, contact and discretisation out.
     """
 
     runs: Annotated[int, Field(ge=4, le=1000)] = 24
@@ -374,24 +359,27 @@ class SolverTable(Table):
     """Steps over loading and unloading before the solver adapts them, and how hard the contact is.
 
     ``penalty_per_mm`` is the contact's stiffness over the mean instantaneous shear modulus of the tissues, as
-    it stays; without it the solver takes its own and raises it where the indenter sinks in by over 1 %.
+    it stays; without it each site holds what a reference tissue needs there.
 
     ``solver`` is what ``limbfit simulate`` runs; identification and prediction are always limbfit's own.
     """
 
     solver: Literal["limbfit", "febio"] = Field(default="limbfit", exclude=True)  # of no stage, so of no key
-    load_steps: Annotated[int, Field(ge=2, le=500)] = 10
-    unload_steps: Annotated[int, Field(ge=2, le=500)] = 8
+    load_steps: Annotated[int, Field(ge=2, le=500)] = 8
+    unload_steps: Annotated[int, Field(ge=2, le=500)] = 10
     penalty_per_mm: Positive | None = None
 
 
 class FebioTable(Table):
-    """FEBio beside limbfit: where it is, what it may take; ``penalty`` is times its automatic one."""
+    """FEBio beside limbfit: where it is, what it may take; ``penalty`` is times its automatic one.
+
+    Without ``penalty`` it is given an explicit one, as stiff as limbfit's contact.
+    """
 
     program: Path | None = None
     threads: Annotated[int, Field(ge=1, le=256)] = 1
     time_limit_s: Positive = 3600.0
-    penalty: Positive = 3.0
+    penalty: Positive | None = None
 
 
 class ExecutionTable(Table):

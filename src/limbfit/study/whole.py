@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ..errors import StudyError
 from .acquisition import AcquireTable
+from .meshing import MeshTable
 from .tables import (
     PARAMETERS,
     CalibrationTable,
@@ -18,7 +19,6 @@ from .tables import (
     IndenterTable,
     MarkupsTable,
     MaterialTable,
-    MeshTable,
     SegmentationTable,
     Site,
     SolverTable,

@@ -8,7 +8,7 @@ stages and of other experiments, so that a killed one goes on and nothing is sim
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,23 +26,6 @@ from .regions import run_regions
 from .sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
 from .uncertainty import run_uncertainty
 
-# Rooms of experiments that simulate, and of those that identify parameters.
-IDENTIFY = tuple(
-    f"identify/{name}"
-    for name in ("calibration", "fidelity", "objective", "parameters", "trust_region", "uncertainty", "noise")
-)
-UNCERTAINTY = (
-    "discrepancy",
-    "emulator",
-    "evidence",
-    "explore",
-    "likelihood",
-    "posterior",
-    "profile",
-    "sources",
-)
-MECHANICS = ("fe", "indentation", "mesh", "pipeline/simulations")
-
 
 @dataclass(frozen=True)
 class Experiment(Stage):
@@ -55,19 +38,16 @@ class Experiment(Stage):
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-_OF_SENSITIVITY = (*MECHANICS, "pipeline/experiments/sensitivity", "pipeline/experiments/variants")
+_SIMULATED = ("sites", "traces", "mesh", "calibrate")
 
 
-def _sensitivity(
-    name: str, run: Callable[..., dict[str, Any]], rooms: Sequence[str] = (), **options: Any
-) -> Experiment:
+def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) -> Experiment:
     return Experiment(
         f"sensitivity-{name}",
         run,
-        needs=("sites", "traces", "mesh", "calibrate"),
+        needs=_SIMULATED,
         tables=("material", "solver", "indenter"),
         site_keys=("name", "region", "edge", "depth_mm", "speed_mm_s"),
-        rooms=(*_OF_SENSITIVITY, *rooms),
         options={"sites": [], **options},
     )
 
@@ -78,56 +58,34 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         run_cube,
         needs=("calibrate",),
         tables=("material",),
-        rooms=("fe", "pipeline/experiments/cube", "pipeline/experiments/published"),
         options={"compression_percent": COMPRESSION_PERCENT},
     ),
     Experiment(
         "regions",
         run_regions,
-        needs=("sites", "traces", "mesh", "calibrate"),
+        needs=_SIMULATED,
         tables=("material", "calibration", "solver", "indenter"),
         site_keys=("name", "region", "fitted", "weight", "edge"),
-        rooms=(
-            *MECHANICS,
-            *IDENTIFY,
-            "identify/regions",
-            "pipeline/stages/calibrate",
-            "pipeline/experiments/regions",
-        ),
         options={"sites": "all"},
     ),
     _sensitivity("c", run_stiffness),
-    _sensitivity("kappa", run_kappa, ["pipeline/experiments/volumes"], ratios=list(KAPPA_RATIOS)),
+    _sensitivity("kappa", run_kappa, ratios=list(KAPPA_RATIOS)),
     _sensitivity("contact", run_contact),
     _sensitivity("indenter", run_indenter),
-    _sensitivity(
-        "mesh", run_refinement, ["pipeline/experiments/refinement", "anatomy"], factors=list(FACTORS)
-    ),
+    _sensitivity("mesh", run_refinement, factors=list(FACTORS)),
     Experiment(
         "uncertainty",
         run_uncertainty,
-        needs=("sites", "traces", "mesh", "calibrate", "predict"),
+        needs=(*_SIMULATED, "predict"),
         tables=("material", "calibration", "solver", "indenter", "uncertainty"),
         site_keys=("name", "fitted", "weight", "edge"),
-        rooms=(
-            *(*MECHANICS, *IDENTIFY, "pipeline/stages/calibrate", "pipeline/stages/record_noise"),
-            *(f"identify/{name}" for name in UNCERTAINTY),
-            *(
-                f"pipeline/experiments/{name}"
-                for name in ("uncertainty", "uncertainty_record", "uncertainty_sources")
-            ),
-        ),
     ),
     Experiment(
         "crossvalidate",
         run_crossvalidate,
-        needs=("sites", "traces", "mesh", "calibrate"),
+        needs=_SIMULATED,
         tables=("material", "calibration", "solver", "indenter"),
         site_keys=("name", "region", "fitted", "weight", "edge"),
-        rooms=(
-            *(*MECHANICS, *IDENTIFY, "identify/crossvalidation", "identify/emulator", "identify/spread"),
-            *("pipeline/stages/calibrate", "pipeline/experiments/crossvalidation"),
-        ),
         options={"fit": 0, "choices": 200, "seed": 0, "runs": 12},
     ),
     Experiment(
@@ -136,7 +94,6 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         needs=("sites", "traces", "mesh"),
         tables=("material", "solver", "indenter"),
         site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s"),
-        rooms=(*MECHANICS, "identify/design", "anatomy/under", "pipeline/experiments/design"),
         options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
     ),
 )

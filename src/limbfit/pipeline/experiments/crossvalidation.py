@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import RunError, StudyError
+from ...errors import StudyError
 from ...identify.calibration import CalibrationSettings
 from ...identify.crossvalidation import (
     Choice,
@@ -28,7 +28,6 @@ from ...identify.crossvalidation import (
     without_regions,
 )
 from ...identify.emulator import Emulator
-from ...identify.fidelity import Anchor, corrected
 from ...identify.objective import SiteResponse
 from ...identify.parameters import Unknowns
 from ...identify.prediction import error_percent
@@ -106,34 +105,16 @@ class _Bench:
         covariance = np.array(stored["uncertainty"]["covariance_log"])
         # Where nothing is known, fits go anywhere; the emulator must not.
         drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
-        self.points, self.runs = [self.best], [self._whole(laboratory.search(self.best))]
-        self.anchor: Anchor | None = None
-        if study.mesh.coarse is not None:
-            fine, coarse = self._whole(laboratory.check(self.best)), self.runs[0]
-            forces = [tuple(r.force_N for r in run) for run in (coarse, fine)]
-            self.anchor = Anchor(self.best, forces[0], forces[1])
-            self.runs[0] = self._as_fine(coarse)
+        at_best, self.as_fine = laboratory.correction(self.best)
+        self.points, self.runs = [self.best], [at_best]
         self.learn(list(drawn))
-
-    def _whole(self, responses: list[SiteResponse]) -> list[SiteResponse]:
-        for response, site in zip(responses, self.measured):
-            if not response.completed:
-                raise RunError(f"site {site.name} cannot be simulated at the answer: {response.reason}")
-        return responses
-
-    def _as_fine(self, responses: list[SiteResponse]) -> list[SiteResponse]:
-        """Coarse meshes' responses corrected by what is known at the answer."""
-        if self.anchor is None:
-            return responses
-        parts = zip(responses, self.anchor.coarse, self.anchor.fine, self.anchor.scales)
-        return [corrected(response, coarse, fine, scale) for response, coarse, fine, scale in parts]
 
     def learn(self, points: Sequence[Array]) -> Runs:
         """Simulate at some points and make the emulator anew; the runs."""
         runs = []
         for i, point in enumerate(points):
             self.context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
-            runs.append(self._as_fine(self.laboratory.search(point)))
+            runs.append(self.as_fine(self.laboratory.search(point)))
         self.points, self.runs = [*self.points, *points], [*self.runs, *runs]
         self.emulator = Emulator.fit(self.bounds.names, np.array(self.points), self.runs)
         return runs

@@ -17,7 +17,7 @@ from ...identify.design import Candidate, Design, NoiseModel, candidate, choose,
 from ...identify.design import prior_information as bounds_information
 from ...identify.objective import SiteResponse
 from ...indentation import Parameters, SimulationJob, SiteModel, to_vector
-from ...study import Site, Study
+from ...study import Study
 from ..context import Context
 from ..simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
 from ..stages.calibrate import unknowns
@@ -78,22 +78,23 @@ def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[lis
             if depth > DEEPEST_SHARE * thickness:
                 left_out.append(f"site {site.name} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
             else:
-                models.append(_at_depth(own, site, depth))
+                models.append(_at_depth(own, depth))
     if not models:
         raise StudyError("no depth fits any site", file=study.file, remedy="give smaller --depths")
     return models, left_out
 
 
-def _at_depth(own: SiteModel, site: Site, depth: float) -> SiteModel:
-    """In and out at the speed of the record, or the planned one."""
-    top = int(np.argmax(own.knots_mm))
-    speed = own.knots_mm[top] / own.knots_s[top] if site.trace is not None else site.speed_mm_s
-    ramp = depth / speed
-    return replace(own, knots_s=(0.0, ramp, 2 * ramp), knots_mm=(0.0, depth, 0.0))
+def _at_depth(own: SiteModel, depth: float) -> SiteModel:
+    """The phases of the record, or of the plan, to another depth: at the same rates, held for as long."""
+    phases, share = own.history.phases, depth / max(own.knots_mm)
+    seconds = [phase.duration_s * (1.0 if phase.kind == "hold" else share) for phase in phases]
+    knots_mm = share * np.array([phases[0].start_mm, *(phase.end_mm for phase in phases)])
+    knots_s = np.r_[0.0, np.cumsum(seconds)]
+    return replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
 
 
 def _job(model: SiteModel, tissues: tuple[str, ...], vector: Array) -> SimulationJob:
-    times = np.linspace(0.0, model.knots_s[-1], CURVE_POINTS)
+    times = model.curve_times(CURVE_POINTS)
     return SimulationJob(model, tissues, tuple(map(float, vector)), tuple(map(float, times)))
 
 

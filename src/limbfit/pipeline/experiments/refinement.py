@@ -3,72 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from ...errors import InputError
 from ...indentation import Simulation
 from ..context import Context
 from ..simulations import experiment_cache
-from ..stages.geometry import make_mesh, mesh_job, mesh_settings
+from ..stages.mesh import make_mesh, mesh_job, mesh_settings
 from ..store import file_digest, read_json
+from .extrapolation import MESH_ORDERS, richardson
 from .sensitivity import identified_parameters, store_runs
 from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants
 
-Array = NDArray[np.float64]
 FACTORS = (1.4, 1.0, 0.7)  # of the edge lengths of the study's meshes
-ASSUMED_ORDER = 2.0
-ORDERS = (0.3, 6.0)  # in which a measured order of convergence is believed
 FARTHEST = 0.1  # of the force on the finest mesh: a limit farther away is no limit
-
-
-@dataclass(frozen=True)
-class Extrapolation:
-    """What a quantity tends to as meshes get finer, and the order at which it does.
-
-    ``measured``: the order follows from three meshes; otherwise it is assumed and the limit rests on the two
-    finest ones.
-    """
-
-    limit: float
-    order: float
-    measured: bool
-
-    def error_percent(self, value: float) -> float:
-        """How far a value is from the limit, in percent of it."""
-        return 100.0 * (value / self.limit - 1.0)
-
-
-def richardson(edges: Sequence[float], values: Sequence[float]) -> Extrapolation:
-    """``value = limit + a edge^order`` through the three finest meshes (Richardson; Roache 1998).
-
-    Where the values do not change in one direction, or at no order of `ORDERS`, order two is assumed.
-
-    Parameters
-    ----------
-    edges : (k,) edge lengths of two or more meshes, in any order.
-    values : (k,) what was computed on them.
-    """
-    if len(edges) < 2:
-        raise ValueError("two meshes or more are needed")
-    order = np.argsort(edges)
-    h, f = np.asarray(edges, dtype=float)[order][:3], np.asarray(values, dtype=float)[order][:3]
-
-    def mismatch(p: float) -> float:
-        return float((f[2] - f[1]) * (h[1] ** p - h[0] ** p) - (f[1] - f[0]) * (h[2] ** p - h[1] ** p))
-
-    measured = len(h) == 3 and (f[2] - f[1]) * (f[1] - f[0]) > 0.0
-    if measured and mismatch(ORDERS[0]) * mismatch(ORDERS[1]) < 0.0:
-        p = float(brentq(mismatch, *ORDERS))
-    else:
-        p, measured = ASSUMED_ORDER, False
-    share = h[0] ** p / (h[1] ** p - h[0] ** p)
-    return Extrapolation(float(f[0] - share * (f[1] - f[0])), p, measured)
 
 
 def run_refinement(
@@ -152,18 +102,20 @@ def _meshes(
 def _limit(one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> dict[str, Any]:
     """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
 
-    Nothing where they do not tend to anything yet.
+    Nothing where they do not tend to anything yet. With an element whose forces do not change in one
+    direction, the limit is the finest mesh's force, at no order.
     """
     done = {
         float(variant.facts["edge_near_mm"]): float(simulation.force_N.max())
         for variant, simulation in zip(variants, simulations, strict=True)
         if variant.chosen is one and simulation.completed
     }
-    own = next(v.facts["edge_near_mm"] for v in variants if v.chosen is one and v.base)
+    own = next(v for v in variants if v.chosen is one and v.base)
+    edge = float(own.facts["edge_near_mm"])
     nothing = dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))
-    if len(done) < 2 or own not in done:
+    if len(done) < 2 or edge not in done:
         return nothing
-    found = richardson(list(done), list(done.values()))
+    found = richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
     finest = done[min(done)]
     if abs(found.limit - finest) > FARTHEST * finest:
         return nothing
@@ -171,5 +123,5 @@ def _limit(one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[S
         "limit_N": found.limit,
         "order": found.order,
         "order_measured": found.measured,
-        "error_percent": found.error_percent(done[own]),
+        "error_percent": found.error_percent(done[edge]),
     }

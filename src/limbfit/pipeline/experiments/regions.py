@@ -18,8 +18,8 @@ from ...indentation import flat_names, to_parameters, to_vector
 from ...study import Site
 from ..context import Context
 from ..simulations import SimulationCache, experiment_cache
-from ..stages.calibrate import Laboratory, groupings, linearised, unknowns
-from ..stages.traces import SiteRecord, site_record
+from ..stages.calibrate import Laboratory, groupings, unknowns
+from ..stages.traces import SiteRecord, as_response, site_record
 from ..store import write_json
 from ..tabular import write_table
 
@@ -38,9 +38,10 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     stages = context.stored("calibrate", "calibration.json")["stages"]
     whole = to_vector(stages[-1]["parameters"], study.tissues)
     cache = experiment_cache(context, folder)
-    made = {name: _region(context, cache, *chosen) for name, chosen in members.items()}
+    benches = {name: Laboratory(context, cache, fitted, "regions") for name, (fitted, _) in members.items()}
+    made = {name: _region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
     found = fit_regions(made, unknowns(study), whole)
-    rows = [_row(context, name, members[name], fit) for name, fit in found.items()]
+    rows = [_row(context, name, benches[name], members[name], fit) for name, fit in found.items()]
     content = {
         "sites_used": sites,
         "left_out": _left_out(context, members),
@@ -90,8 +91,7 @@ def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
     return words + ([f"sites without a region: {', '.join(without)}"] if without else [])
 
 
-def _region(context: Context, cache: SimulationCache, fitted: Sequence[Site], mine: Sequence[Site]) -> Region:
-    laboratory = Laboratory(context, cache, fitted, "regions")
+def _region(context: Context, cache: SimulationCache, laboratory: Laboratory, mine: Sequence[Site]) -> Region:
     records = [site_record(context, site) for site in mine]
     stage = groupings(context.study)[-1:]
 
@@ -110,21 +110,20 @@ def _forces(
     """Forces on the study's own meshes; with derivatives where the study's prediction has made them so."""
     searched = context.study.mesh.coarse is None
     jobs = [record.job(parameters, sensitivities=searched) for record in records]
-    none = np.zeros((0, 0))
-    return [
-        SiteResponse(one.force_N, none, one.completed, one.reason)
-        for one in cache.run(jobs, context.executor)
-    ]
+    return [as_response(one) for one in cache.run(jobs, context.executor)]
 
 
 def _row(
-    context: Context, name: str, chosen: tuple[list[Site], list[Site]], fit: RegionFit
+    context: Context,
+    name: str,
+    laboratory: Laboratory,
+    chosen: tuple[list[Site], list[Site]],
+    fit: RegionFit,
 ) -> dict[str, Any]:
     """What ``regions.json`` holds of a region."""
     study, found = context.study, fit.calibration
     fitted, mine = chosen
-    records = [site_record(context, site) for site in fitted]
-    known = linearised(study, records, found.parameters, found.responses)
+    known = laboratory.uncertainty(found, groupings(study)[-1])
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, key), limits in zip(flat_names(study.tissues), known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits

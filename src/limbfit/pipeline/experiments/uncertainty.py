@@ -10,22 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import RunError
+from ...identify.correction import CoarseToFine
 from ...identify.discrepancy import ResidualModel
 from ...identify.evidence import Evidence, candidate, compare
 from ...identify.explore import Explored, ExploreSettings, explore
-from ...identify.fidelity import Anchor, corrected
 from ...identify.likelihood import Likelihood
-from ...identify.objective import Measured, SiteResponse
+from ...identify.objective import SiteResponse
 from ...identify.parameters import search_space, shared
 from ...identify.sources import Gain
-from ...identify.uncertainty import Uncertainty
 from ...indentation import Parameters, to_vector
 from ..context import Context
 from ..simulations import experiment_cache
-from ..stages.calibrate import groupings, linearised, stage_titles, unknowns
+from ..stages.calibrate import Laboratory, groupings, linearised, stage_titles, unknowns
 from ..stages.record_noise import site_noise
-from ..stages.traces import site_record
+from ..stages.traces import as_response, site_record
 from .uncertainty_record import Found, Predicted, write_results
 from .uncertainty_sources import Change, changes, variants
 
@@ -35,24 +33,16 @@ _NEAR = 4.0  # runs of the calibration whose error is at most this many times th
 NAME = "uncertainty"
 
 
-class FittedSites:
+class FittedSites(Laboratory):
     """The fitted sites, simulated with derivatives; brought to the fine meshes' forces where those exist."""
 
     def __init__(
         self, context: Context, folder: Path, best: Array, earlier: Mapping[tuple[float, ...], Array | None]
     ) -> None:
         """``earlier``: parameters that the calibration simulated, and where it started them from."""
-        study = context.study
+        super().__init__(context, experiment_cache(context, folder), context.study.fitted, NAME)
         self.best, self.earlier = best, earlier
-        coarse = study.mesh.coarse is not None
-        self.context, self.cache = context, experiment_cache(context, folder)
-        self.records = [site_record(context, site) for site in study.fitted]
-        self.searched = [site_record(context, site, coarse) for site in study.fitted]
-        self.anchor = self._anchor(best) if coarse else None
-
-    @property
-    def measured(self) -> list[Measured]:
-        return [record.measured for record in self.records]
+        self.at_best, self.as_fine = self.correction(best)
 
     def simulate(self, points: Sequence[Array]) -> list[list[SiteResponse]]:
         """Responses of all sites at several parameters (p,)."""
@@ -65,30 +55,13 @@ class FittedSites:
             found.append(record.respond(simulation))
             self.context.tell(NAME, len(found), len(jobs), f"site {simulation.site}")
         n = len(self.searched)
-        return [self._corrected(found[i : i + n]) for i in range(0, len(found), n)]
+        return [self.as_fine(found[i : i + n]) for i in range(0, len(found), n)]
 
     def _first_guess(self, point: Array) -> Array | None:
         """Where a simulation starts from: as in the calibration, or from the answer; None: from rest."""
         if np.array_equal(point, self.best):
             return None
         return self.earlier.get(tuple(point.tolist()), self.best)
-
-    def _anchor(self, best: Array) -> Anchor:
-        jobs = [record.job(best) for record in self.searched]
-        jobs += [record.job(best, sensitivities=False) for record in self.records]
-        ends = list(self.cache.run(jobs, self.context.executor))
-        failed = [end.site for end in ends if not end.completed]
-        if failed:
-            raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
-        n = len(self.records)
-        forces = [record.respond(end).force_N for record, end in zip(cycle(self.records), ends)]
-        return Anchor(best, tuple(forces[:n]), tuple(forces[n:]))
-
-    def _corrected(self, responses: list[SiteResponse]) -> list[SiteResponse]:
-        if self.anchor is None:
-            return responses
-        parts = zip(responses, self.anchor.coarse, self.anchor.fine, self.anchor.scales, strict=True)
-        return [corrected(*part) for part in parts]
 
 
 def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
@@ -98,7 +71,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     best = to_vector(calibration["stages"][-1]["parameters"], study.tissues)
     earlier = _earlier_points(context, calibration)
     sites = FittedSites(context, folder, best, earlier)
-    known = _linearised(context, sites, best)
+    known = linearised(study, sites.records, best, sites.at_best)
     table, grouping = study.uncertainty, groupings(study)[-1]
     space = search_space(unknowns(study), grouping)
     settings = ExploreSettings(table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed)
@@ -113,8 +86,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         tell=lambda text: context.tell(NAME, 0, 0, text),
     )
     evidence = _evidence(context, explored, known.residual_model) if len(study.tissues) > 1 else None
-    responses = sites.simulate([best])[0]
-    gain = Gain.at(best, responses, known.residual_model, unknowns(study), space)
+    gain = Gain.at(best, sites.at_best, known.residual_model, unknowns(study), space)
     found: list[Change] = []
     if table.sources:
         wanted = variants(context, folder, sites.searched, best)
@@ -122,14 +94,6 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     result = Found(known, explored, evidence, gain, tuple(found), unknowns(study))
     write_results(folder, result, _predicted(context, sites, best))
     return {"runs": explored.rounds[-1].runs}
-
-
-def _linearised(context: Context, sites: FittedSites, best: Array) -> Uncertainty:
-    responses = sites.simulate([best])[0]
-    failed = [record.site.name for record, r in zip(sites.records, responses) if not r.completed]
-    if failed:
-        raise RunError(f"the identified parameters cannot be simulated at site {failed[0]}")
-    return linearised(context.study, sites.records, best, responses)
 
 
 def _earlier_points(context: Context, calibration: dict[str, Any]) -> dict[tuple[float, ...], Array | None]:
@@ -170,13 +134,10 @@ def _predicted(context: Context, sites: FittedSites, best: Array) -> list[Predic
     jobs = [record.job(best) for record in searched]
     if coarse:
         jobs += [site_record(context, site).job(best, sensitivities=False) for site in recorded]
-    ends = list(sites.cache.run(jobs, context.executor))
-    found = []
-    for i, record in enumerate(searched):
-        derived, force = ends[i], ends[i + len(searched)] if coarse else ends[i]
-        if not (derived.completed and force.completed) or derived.jacobian is None:
-            continue
-        scale = float(force.force_N @ derived.force_N / (derived.force_N @ derived.force_N))
-        response = SiteResponse(force.force_N, scale * derived.jacobian)
-        found.append(Predicted(record, response, site_noise(study, record, response.force_N)))
-    return found
+    ends = [as_response(end) for end in sites.cache.run(jobs, context.executor)]
+    n = len(searched)
+    responses = CoarseToFine(ends[:n], ends[n:])(ends[:n]) if coarse else ends
+    return [
+        Predicted(r, end, site_noise(study, r, end.force_N) if end.completed else None)
+        for r, end in zip(searched, responses)
+    ]

@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 NORMAL_95 = 1.959964
 _DRAWS = 1500  # written
+_SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "noise", "misfit")}
+_MOST_OFF = 0.5  # of the rise that ends an interval: differences beyond it are told
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,12 @@ class Found:
 
 @dataclass(frozen=True)
 class Predicted:
-    """A recorded site as predicted at the identified parameters, beside its record and the record's noise."""
+    """A recorded site as predicted at the identified parameters, beside its record and the record's noise
+    (None where the prediction failed)."""
 
     record: SiteRecord
     response: SiteResponse
-    noise: SiteNoise
+    noise: SiteNoise | None
 
 
 def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
@@ -101,9 +104,9 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     _table(
         folder / "profiles.csv",
         [
-            {"parameter": one.name, "value": value, "rise": rise}
+            {"parameter": one.name, "value": value, "rise": rise, "extrapolated": bool(beyond)}
             for one in explored.profiles
-            for value, rise in zip(one.values, one.rise)
+            for value, rise, beyond in zip(one.values, one.rise, one.extrapolated, strict=True)
         ],
     )
 
@@ -137,6 +140,7 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
                 "posterior_95": [float(low), float(high)],
                 "profile_95": None if profile is None else list(profile.interval_95),
                 "profile_verdict": None if profile is None else profile.verdict,
+                "profile_extrapolated": None if profile is None else list(profile.ends_extrapolated),
                 "with_sources_95": list(map(float, with_sources)),
                 "verdict": GIVEN if given else verdict_of(float(factor), more[i] / prior_sd),
             }
@@ -211,8 +215,14 @@ def _source(found: Found, change: Change) -> dict[str, Any]:
 
 
 def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
-    """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside."""
+    """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
+
+    Of a site whose prediction failed there is the reason only.
+    """
     model, record = found.known.residual_model, one.record
+    facts = {"site": record.site.name, "fitted": record.site.fitted, "reason": one.response.reason}
+    if one.noise is None:
+        return facts | dict.fromkeys(("inside_percent", "half_width_percent", *_SHARES.values()))
     parameters = found.known.parameters
     force, measured = one.response.force_N, record.force_N
     peak = float(force.max())
@@ -241,12 +251,10 @@ def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
         force_high_N=high,
     )
     inside = (measured >= low) & (measured <= high)
-    return {
-        "site": record.site.name,
-        "fitted": record.site.fitted,
+    return facts | {
         "inside_percent": 100 * float(inside.mean()),
         "half_width_percent": 100 * float(half.mean()) / peak,
-        **{f"{k}_sd_percent": 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()},
+        **{_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()},
     }
 
 
@@ -254,7 +262,7 @@ def _coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Mean share of the records inside their intervals, in percent."""
     found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
-        shares = [row["inside_percent"] for row in rows if row["fitted"] == fitted]
+        shares = [row["inside_percent"] for row in rows if row["fitted"] == fitted and not row["reason"]]
         found[f"coverage_{kind}_percent"] = float(np.mean(shares)) if shares else None
     return found
 
@@ -300,10 +308,35 @@ def _verdict(
     coverage = _coverage(rows)["coverage_heldout_percent"]
     if coverage is not None:
         words.append(f"{coverage:.0f} % of the held-out records lies inside the 95 % prediction intervals.")
+    words += [f"Site {row['site']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
+    words += _of_profiles(found.explored)
     if not found.explored.good_enough:
         words.append("The emulator is not as good as the records: raise uncertainty.runs.")
     if not found.explored.posterior.long_enough:
         words.append("The sampler's chain is short for its autocorrelation: intervals are rough.")
+    return words
+
+
+def _of_profiles(explored: Explored) -> list[str]:
+    """Where profiles rest on an emulator beyond its runs, and what the solver said there."""
+    beyond = [one.name for one in explored.profiles if any(one.ends_extrapolated)]
+    words = []
+    if beyond:
+        words.append(
+            "Profiles end beyond the emulator's simulations, where they are extrapolated: "
+            f"{', '.join(beyond)}."
+        )
+    thresholds = {one.name: one.threshold for one in explored.profiles}
+    for check in explored.checks:
+        if None in check.solved:
+            words.append(f"An end of the profile of {check.name} could not be simulated.")
+        off = check.largest_difference
+        if off is not None and off > _MOST_OFF * thresholds[check.name]:
+            words.append(
+                f"At an end of the profile of {check.name} solver and emulator differ by {off:.1f} in "
+                f"-2 ln L, where a rise of {thresholds[check.name]:.1f} ends an interval: it rests there on "
+                "the emulator alone."
+            )
     return words
 
 

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from ...anatomy.meshing import MeshSettings
 from ...anatomy.sites import indenter_axis, project_to_skin
 from ...anatomy.surfaces import load_anatomy
+from ...fe import ORDER_IN_TIME
 from ...indentation import SimulationJob, SiteModel
 from ...study import SolverTable, Study, Vector
 from ..context import Context
 from ..simulations import SimulationCache
-from ..stages.geometry import coarse_settings, make_mesh, mesh_job, mesh_settings
+from ..stages.mesh import coarse_settings, make_mesh, mesh_job, mesh_settings
 from ..stages.traces import SiteRecord, site_record
 from ..store import file_digest
+from .extrapolation import MESH_ORDERS, error_of_coarser, error_of_finer
 
 Array = NDArray[np.float64]
 
@@ -83,7 +85,9 @@ def variants(
         found.append(vary("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True))
     found += _of_contact(context.study, models, vary)
     finer = [replace(m, steps=_more_steps(m)) for m in models]
-    found.append(vary("time steps", f"{MORE_STEPS} times as many", finer, True, True))
+    change = f"{MORE_STEPS} times as many, extrapolated at order {ORDER_IN_TIME:g}"
+    in_time = vary("time steps", change, finer, True, True)
+    found.append(replace(in_time, scale=error_of_coarser(ORDER_IN_TIME, MORE_STEPS)))
     found.append(_of_mesh(context, folder, records, plain, parameters))
     return found
 
@@ -186,21 +190,30 @@ def _of_mesh(
     plain: tuple[SimulationJob, ...],
     parameters: Array,
 ) -> Variant:
-    """How far forces are from those of an infinitely fine mesh, extrapolated from two (order 2)."""
+    """How far forces are from those of an infinitely fine mesh, from two."""
     study = context.study
     settings = searched_settings(study)
     if study.mesh.coarse is not None:
-        fine = [site_record(context, record.site).job(parameters, sensitivities=False) for record in records]
-        ratio = (settings.edge_near_mm / study.mesh.edge_near_mm) ** 2
-        change = "what the fine mesh lacks, from coarse and fine"
-        return Variant("mesh", change, tuple(fine), plain, False, True, 1 / max(ratio - 1, 0.2))
-    finer = replace(
-        settings, edge_near_mm=FINER * settings.edge_near_mm, edge_far_mm=FINER * settings.edge_far_mm
-    )
-    models = _meshed(context, folder / "finer", [record.model for record in records], finer)
-    jobs = tuple(replace(job, model=model) for job, model in zip(plain, models, strict=True))
-    change = f"what the mesh lacks, from edges {FINER:g} times as long"
-    return Variant("mesh", change, jobs, plain, False, True, 1 / (1 - FINER**2))
+        jobs = [site_record(context, record.site).job(parameters, sensitivities=False) for record in records]
+    else:
+        finer = replace(
+            settings, edge_near_mm=FINER * settings.edge_near_mm, edge_far_mm=FINER * settings.edge_far_mm
+        )
+        models = _meshed(context, folder / "finer", [record.model for record in records], finer)
+        jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
+    change, scale = mesh_share(study)
+    return Variant("mesh", change, tuple(jobs), plain, False, True, scale)
+
+
+def mesh_share(study: Study) -> tuple[str, float]:
+    """In words and as a factor: what the mesh of the answer lacks, over the difference of two meshes."""
+    order = MESH_ORDERS[study.mesh.element]
+    how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
+    if study.mesh.coarse is not None:
+        ratio = study.mesh.coarse.edge_near_mm / study.mesh.edge_near_mm
+        return f"what the fine mesh lacks, from coarse and fine: {how}", error_of_finer(order, ratio)
+    what = f"what the mesh lacks, from edges {FINER:g} times as long: {how}"
+    return what, error_of_coarser(order, 1 / FINER)
 
 
 def changes(context: Context, cache: SimulationCache, wanted: Sequence[Variant]) -> list[Change]:

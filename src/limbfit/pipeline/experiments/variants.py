@@ -61,7 +61,7 @@ class Variant:
     @property
     def times(self) -> Array:
         """Times (k,) s of the compared forces."""
-        return np.linspace(0.0, self.model.knots_s[-1], CURVE_POINTS)
+        return self.model.curve_times(CURVE_POINTS)
 
 
 def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
@@ -173,7 +173,7 @@ def write_variants(folder: Path, variants: Sequence[Variant], simulations: Seque
         write_curves(
             folder / f"{name}.csv",
             time_s=first.times,
-            displacement_mm=np.interp(first.times, first.model.knots_s, first.model.knots_mm),
+            displacement_mm=first.model.history.at(first.times),
             **forces,
         )
 

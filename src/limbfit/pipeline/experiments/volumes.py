@@ -44,7 +44,7 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
         facts=dict(result.statistics) | {"volume": _volume(result, model)},
-        warnings=result.warnings,
+        doubts=result.doubts,
     )
 
 

@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import StudyError
+from ...errors import RunError, StudyError
 from ...identify.calibration import Calibration, CalibrationSettings, State, calibrate
+from ...identify.correction import CoarseToFine
 from ...identify.fidelity import FidelitySettings, Round, calibrate_corrected
+from ...identify.intervals import Kept, sampled_uncertainty
 from ...identify.multistart import Multistart, describe, multistart
 from ...identify.objective import Measured, SiteResponse
-from ...identify.parameters import Grouping, Prior, Unknowns, constrained, two_stages
-from ...identify.uncertainty import Uncertainty, estimate_uncertainty
-from ...indentation import Parameters, SimulationJob, flat_names, to_parameters, to_vector
+from ...identify.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
+from ...identify.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
+from ...indentation import (
+    Parameters,
+    Simulation,
+    SimulationJob,
+    flat_names,
+    to_parameters,
+    to_vector,
+)
 from ...study import Site, Study
 from ..context import Context
 from ..simulations import SimulationCache
 from ..store import write_json
+from .doubted import Doubted, contact_record, doubts_record
 from .plausible import stored_flags
 from .record_noise import site_noise
 from .traces import SiteRecord, site_record
 
 Array = NDArray[np.float64]
+Responses = list[SiteResponse]
 NEAR = 1.5  # in logarithms of parameters: as far as another simulation's states save work as first guesses
+ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too sure"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -53,6 +65,10 @@ class Laboratory:
             self.searched = [site_record(context, site, coarse=True) for site in sites]
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
+        self.latest: dict[str, Simulation] = {}
+        self.penalties: dict[str, float | None] = {}
+        self.doubts: list[Doubted] = []
+        self.kept = Kept()
         self._rested: Array | None = None
         self._starts: dict[bytes, Array | None] = {}
 
@@ -60,12 +76,14 @@ class Laboratory:
     def measured(self) -> list[Measured]:
         return [record.measured for record in self.records]
 
-    def search(self, parameters: Array) -> list[SiteResponse]:
+    def search(self, parameters: Array) -> Responses:
         """Force and derivatives where parameters are searched."""
         self.evaluations += 1
         start = self.first_guess(parameters)
         jobs = [record.job(parameters, start=start) for record in self.searched]
-        return self._run(jobs, f"evaluation {self.evaluations}")
+        found = self._run(jobs, f"evaluation {self.evaluations}", searched=parameters)
+        self.kept.add(parameters, found)
+        return found
 
     def first_guess(self, parameters: Array) -> Array | None:
         """Parameters simulated from rest near these; None where these are to be simulated so themselves.
@@ -82,17 +100,59 @@ class Laboratory:
             self._starts[key] = rested
         return self._starts[key]
 
-    def answer(self, parameters: Array) -> list[SiteResponse]:
+    def answer(self, parameters: Array) -> Responses:
         """The forces of an answer, from rest as all that follows takes them; ``warnings`` are then theirs."""
         if self.searched is not self.records:
             return self.check(parameters)
         return self._run([record.job(parameters) for record in self.records], "the answer, from rest")
 
-    def check(self, parameters: Array) -> list[SiteResponse]:
+    def check(self, parameters: Array) -> Responses:
         """Force on the study's own meshes; what failed before is tried again."""
         self.corrections += 1
         jobs = [record.job(parameters, sensitivities=False) for record in self.records]
         return self._run(jobs, f"correction {self.corrections}", again=True)
+
+    def correction(self, parameters: Array) -> tuple[Responses, Callable[[Responses], Responses]]:
+        """The responses at an answer, and what brings those of `search` to the study's own meshes.
+
+        Raises
+        ------
+        RunError
+            Where a site cannot be simulated there.
+        """
+        found = self.search(parameters)
+        correct: Callable[[Responses], Responses] = list
+        if self.searched is not self.records:
+            correct = CoarseToFine(found, self.check(parameters))
+        found = correct(found)
+        for one in found:
+            if not one.completed:
+                raise RunError(f"site {one.site} cannot be simulated at the answer: {one.reason}")
+        return found, correct
+
+    def uncertainty(self, found: Calibration, grouping: Grouping) -> Uncertainty:
+        """What the records tell about an answer, sampled on what was simulated near it and a little more.
+
+        Where that cannot be, for simulations that fail, it is linearised and a line says so.
+        """
+        study = self.context.study
+        known = linearised(study, self.records, found.parameters, found.responses)
+        fine = self.searched is self.records
+        as_fine: Callable[[Responses], Responses] = list if fine else self.correction(found.parameters)[1]
+        kept = Kept()
+        for point, run in zip(self.kept.points, self.kept.responses, strict=True):
+            kept.add(point, as_fine(list(run)))
+
+        def simulate(parameters: Array) -> Responses:
+            self.context.tell(self.title, 0, 0, "a further evaluation, for the intervals")
+            return as_fine(self.search(parameters))
+
+        bounds = unknowns(study)
+        space = search_space(bounds, grouping)
+        sampled = sampled_uncertainty(known, self.measured, bounds, space, kept, simulate)
+        if sampled.method == LINEARISED:
+            self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
+        return sampled
 
     def _facts(self, state: State) -> dict[str, Any]:
         """The newest iterate in numbers: error in percent of the largest force, parameters, cost."""
@@ -112,14 +172,24 @@ class Laboratory:
             "parameters": to_parameters(np.array(last.parameters), self.context.study.tissues),
         }
 
-    def _run(self, jobs: Sequence[SimulationJob], what: str, again: bool = False) -> list[SiteResponse]:
+    def _run(
+        self, jobs: Sequence[SimulationJob], what: str, again: bool = False, searched: Array | None = None
+    ) -> Responses:
+        """Responses to the jobs; doubts about those of the search, with ``searched`` parameters, are kept."""
         found = []
-        self.warnings = {}
+        self.warnings, self.latest = {}, {}
         done = self.cache.run(jobs, self.context.executor, again)
         for record, simulation in zip(self.records, done, strict=True):
             found.append(record.respond(simulation))
+            self.latest[simulation.site] = simulation
             if simulation.warnings:
                 self.warnings[simulation.site] = list(simulation.warnings)
+            if searched is not None:
+                self.penalties[simulation.site] = simulation.facts.get("penalty_per_mm")
+                self.doubts += [
+                    Doubted(self.evaluations, simulation.site, tuple(searched.tolist()), doubt)
+                    for doubt in simulation.doubts
+                ]
             self.context.tell(self.title, 0, 0, f"{what}, site {simulation.site}")
         return found
 
@@ -171,14 +241,20 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     tried = multistart(run, unknowns(study), table.starts, table.seed)
     found = tried.best
-    known = linearised(study, laboratory.records, found.parameters, found.responses)
+    known = laboratory.uncertainty(found, stages[-1])
     rounds = rounds_of[tried.number]
-    laboratory.answer(found.parameters)
+    answers = laboratory.answer(found.parameters)
+    for site, texts in laboratory.warnings.items():
+        context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
     content = _calibration_record(context, found, known, laboratory)
     content |= {
         "corrections": [_round_record(one, found.sites, study.tissues) for one in rounds],
         "multistart": _multistart_record(tried, study.tissues) if table.starts > 1 else None,
         "warnings": laboratory.warnings,
+        "contact": contact_record(laboratory.latest, laboratory.penalties, answers, found.responses),
+        "doubts": doubts_record(
+            laboratory.doubts, laboratory.latest, laboratory.evaluations * len(laboratory.records), found
+        ),
     }
     write_json(folder / "calibration.json", content)
     return {}
@@ -191,7 +267,9 @@ def linearised(
     pairs = zip(records, responses, strict=True)
     noise = [site_noise(study, record, response.force_N) for record, response in pairs]
     measured = [record.measured for record in records]
-    return estimate_uncertainty(parameters, responses, measured, unknowns(study), noise, groupings(study)[-1])
+    return estimate_uncertainty(
+        parameters, responses, measured, unknowns(study), noise, groupings(study)[-1], settings(study)
+    )
 
 
 def settings(study: Study) -> CalibrationSettings:
@@ -333,9 +411,11 @@ def _uncertainty_record(known: Uncertainty, tissues: Sequence[str]) -> dict[str,
     for (tissue, name), interval in zip(flat_names(tissues), known.intervals_95.tolist(), strict=True):
         intervals[tissue][name] = interval
     return {
+        "method": known.method,
         "intervals_95": intervals,
         "correlation": {"names": list(known.names), "matrix": known.correlation.tolist()},
         "covariance_log": known.covariance.tolist(),
+        "sampling_covariance_log": known.sampling_covariance.tolist(),
         "verdict": dict(zip(known.names, known.verdicts, strict=True)),
         "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
         "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +11,9 @@ from ...anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labe
 from ...anatomy.one_limb import check_one_limb
 from ...anatomy.placement import on_grid_of
 from ...anatomy.segmentation import segment
-from ...errors import InputError
 from ...study import Study
 from ..corrections import hand_labels
+from .files import naming
 
 
 def study_image(study: Study) -> Volume:
@@ -87,21 +85,3 @@ def automatic_labels(study: Study, volume: Volume) -> LabelMap:
     return on_grid_of(
         LabelMap(found.array, near.spacing, near.origin, near.direction, found.names), volume, path
     )
-
-
-def labelled_file(study: Study) -> Path:
-    """What the labels of a study come from: its label map, or the image."""
-    assert study.image is not None
-    table = study.segmentation
-    return study.path(table.labels or table.contours or hand_labels(study) or study.image.path)
-
-
-@contextmanager
-def naming(file: Path) -> Iterator[None]:
-    """Say which file an error is about, where it does not say so itself."""
-    try:
-        yield
-    except InputError as error:
-        if error.file is not None:
-            raise
-        raise type(error)(error.what, file=file, place=error.place, remedy=error.remedy) from None

@@ -11,9 +11,8 @@ from ...anatomy.marked import marked_skin, without_markers
 from ...anatomy.registration import limb_motion
 from ...anatomy.surfaces import write_surface
 from ...study import Study
-from .inputs import marked_image, naming
-
-MARKED_SKIN = "skin-markers.stl"
+from .files import MARKED_SKIN, naming
+from .inputs import marked_image
 
 
 def without_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, dict[str, Any]]:

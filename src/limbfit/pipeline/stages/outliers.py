@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...identify.correction import CoarseToFine
 from ...identify.objective import Measured, SiteResponse
 from ...identify.outliers import Exchange, FirstOrder, as_driven, find_outliers
 from ...identify.plausibility import explained
-from ...indentation import Simulation, SimulationJob
+from ...indentation import SimulationJob
 from ..context import Context
 from ..simulations import SimulationCache
 from .plausible import stored_flags
-from .traces import SiteRecord
+from .traces import SiteRecord, as_response
 
 Array = NDArray[np.float64]
 
@@ -25,32 +26,40 @@ def outlier_record(
     context: Context,
     cache: SimulationCache,
     records: Sequence[SiteRecord],
-    ours: Sequence[Simulation],
+    ours: Sequence[SiteResponse],
     best: Array,
     one: Array,
     searched: Sequence[SiteRecord],
+    correction: CoarseToFine | None,
 ) -> dict[str, Any]:
     """What ``predict.json`` holds of flags: on the records themselves, and on those that the model misses.
 
     Parameters
     ----------
-    ours : the records' simulations with the identified parameters ``best``, with derivatives.
+    ours : the records' sites with the identified parameters ``best``, with derivatives; those that failed
+        are not looked at.
     one : the answer with one material.
     searched : the records on the meshes on which parameters are searched.
+    correction : brings responses there to those of the study's own meshes; None where they are the same.
     """
     plain = stored_flags(context)
-    whole = [i for i, simulation in enumerate(ours) if simulation.completed]
+    whole = [i for i, response in enumerate(ours) if response.completed]
     records, searched = [records[i] for i in whole], [searched[i] for i in whole]
-    known = [_response(ours[i]) for i in whole]
+    known, failed = [ours[i] for i in whole], list[str]()
 
     def simulate(parameters: Array) -> list[SiteResponse]:
         if np.array_equal(parameters, best):
             return known
-        return _run(context, cache, [record.job(parameters, start=best) for record in searched])
+        found = _run(context, cache, [record.job(parameters, start=best) for record in searched])
+        found = found if correction is None else correction.of(whole)(found)
+        failed.extend(f"site {r.site}, one material: {r.reason}" for r in found if not r.completed)
+        return found
 
     def exactly(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
         jobs = [_driven_by(searched[a], searched[b], parameters) for a, b in ((i, j), (j, i))]
         one, two = _run(context, cache, jobs)
+        pairs = ((one, two), (two, one))
+        failed.extend(f"site {a.site}, record of {b.site}: {a.reason}" for a, b in pairs if not a.completed)
         return one, two
 
     found = find_outliers(
@@ -65,7 +74,7 @@ def outlier_record(
     flags = [flag.to_dict() | {"found": "in the record"} for flag in plain]
     against = explained(found.flags, plain)
     flags += [flag.to_dict() | {"found": "against the model"} for flag in against]
-    return {"flags": flags, "left_out": left_out}
+    return {"flags": flags, "left_out": left_out, "failed": list(dict.fromkeys(failed))}
 
 
 def _exchange(records: Sequence[SiteRecord]) -> Callable[[FirstOrder], Exchange]:
@@ -92,10 +101,5 @@ def _run(context: Context, cache: SimulationCache, jobs: Sequence[SimulationJob]
     found = []
     for simulation in cache.run(jobs, context.executor):
         context.tell("predict", 0, 0, f"looking at site {simulation.site} for what is wrong")
-        found.append(_response(simulation))
+        found.append(as_response(simulation))
     return found
-
-
-def _response(simulation: Simulation) -> SiteResponse:
-    assert simulation.jacobian is not None
-    return SiteResponse(simulation.force_N, simulation.jacobian, simulation.completed, simulation.reason)

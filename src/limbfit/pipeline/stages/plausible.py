@@ -18,6 +18,9 @@ from .traces import read_curves
 
 Placed = Mapping[str, Mapping[str, Any]]
 
+# Radius of a circle with the section of each shape of indenter, over its width.
+SECTION_RADIUS = {"square": np.pi**-0.5, "stl": np.pi**-0.5, "cylinder": 0.5, "sphere": 0.5}
+
 
 def stored_flags(context: Context) -> tuple[Flag, ...]:
     """Flags on all recorded sites from the stages ``surfaces``, ``sites`` and ``traces``."""
@@ -52,7 +55,13 @@ def record_flags(
         _facts(study, site, records[site.name], steps_s[site.name], radius, placed.get(site.name), anatomy)
         for site in recorded
     ]
-    return implausible(facts)
+    remarks = tuple(_flag(site.name, r) for site in recorded for r in records[site.name].get("remarks", ()))
+    return (*remarks, *implausible(facts))
+
+
+def _flag(site: str, remark: Mapping[str, Any]) -> Flag:
+    """What reading a record had to say about it."""
+    return Flag((site,), **remark)
 
 
 def _radius(study: Study) -> float:
@@ -61,7 +70,7 @@ def _radius(study: Study) -> float:
     file = None if table.file is None else study.path(table.file)
     shape = table.model_copy(update={"file": file})
     width = read_indenter(shape, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
-    return float(width / np.sqrt(np.pi)) if table.shape in ("square", "stl") else width / 2
+    return float(SECTION_RADIUS[table.shape] * width)
 
 
 def _facts(
@@ -79,6 +88,7 @@ def _facts(
         axis = np.array(row["axis"])
         normal = indenter_axis(anatomy.skin, row["position_mm"], width)
         facts = {
+            "position_mm": tuple(row["position_mm"]),
             "thickness_mm": tissue_under(anatomy, row["position_mm"], normal, width),
             "axis_deg": float(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1)))),
             "off_skin_mm": row["off_skin_mm"] if row["marker"] is None else None,

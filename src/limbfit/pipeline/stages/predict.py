@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.fidelity import Anchor, corrected
+from ...identify.correction import CoarseToFine
 from ...identify.objective import SiteResponse
 from ...identify.prediction import Known, error_percent, summarise
 from ...indentation import (
@@ -27,9 +27,14 @@ from ..context import Context
 from ..simulations import SimulationCache
 from ..store import write_json
 from .outliers import outlier_record
-from .traces import SiteRecord, site_record, write_curves
+from .traces import SiteRecord, as_response, site_record, write_curves
 
 Array = NDArray[np.float64]
+_MISSING = {
+    "force": "no force is predicted",
+    "interval": "no 95 % interval and no check against the other sites",
+    "one_material": "no force with one material",
+}
 
 
 def run_predict(context: Context, folder: Path) -> dict[str, Any]:
@@ -49,23 +54,22 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         simulations.append(simulation)
         context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
     n = len(records)
-    ours, others = simulations[:n], simulations[n:]
-    coarse, simple = ([], others) if study.mesh.coarse is None else (others[:n], others[n:])
-    if coarse:
-        simple = [
-            s if record.site.fitted else _fine_force(s, fine, rough)
-            for record, s, fine, rough in zip(records, simple, ours, coarse)
-        ]
-        ours = [_with_derivatives(*parts) for parts in zip(ours, coarse)]
-    _write_fields(context, folder, records, best, len(jobs))
-    rows = []
-    for record, with_all, with_one in zip_longest(records, ours, simple):
-        _write_prediction(folder, record, with_all, with_one, best, known)
-        rows.append(_row(record, with_all, with_one))
-    searched = records
+    ours = own = [as_response(simulation) for simulation in simulations[:n]]
+    others = [as_response(simulation) for simulation in simulations[n:]]
+    searched, correction = records, None
     if study.mesh.coarse is not None:
         searched = [site_record(context, record.site, coarse=True) for record in records]
-    doubts = outlier_record(context, cache, records, ours, best, one, searched)
+        coarse, others = others[:n], others[n:]
+        correction = CoarseToFine(coarse, own)
+        ours = correction(coarse)
+        fine = correction(others) if others else []
+        others = [as_is if r.site.fitted else held for r, as_is, held in zip(records, others, fine)]
+    sites = [SitePrediction(*parts) for parts in zip_longest(records, simulations[:n], ours, others)]
+    _write_fields(context, folder, [site.record for site in sites if site.own.completed], best, len(jobs))
+    for site in sites:
+        _write_curves(folder, site, best, known)
+    rows = [_row(site) for site in sites]
+    doubts = outlier_record(context, cache, records, ours, best, one, searched, correction)
     write_json(folder / "predict.json", {"sites": rows, **_means(rows), **doubts})
     return {}
 
@@ -113,18 +117,31 @@ def _jobs(
     return jobs
 
 
-def _with_derivatives(fine: Simulation, coarse: Simulation) -> Simulation:
-    """The fine force with the coarse mesh's derivatives, scaled as the forces are."""
-    assert coarse.jacobian is not None
-    scale = Anchor(np.zeros(0), (coarse.force_N,), (fine.force_N,)).scales[0]
-    return replace(fine, jacobian=scale * coarse.jacobian)
+@dataclass(frozen=True)
+class SitePrediction:
+    """A recorded site at the answer: its own mesh's simulation, the same with derivatives, and with one
+    material (None where that is the answer). Force and derivatives at the times of the record."""
 
+    record: SiteRecord
+    own: Simulation
+    ours: SiteResponse
+    one: SiteResponse | None
 
-def _fine_force(simple: Simulation, fine: Simulation, coarse: Simulation) -> Simulation:
-    """The one material's force on a coarse mesh, corrected by what is known with all materials."""
-    anchor = Anchor(np.zeros(0), (coarse.force_N,), (fine.force_N,))
-    rough = SiteResponse(simple.force_N, np.zeros((simple.force_N.size, 0)))
-    return replace(simple, force_N=corrected(rough, coarse.force_N, fine.force_N, anchor.scales[0]).force_N)
+    @property
+    def missing(self) -> dict[str, str]:
+        """What is not predicted, and why."""
+        found = {} if self.ours.completed else {"interval": self.ours.reason}
+        if not self.own.completed:
+            found = {"force": self.own.reason}
+        if self.one is not None and not self.one.completed:
+            found["one_material"] = self.one.reason
+        return found
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful or missing."""
+        doubts = self.ours.doubts if self.ours.completed else self.own.warnings
+        return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing.items())]
 
 
 @dataclass(frozen=True)
@@ -155,42 +172,48 @@ def _write_fields(
         context.tell("predict", before + i + 1, total, f"fields of site {name}")
 
 
-def _write_prediction(
-    folder: Path, record: SiteRecord, ours: Simulation, one: Simulation | None, best: Array, known: Known
-) -> None:
-    assert ours.jacobian is not None
-    half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.site.name)
-    write_curves(
-        folder / f"{record.site.name}.csv",
-        time_s=record.times_s,
-        displacement_mm=record.displacement_mm,
-        force_measured_N=record.force_N,
-        force_simulated_N=ours.force_N,
-        **({} if one is None else {"force_one_material_N": one.force_N}),
-        force_low_N=np.maximum(ours.force_N - half, 0.0),
-        force_high_N=ours.force_N + half,
-    )
+def _write_curves(folder: Path, site: SitePrediction, best: Array, known: Known) -> None:
+    """The record beside its prediction; a column that is not predicted is not there."""
+    record, ours, missing = site.record, site.ours, site.missing
+    columns = {
+        "time_s": record.times_s,
+        "displacement_mm": record.displacement_mm,
+        "force_measured_N": record.force_N,
+    }
+    if "force" not in missing:
+        columns["force_simulated_N"] = site.own.force_N
+    if site.one is not None and "one_material" not in missing:
+        columns["force_one_material_N"] = site.one.force_N
+    if ours.completed:
+        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.site.name)
+        columns["force_low_N"] = np.maximum(ours.force_N - half, 0.0)
+        columns["force_high_N"] = ours.force_N + half
+    write_curves(folder / f"{record.site.name}.csv", **columns)
 
 
-def _row(record: SiteRecord, ours: Simulation, one: Simulation | None) -> dict[str, Any]:
-    def error(simulation: Simulation | None) -> float | None:
-        if simulation is None or not simulation.completed:
+def _row(site: SitePrediction) -> dict[str, Any]:
+    record, own = site.record, site.own
+
+    def error(found: Simulation | SiteResponse | None) -> float | None:
+        if found is None or not found.completed:
             return None
-        return error_percent(simulation.force_N, record.force_N)
+        return error_percent(found.force_N, record.force_N)
 
     return {
         "site": record.site.name,
         "region": record.site.region,
         "fitted": record.site.fitted,
         "peak_force_N": float(record.force_N.max()),
-        "error_percent": error(ours),
-        "error_one_material_percent": error(one),
-        "penetration_mm": ours.penetration_mm,
-        "completed": ours.completed,
-        "reason": ours.reason,
-        "warnings": list(ours.warnings),
-        "steps": ours.facts["steps"],
-        "element": ours.facts["element"],
+        "error_percent": error(own),
+        "error_one_material_percent": error(site.one),
+        "penetration_mm": own.penetration_mm,
+        "completed": own.completed,
+        "reason": own.reason,
+        "not_predicted": site.missing,
+        "warnings": site.warnings,
+        "doubts": [asdict(doubt) for doubt in own.doubts],
+        "steps": own.facts["steps"],
+        "element": own.facts["element"],
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from ...errors import TraceError
 from ...identify.objective import Measured, SiteResponse
 from ...indentation import Simulation, SimulationJob, SiteModel
+from ...phases import Phase, in_words
 from ...study import Site, Study
-from ...traces import Regularised, Trace, find_touch_down, read_trace, regularise, touch_down_at
+from ...traces import Regularised, TouchDown, Trace, read_trace, regularise, understand
 from ..context import Context
 from ..simulations import CURVE_POINTS, recorded_model
 from ..store import write_json
@@ -23,14 +24,14 @@ SMOOTHING = "{}-smoothing.npy"  # of a site's record, as a matrix
 
 
 def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[str, Any]]:
-    """A site's record, its regularised curves and the facts that ``traces.json`` holds."""
+    """A site's record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
     assert site.trace is not None
     table = study.traces
     file = study.path(site.trace)
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
     try:
-        stated = site.touch_down_s
-        touch = find_touch_down(trace) if stated is None else touch_down_at(trace, stated)
+        known = understand(trace, site.touch_down_s)
+        trace, touch = known.trace, known.touch_down
         smooth = regularise(trace, touch, table.smoothing, site.peak_s)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
@@ -38,16 +39,28 @@ def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[
         "touch_down_s": touch.time_s,
         "touch_down_mm": touch.displacement_mm,
         "touch_down_uncertainty_mm": touch.uncertainty_mm,
-        "peak_s": touch.time_s + float(smooth.corners_s[1]),
+        "peak_s": touch.time_s + smooth.peak_s,
         "peak_force_N": smooth.peak_force_N,
         "depth_mm": smooth.depth_mm,
         "noise_N": smooth.noise_N,
         "speed_load_mm_s": smooth.speed_load_mm_s,
         "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
+        "phases": _phase_rows(trace, smooth, touch),
+        "phases_in_words": in_words(smooth.phases),
         "knots_s": smooth.knots_s.tolist(),
         "knots_mm": smooth.knots_mm.tolist(),
+        "remarks": [asdict(remark) for remark in known.remarks],
     }
     return trace, smooth, facts
+
+
+def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
+    """What the indenter does, in times of the record and in mm from touch-down."""
+    first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
+    phases = [phase.later(touch.time_s) for phase in smooth.phases]
+    if touch.time_s > first_s:
+        phases.insert(0, Phase("approach", first_s, touch.time_s, first_mm, 0.0))
+    return [{**asdict(phase), "rate_mm_s": phase.rate_mm_s} for phase in phases]
 
 
 def run_traces(context: Context, folder: Path) -> dict[str, Any]:
@@ -111,17 +124,26 @@ class SiteRecord:
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
-        derivatives = np.zeros((len(self.smoothing), 0))
-        if simulation.jacobian is not None:
-            derivatives = self.smoothing @ simulation.jacobian
-        force = self.smoothing @ simulation.force_N
-        return SiteResponse(force, derivatives, simulation.completed, simulation.reason)
+        plain = as_response(simulation)
+        force_N, jacobian = (self.smoothing @ values for values in (plain.force_N, plain.jacobian))
+        return replace(plain, force_N=force_N, jacobian=jacobian)
 
     def job(self, parameters: Array, sensitivities: bool = True, start: Array | None = None) -> SimulationJob:
         """The simulation with these parameters; ``start``: those whose simulation gives first guesses."""
         values, times = tuple(map(float, parameters)), tuple(map(float, self.times_s))
         first = None if start is None else tuple(map(float, start))
         return SimulationJob(self.model, self.tissues, values, times, sensitivities, first)
+
+
+def as_response(simulation: Simulation) -> SiteResponse:
+    """A simulation as it is; derivatives (n, 0) where it has none."""
+    jacobian = np.zeros((simulation.force_N.size, 0)) if simulation.jacobian is None else simulation.jacobian
+    ended = simulation.completed, simulation.reason
+    kinds = {doubt.kind: doubt.text for doubt in simulation.doubts}
+    return SiteResponse(
+        simulation.force_N, jacobian, *ended, simulation.site, simulation.warnings,
+        kinds.get("slipped", ""), kinds.get("folded", ""),
+    )  # fmt: skip
 
 
 def site_record(context: Context, site: Site, coarse: bool = False) -> SiteRecord:

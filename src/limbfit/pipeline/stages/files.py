@@ -1,0 +1,32 @@
+"""Files that one stage writes and another reads, and those of the study that errors name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ...errors import InputError
+from ...study import Study
+from ..corrections import hand_labels
+
+THICKNESS = "fat-depth.vtp"
+MARKED_SKIN = "skin-markers.stl"
+
+
+def labelled_file(study: Study) -> Path:
+    """What the labels of a study come from: its label map, or the image."""
+    assert study.image is not None
+    table = study.segmentation
+    return study.path(table.labels or table.contours or hand_labels(study) or study.image.path)
+
+
+@contextmanager
+def naming(file: Path) -> Iterator[None]:
+    """Say which file an error is about, where it does not say so itself."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None:
+            raise
+        raise type(error)(error.what, file=file, place=error.place, remedy=error.remedy) from None

@@ -1,0 +1,139 @@
+"""The stage ``mesh``: one graded mesh for each site."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.layers import LayerSpec
+from ...anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ...anatomy.surfaces import Anatomy, load_anatomy
+from ...anatomy.thickness import read_thickness
+from ...mesh import write_vtu
+from ...study import Study
+from ..context import Context
+from ..store import COARSE, read_json, write_json
+from .files import THICKNESS
+
+
+@dataclass(frozen=True)
+class MeshJob:
+    """A site mesh to be made by a worker."""
+
+    site: str
+    surfaces: Path
+    surfaces_key: str
+    position: tuple[float, ...]
+    axis: tuple[float, ...]
+    settings: MeshSettings
+    file: Path
+
+
+def mesh_job(
+    context: Context,
+    site: str,
+    position: Sequence[float],
+    axis: Sequence[float],
+    settings: MeshSettings,
+    file: Path,
+) -> MeshJob:
+    """The mesh of a site of the study's surfaces, with any settings."""
+    key = str((context.store.stamp("surfaces") or {})["key"])
+    surfaces = context.store["surfaces"]
+    return MeshJob(site, surfaces, key, tuple(position), tuple(axis), settings, file)
+
+
+def make_mesh(job: MeshJob) -> dict[str, Any]:
+    """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
+    anatomy, base = _base(job.surfaces, job.surfaces_key, job.settings)
+    mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
+    write_vtu(mesh, job.file)
+    facts = {**asdict(report), "element": job.settings.element}
+    write_json(job.file.with_suffix(".json"), facts)
+    return facts
+
+
+@lru_cache(maxsize=1)
+def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+    """What all sites of a study share; a worker makes it once."""
+    anatomy = load_anatomy(surfaces)
+    mapped = any(layer.thickness_mm is None for layer in settings.layers)
+    depth = read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
+    return anatomy, base_mesh(anatomy, settings, depth)
+
+
+def mesh_settings(study: Study) -> MeshSettings:
+    """How the site meshes of a study are made."""
+    table, geometry = study.mesh, study.geometry
+    return MeshSettings(
+        element=table.cell_type,
+        edge_near_mm=table.edge_near_mm,
+        edge_far_mm=table.edge_far_mm,
+        near_radius_mm=table.near_radius_mm,
+        growth=table.growth,
+        flatness=table.flatness,
+        engine=table.engine,
+        time_limit_s=table.time_limit_s,
+        layers=tuple(
+            LayerSpec(layer.name, layer.thickness_mm, layer.min_thickness_mm)
+            for layer in geometry.model_layers
+        ),
+        core=geometry.core,
+        bone_policy=geometry.bone_policy,
+        bone_clearance_mm=geometry.bone_clearance_mm,
+    )
+
+
+def coarse_settings(study: Study) -> MeshSettings | None:
+    """How the second, coarse meshes are made; None where the study wants none."""
+    table = study.mesh.coarse
+    return None if table is None else replace(mesh_settings(study), **table.model_dump())
+
+
+def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
+    """One graded mesh per site, and a coarse one where the study wants it; side by side.
+
+    Meshes of an interrupted run are kept.
+    """
+    study = context.study
+    content = _make_meshes(context, folder, mesh_settings(study), "")
+    coarse = coarse_settings(study)
+    if coarse is not None:
+        (folder / COARSE).mkdir(exist_ok=True)
+        content["coarse"] = _make_meshes(context, folder / COARSE, coarse, "coarse, ")
+    write_json(folder / "mesh.json", content)
+    for facts in (*folder.glob("*.vtu"), *folder.glob(f"{COARSE}/*.vtu")):
+        facts.with_suffix(".json").unlink()
+    return {}
+
+
+def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
+    """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
+    sites = context.stored("sites", "sites.json")["sites"]
+    jobs = [
+        mesh_job(
+            context,
+            site["site"],
+            site["position_mm"],
+            site["axis"],
+            settings,
+            folder / f"{site['site']}.vtu",
+        )
+        for site in sites
+    ]
+    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if _is_meshed(job)}
+    missing = [job for job in jobs if job.site not in facts]
+    context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
+    for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
+        facts[job.site] = made
+        context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {made['nodes']} nodes")
+    return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
+
+
+def _is_meshed(job: MeshJob) -> bool:
+    return job.file.is_file() and job.file.with_suffix(".json").is_file()

@@ -1,0 +1,72 @@
+"""The stage ``surfaces``: label map, or surfaces of the study, to a checked anatomy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.amputation import amputate
+from ...anatomy.imaging import LabelMap, read_labels
+from ...anatomy.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
+from ...anatomy.thickness import fat_depth, write_thickness
+from ...study import Study
+from ..context import Context
+from .files import THICKNESS, labelled_file, naming
+
+
+def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
+    """Label map or the study's own surfaces to a checked anatomy: closed skin, closed bones, proximal cut."""
+    study = context.study
+    context.tell("surfaces", 0, 2, "building surfaces")
+    if study.surfaces is not None:
+        anatomy = given_anatomy(study)
+    else:
+        labels = _limb_labels(context)
+        anatomy = _imaged_anatomy(study, labels)
+        if any(layer.thickness == "map" for layer in study.geometry.model_layers):
+            depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
+            write_thickness(folder / THICKNESS, anatomy.skin, depth)
+    save_anatomy(folder, anatomy)
+    return {}
+
+
+def _limb_labels(context: Context) -> LabelMap:
+    """The label map of the segment stage, after the virtual amputation where there is one."""
+    geometry = context.study.geometry
+    labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
+    if geometry.amputation is None:
+        return labels
+    plane = geometry.amputation
+    return amputate(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
+
+
+def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
+    geometry = study.geometry
+    cut = geometry.proximal_cut
+    with naming(labelled_file(study)):
+        anatomy = build_anatomy(
+            labels,
+            edge_mm=geometry.surface_edge_mm,
+            proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
+        )
+        check_anatomy(anatomy)
+    return anatomy
+
+
+def given_anatomy(study: Study) -> Anatomy:
+    """The checked anatomy of given surfaces; without a stated cut its end is the highest (z) of the skin."""
+    assert study.surfaces is not None
+    tables = study.surfaces
+    files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
+    surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
+    skin = surfaces.pop("skin")
+    cut = study.geometry.proximal_cut
+    if cut is not None:
+        point, normal = np.array(cut.point), np.array(cut.normal)
+    else:
+        point, normal = np.array([0.0, 0.0, skin.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
+    anatomy = Anatomy(skin=skin, bones=surfaces, cut_point=point, cut_normal=normal)
+    check_anatomy(anatomy, files)
+    return anatomy

@@ -1,0 +1,88 @@
+"""The tables of ``study.toml`` that say how sites are meshed, and how many cells that makes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from .tables import Positive, Table
+
+MOST_CELLS = 3e6  # some 4 million nodes: more than a workstation solves
+_LIMB_MM = 80.0  # the farthest tissue from a site that counts
+_DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
+_CELLS_PER_CUBE = 6.0 * np.sqrt(2.0)  # regular tetrahedra in the cube of their edge
+
+
+def estimated_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
+    """About how many tetrahedra the mesh of a site has: those that fill half an ellipsoid around it."""
+    radius = np.linspace(0.0, _LIMB_MM, 2001)
+    edge = np.minimum(edge_near_mm + growth * np.maximum(radius - near_radius_mm, 0.0), edge_far_mm)
+    volume = np.diff(2.0 / 3.0 * np.pi * radius**3 / _DEPTH_RATIO)
+    return float(np.sum(volume * _CELLS_PER_CUBE / ((edge[1:] + edge[:-1]) / 2) ** 3))
+
+
+def smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
+    """The shortest ``edge_near_mm`` that keeps a mesh within ``MOST_CELLS``; the far edge follows it down."""
+    edges = np.geomspace(0.01, 20.0, 400)
+    cells = [estimated_cells(e, max(edge_far_mm, e), near_radius_mm, growth) for e in edges]
+    return float(edges[np.argmax(np.array(cells) <= MOST_CELLS)])
+
+
+class CoarseMeshTable(Table):
+    """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
+
+    edge_near_mm: Positive = 5.5
+    edge_far_mm: Positive = 30.0
+    near_radius_mm: Positive = 12.0
+    growth: Positive = 0.9
+    flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
+
+    @model_validator(mode="after")
+    def _few_enough(self) -> CoarseMeshTable:
+        _refuse_too_many(self)
+        return self
+
+
+class MeshTable(Table):
+    """The mesh of each site: element and edge lengths near the indenter and far from it.
+
+    ``element``: linear tetrahedra, or quadratic ones with the pressure as it comes or constant in each.
+    With ``coarse``, parameters are searched on coarse meshes, whose forces these meshes correct.
+    """
+
+    element: Literal["tet4", "tet10", "tet10p0"] = "tet10p0"
+    edge_near_mm: Positive = 3.5
+    edge_far_mm: Positive = 12.0
+    near_radius_mm: Positive = 16.0
+    growth: Positive = 0.35
+    flatness: Annotated[float, Field(ge=1, le=2)] = 1.0
+    engine: Literal["mmg", "netgen"] = "mmg"
+    time_limit_s: Positive = 600.0
+    coarse: CoarseMeshTable | None = None
+
+    @model_validator(mode="after")
+    def _few_enough(self) -> MeshTable:
+        _refuse_too_many(self)
+        return self
+
+    @property
+    def cell_type(self) -> Literal["tet4", "tet10"]:
+        """The cells of the mesh, whatever is solved on them."""
+        return "tet4" if self.element == "tet4" else "tet10"
+
+
+def _refuse_too_many(table: CoarseMeshTable | MeshTable) -> None:
+    far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
+    cells = estimated_cells(table.edge_near_mm, far, radius, growth)
+    if cells <= MOST_CELLS:
+        return
+    counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
+    where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
+    least = smallest_edge_mm(far, radius, growth)
+    finest = np.ceil(100 * least) / 100
+    raise ValueError(
+        f"{where} makes about {counted} cells per site, and {MOST_CELLS / 1e6:g} million are the most; give "
+        f"edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"
+    )
