@@ -206,8 +206,17 @@ def _traces(folder: Path, sites: tuple) -> None:
             "noise_N": 0.05,
             "speed_load_mm_s": 0.96,
             "speed_unload_mm_s": 0.96,
+            "phases": _phases(float(before[0]) + 1.3, 1.3, float(time[-1])),
+            "phases_in_words": "load at 0.96 mm/s, hold for 2 s, unload at 0.96 mm/s",
         }
     _json(folder / "traces.json", {"sites": facts})
+
+
+def _phases(first_s: float, touch_s: float, seconds: float) -> list[dict]:
+    ends = [first_s, touch_s, touch_s + 0.4 * seconds, touch_s + 0.6 * seconds, touch_s + seconds]
+    kinds = ("approach", "load", "hold", "unload")
+    rows = zip(kinds, ends, ends[1:], strict=False)
+    return [{"kind": kind, "start_s": a, "end_s": b} for kind, a, b in rows]
 
 
 def _limb_mesh() -> Mesh:

@@ -291,6 +291,26 @@ def test_a_failed_simulation_is_named(copy: Path) -> None:
     assert "no: the step fell below its limit" in text
 
 
+def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    row = content["sites"][5]
+    why = "coarse mesh: went over its limits"
+    row |= {"error_one_material_percent": None, "not_predicted": {"interval": why, "one_material": why}}
+    row["warnings"] = [f"no force with one material: {why}"]
+    content |= {"flags": [], "failed": ["site PO-6, one material: lost"]}
+    file.write_text(json.dumps(content))
+    curve = copy / "predict" / "PO-6.csv"
+    rows = [",".join(line.split(",")[:3]) for line in curve.read_text().splitlines()]
+    curve.write_text("\n".join(rows))  # no simulated force either
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert f"interval: {why}; one material: {why}" in _section(text, "solver")
+    assert f"Site PO-6: no force with one material: {why}" in _section(text, "solver")
+    assert "Sites not compared with the others: PO-6." in _section(text, "doubts")
+    assert "Not simulated: site PO-6, one material: lost." in _section(text, "doubts")
+    assert "not predicted" in text
+
+
 def test_indentations_without_records(copy: Path) -> None:
     for part in ("traces", "calibrate", "predict"):
         shutil.rmtree(copy / part)

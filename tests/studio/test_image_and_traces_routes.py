@@ -177,8 +177,12 @@ def test_who_runs_a_study_is_read_from_its_lock(study):
         if "limbfit" not in " ".join(sys.argv[:2]):
             with pytest.raises(Exception, match="is no limbfit command; end it where it runs"):
                 stop_run(folder)
-    assert running(folder) is None  # the file still names a process that lives
+    assert running(folder) is None
+    (study / "results" / ".lock").touch()
+    holder = study / "results" / ".holder"
+    holder.write_text(f"process {os.getpid()} (since 2026-01-01 00:00 UTC)")
+    assert running(folder) is None  # it lives, and holds nothing
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    (study / "results" / ".lock").write_text(f"process {ended.pid} (since 2026-01-01 00:00 UTC)")
+    holder.write_text(f"process {ended.pid} (since 2026-01-01 00:00 UTC)")
     assert running(folder) is None

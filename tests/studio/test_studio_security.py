@@ -318,9 +318,10 @@ def test_only_stages_can_be_asked_for(page, study, stage):
 
 
 def test_no_process_is_stopped_that_does_not_hold_the_study(page, study):
-    """A study from elsewhere may name any process in its lock file: nothing is sent to it."""
+    """A study from elsewhere may name any process as its holder: nothing is sent to it."""
     (study / "results").mkdir()
-    (study / "results" / ".lock").write_text("process 1 (since 2026-01-01 00:00 UTC)")
+    (study / "results" / ".lock").touch()
+    (study / "results" / ".holder").write_text("process 1 (since 2026-01-01 00:00 UTC)")
     answer = page.post("/api/identification/stop", headers={"Origin": ORIGIN})
     assert answer.status_code == 409
     assert "nothing to stop" in answer.json()["error"]

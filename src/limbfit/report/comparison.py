@@ -12,7 +12,7 @@ def comparison(store: Store) -> Section:
     """Curves and differences of the sites that ``limbfit compare`` solved."""
     words = Prose(
         "The same mesh, materials and history by FEBio and by limbfit: once with limbfit's own contact, "
-        "which keeps the penetration below 1 % of the depth, and once with the mean of FEBio's penalty; what "
+        "which keeps the penetration below 1 % of the depth, and once with FEBio's penalty and steps; what "
         "lies between the two is how far the indenter sinks in. Differences are in percent of FEBio's "
         "largest force."
     )

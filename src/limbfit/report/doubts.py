@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .page import Bullets, Cell, Prose, Row, Section, Table
+from .page import Bullets, Cell, Note, Prose, Row, Section, Table
 from .store import Json, Store
 from .tables import NOTHING, fixed, heading, number, numeric
 
@@ -20,7 +20,20 @@ def doubts(store: Store) -> Section:
             "every site is predicted from the others about as well as they are."
         )
     tables = (_flag_table(flags),) if flags else ()
-    return Section("doubts", "Records in doubt", (words, *tables, *_left_out_tables(store, left_out)))
+    unknown = _not_looked_at(store)
+    return Section(
+        "doubts", "Records in doubt", (*unknown, words, *tables, *_left_out_tables(store, left_out))
+    )
+
+
+def _not_looked_at(store: Store) -> tuple[Note, ...]:
+    """What failed, and so was not compared."""
+    sites = [
+        str(row["site"]) for row in store.predicted if row.get("not_predicted", {}).keys() - {"one_material"}
+    ]
+    failed = [f"Sites not compared with the others: {', '.join(sites)}."] if sites else []
+    failed += [f"Not simulated: {text}." for text in store.predict.get("failed") or ()]
+    return (Note(" ".join(failed)),) if failed else ()
 
 
 def _sentence(flag: Json) -> str:

@@ -1,4 +1,4 @@
-"""Curves of the report: records (the paper's figure 3), forces (figure 7), convergence, errors, intervals."""
+"""Curves of the report: forces (the paper's figure 7), convergence, errors, intervals."""
 
 from __future__ import annotations
 
@@ -33,47 +33,10 @@ from .tables import SYMBOLS, UNITS, fixed, interval, number
 MOST_POINTS, LONGEST_TITLE, MOST_IN_A_ROW = 2500, 44, 7
 
 
-def _thin(curves: Curves) -> Curves:
+def thin(curves: Curves) -> Curves:
     """At most ``MOST_POINTS`` samples of every column: more cannot be seen."""
     stride = max(1, math.ceil(len(next(iter(curves.values()))) / MOST_POINTS))
     return {name: values[::stride] for name, values in curves.items()}
-
-
-def record_figure(store: Store, site: str) -> Figure | None:
-    """Figure 3: one site's record as the robot wrote it, and regularised from touch-down on."""
-    raw, regular = store.curves("traces", f"{site}-raw"), store.curves("traces", site)
-    if raw is None or regular is None:
-        return None
-    facts = store.traces.get(site, {})
-    start = (facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0))
-    drawing, axes = panels(3, 3, 2.5)
-    with matplotlib.rc_context(STYLE):
-        _draw_record(axes, _thin(raw), regular, start)
-        legend_above(drawing, axes[0])
-    peak, depth = fixed(facts.get("peak_force_N"), 2), fixed(facts.get("depth_mm"), 2)
-    alt = f"Record of site {site}: displacement and force against time, and force against displacement"
-    caption = (
-        f"Figure 3 of the paper for this study: record of site {site}, raw and regularised. The dashed "
-        "line is the touch-down that was found; "
-        f"loading and unloading are regularised apart and the peak is kept ({peak} N at {depth} mm)."
-    )
-    return Figure("record", svg(drawing, "record", alt), caption)
-
-
-def _draw_record(axes: list[Axes], raw: Curves, regular: Curves, start: tuple[float, float]) -> None:
-    time, depth = regular["time_s"] + start[0], regular["displacement_mm"] + start[1]
-    pairs = [
-        (("time_s", "displacement_mm"), (time, depth), ("Time (s)", "Displacement (mm)")),
-        (("time_s", "force_N"), (time, regular["force_N"]), ("Time (s)", "Force (N)")),
-        (("displacement_mm", "force_N"), (depth, regular["force_N"]), ("Displacement (mm)", "Force (N)")),
-    ]
-    for ax, (columns, curve, labels) in zip(axes, pairs, strict=True):
-        ax.plot(raw[columns[0]], raw[columns[1]], color=MUTED, lw=0.9, label="as recorded")
-        ax.plot(*curve, color=SIMULATED, lw=1.8, label="regularised")
-        at = start[1] if columns[0] == "displacement_mm" else start[0]
-        ax.axvline(at, color=INK, lw=0.8, ls="--", label="touch-down")
-        ax.set_xlabel(labels[0])
-        ax.set_ylabel(labels[1])
 
 
 def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, columns: int) -> Figure | None:
@@ -86,7 +49,7 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
     words = {"time_s": ("Time (s)", "time"), "displacement_mm": ("Displacement (mm)", "displacement")}
     with matplotlib.rc_context(STYLE):
         for i, (ax, (row, curves)) in enumerate(zip(axes, pairs, strict=True)):
-            _draw_forces(ax, _thin(curves), against, store.materials)
+            _draw_forces(ax, thin(curves), against, store.materials)
             ax.set_title(_site_title(store, row, columns))
             if i + columns >= len(pairs):
                 ax.set_xlabel(words[against][0])
@@ -122,7 +85,8 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
         ax.plot(x, curves["force_measured_N"], color=MEASURED, lw=2.6, alpha=0.55, label="measured")
     if "force_one_material_N" in curves:
         ax.plot(x, curves["force_one_material_N"], color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
-    ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label=materials)
+    if "force_simulated_N" in curves:
+        ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label=materials)
     ax.margins(x=0.01)
 
 

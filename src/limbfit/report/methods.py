@@ -120,7 +120,8 @@ def _indentations(store: Store) -> str:
         "under it "
         "unless the study states one. Touch-down was found in each record; from there on displacement was "
         "made "
-        "piecewise linear and force smoothed, loading and unloading apart so that the peak is kept; where "
+        "piecewise linear and force smoothed, every phase (loading, hold, unloading) by itself so that the "
+        "peak is kept; where "
         "parameters are searched and judged, the simulated force is smoothed in the same way. "
         f"Depths are {_range(facts, 'depth_mm', 2)} mm, largest forces {_range(facts, 'peak_force_N', 2)} N, "
         f"loading speeds {_range(facts, 'speed_load_mm_s', 2)} mm/s"
@@ -192,7 +193,7 @@ def _contact(store: Store) -> str:
     stiff = (
         f"a stiffness of {penalty} per mm times the mean instantaneous shear modulus"
         if penalty
-        else "a stiffness that is raised wherever the indenter sinks in by more than 1 % of the depth"
+        else "a stiffness with which a reference tissue lets it sink in by 0.3 % of the depth at most"
     )
     deepest = [row["penetration_mm"] for row in store.predicted if row.get("penetration_mm") is not None]
     return _said(

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 
 from . import figures, pictures, tables
 from .comparison import comparison
+from .doubted import search_doubts
 from .doubts import doubts
 from .experiments import experiment_sections
 from .interactive import convergence_curves, explorer, record_curves
 from .methods import method_section
 from .page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
+from .records import record_figure, trace_table
 from .slices import slices_figure
 from .store import PARAMETERS, Json, Store
 
@@ -196,8 +198,9 @@ def _combinations(store: Store) -> tuple[Block, ...]:
             sentence = sentence.replace(name, symbol)
         told.append(sentence)
     lead = (
-        "Products of powers of the parameters, the best determined by the data first. They are linearised, "
-        "which makes the best of them up to twice too sure; limbfit uncertainty samples them."
+        "Products of powers of the parameters, the best determined by the data first. They and the intervals "
+        "are those of the records alone, sampled on what the calibration simulated; limbfit uncertainty adds "
+        "geometry, contact and mesh."
     )
     return Prose(lead), Bullets(tuple(told))
 
@@ -237,9 +240,9 @@ def records(store: Store) -> Section:
     """Indentation records."""
     chosen = [site for site in (*store.fitted, *store.traces) if store.curves("traces", site)]
     blocks = _blocks(
-        figures.record_figure(store, chosen[0]) if chosen else None,
+        record_figure(store, chosen[0]) if chosen else None,
         record_curves(store, tuple(dict.fromkeys(chosen))),
-        tables.trace_table(store) if store.traces else None,
+        trace_table(store) if store.traces else None,
         otherwise="No indentation records are stored yet.",
     )
     return Section("records", "Indentation records", blocks)
@@ -323,6 +326,7 @@ def convergence(store: Store) -> Section:
         Bullets(texts) if texts else None,
         figure,
         convergence_curves(store),
+        *search_doubts(store),
         *details,
         otherwise="No identification is stored yet.",
     )
@@ -352,7 +356,10 @@ def _corrections(rounds: Sequence[Json]) -> str | None:
     """How many, and what the last one changed."""
     if not rounds:
         return None
-    left = max(rounds[-1]["change_percent_by_site"].values())
+    last = rounds[-1]
+    if last["reason"]:
+        return f"{len(rounds)}; the last failed: {last['reason']}"
+    left = max(last["change_percent_by_site"].values())
     return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
 
 

@@ -264,8 +264,8 @@ def mesh_section(store: Store, content: Json) -> Section:
     """Mesh independence."""
     name = "sensitivity-mesh"
     words = Prose(
-        "The sites meshed anew with other edge lengths, everything else the same. Where three forces allow "
-        "it, "
+        "The sites meshed anew with other edge lengths, everything else the same. Where element and forces "
+        "allow it, "
         f"they are extrapolated to an edge of zero (Richardson). {_limits(content)}"
     )
     columns = (
@@ -290,6 +290,13 @@ def _limits(content: Json) -> str:
                 f"at site {row['site']} the forces do not tend to a value yet: finer meshes are needed"
             )
             continue
+        if row["order"] is None:
+            parts.append(
+                f"at site {row['site']} the study's mesh is {fixed(row['error_percent'], 2)} % off the "
+                f"finest, whose largest force is {fixed(row['limit_N'], 3)} N; with this element forces do "
+                "not change in one direction, so nothing is extrapolated"
+            )
+            continue
         order = f"order {number(row['order'], 2)}" + ("" if row["order_measured"] else ", assumed")
         parts.append(
             f"at site {row['site']} the largest force tends to {fixed(row['limit_N'], 3)} N ({order}), and "
@@ -310,7 +317,7 @@ def _mesh_figure(store: Store, content: Json) -> Figure:
             color, line = _STYLES[i % len(_STYLES)]
             edge, peak = ([row[key] for row in rows] for key in ("edge_near_mm", "peak_force_N"))
             axes[-1].plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site['site']}")
-            if site["limit_N"] is not None:
+            if site["order"] is not None:
                 axes[-1].plot(0.0, site["limit_N"], color=color, marker="x", ls="", mew=1.8)
         axes[0].set_ylabel("Force (N)")
         axes[-1].set_title("Largest force (N)")

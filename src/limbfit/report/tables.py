@@ -152,11 +152,15 @@ def _site_row(store: Store, row: Json) -> Row:
             Cell("fitted" if fitted else "held out"),
             numeric(fixed(row.get("peak_force_N"), 2)),
             numeric(fixed(depth, 2)),
-            numeric(fixed(row.get("error_one_material_percent"))),
-            numeric(fixed(row.get("error_percent"))),
+            numeric(_error(row, "error_one_material_percent", "one_material")),
+            numeric(_error(row, "error_percent", "force")),
         ),
         marked=fitted,
     )
+
+
+def _error(row: Json, key: str, what: str) -> str:
+    return "not predicted" if what in row.get("not_predicted", ()) else fixed(row.get(key))
 
 
 def _mean_rows(store: Store) -> Iterable[Row]:
@@ -168,7 +172,7 @@ def _mean_rows(store: Store) -> Iterable[Row]:
             yield Row(
                 (
                     heading(f"Mean, {word}"),
-                    Cell(f"{len(chosen)} site{'s' if len(chosen) > 1 else ''}"),
+                    Cell(_number_of_sites(chosen)),
                     Cell(word),
                     numeric(""),
                     numeric(""),
@@ -212,39 +216,6 @@ def _shade(value: Any) -> float | None:
 def _short(name: str) -> str:
     tissue, _, parameter = name.partition(".")
     return f"{tissue} {SYMBOLS.get(parameter, parameter)}" if parameter else name
-
-
-def trace_table(store: Store) -> Table:
-    """Touch-down, peak, noise and speed of every record."""
-    head = (
-        "Site",
-        "Touch-down (s)",
-        "Touch-down (mm)",
-        "± (mm)",
-        "Depth (mm)",
-        "Largest force (N)",
-        "Noise (N)",
-        "Loading (mm/s)",
-        "Unloading (mm/s)",
-    )
-    keys = (
-        ("touch_down_s", 3),
-        ("touch_down_mm", 3),
-        ("touch_down_uncertainty_mm", 3),
-        ("depth_mm", 2),
-        ("peak_force_N", 2),
-        ("noise_N", 3),
-        ("speed_load_mm_s", 3),
-        ("speed_unload_mm_s", 3),
-    )
-    rows = tuple(
-        Row(
-            (heading(site), *(numeric(fixed(facts.get(key), digits)) for key, digits in keys)),
-            site in store.fitted,
-        )
-        for site, facts in store.traces.items()
-    )
-    return Table("trace-facts", "What was found in each indentation record.", head, rows)
 
 
 def place_table(store: Store) -> Table:
@@ -322,6 +293,12 @@ def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
     return Row(cells, marked)
 
 
+def _number_of_sites(rows: list[Json]) -> str:
+    """How many, and how many of them the mean lacks."""
+    lacking = sum(row.get("error_percent") is None for row in rows)
+    return f"{len(rows)} site{'s' if len(rows) > 1 else ''}" + (f", without {lacking}" if lacking else "")
+
+
 def _layers(facts: Json) -> str:
     """Thickness of the layer, or of each by its name."""
     each = facts.get("layer_thickness_mm") or {}
@@ -347,12 +324,17 @@ def solver_table(store: Store) -> Table:
                 numeric(_count(row.get("steps"))),
                 numeric(fixed(row.get("penetration_mm"), 3)),
                 Cell("yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"),
+                Cell(
+                    "; ".join(
+                        f"{k.replace('_', ' ')}: {why}" for k, why in row.get("not_predicted", {}).items()
+                    )
+                ),
             ),
             bool(row.get("fitted")),
         )
         for row in store.predicted
     )
-    head = ("Site", "Element", "Steps", "Largest penetration (mm)", "Completed")
+    head = ("Site", "Element", "Steps", "Largest penetration (mm)", "Completed", "Not predicted")
     return Table("solver", "The simulation of each site with the identified parameters.", head, rows)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
 
 from .ink import MUTED, SIMULATED, STYLE, legend_above, panels, svg
 from .page import Block, Bullets, Cell, Figure, Note, Prose, Row, Section, Table
@@ -68,7 +70,7 @@ def _parameters(store: Store, content: Json) -> Table:
         columns = ("linearised_95", "posterior_95", "profile_95")
         ranges = [numeric(_range(row[key])) for key in columns]
         wider = numeric(_range(row["with_sources_95"]))
-        words = (Cell(str(row["profile_verdict"] or "–")), wider, Cell(row["verdict"]))
+        words = (Cell(_profile_words(row)), wider, Cell(row["verdict"]))
         cells = (heading(label(row["name"])), numeric(number(row["calibrated"])), *ranges, *words)
         rows.append(Row(cells))
     caption = (
@@ -76,6 +78,16 @@ def _parameters(store: Store, content: Json) -> Table:
         "geometry, contact and mesh added. A profile that is determined on both sides needs no bounds."
     )
     return Table("uncertainty-parameters", caption, head, tuple(rows))
+
+
+def _profile_words(row: Json) -> str:
+    """What a profile says, and which of its ends rest on an emulator beyond its simulations."""
+    if row["profile_verdict"] is None:
+        return "–"
+    low, high = row["profile_extrapolated"]
+    ends = [word for word, beyond in (("low", low), ("high", high)) if beyond]
+    where = f"; {' and '.join(ends)} end extrapolated" if ends else ""
+    return f"{row['profile_verdict']}{where}"
 
 
 def _combinations(content: Json) -> Table:
@@ -106,8 +118,8 @@ def profile_figure(store: Store, content: Json) -> Figure | None:
     drawing, axes = panels(len(profiles), _MOST_PANELS_IN_A_ROW, 1.9)
     with matplotlib.rc_context(STYLE):
         for i, (ax, (name, one)) in enumerate(zip(axes, profiles.items(), strict=True)):
-            ax.plot(one["values"], one["rise"], color=SIMULATED, marker="o", ms=2.5, label="profile")
-            ax.axhline(one["threshold"], color=MUTED, ls="--", lw=0.9, label="95 %")
+            _draw_profile(ax, one)
+            ax.axhline(one["threshold"], color=MUTED, ls=":", lw=1.2, label="95 %")
             ax.axvspan(*one["interval_95"], color=SIMULATED, alpha=0.12, lw=0)
             if name in truth:
                 ax.axvline(truth[name][0], **truth[name][1], label="truth")
@@ -121,21 +133,33 @@ def profile_figure(store: Store, content: Json) -> Figure | None:
         legend_above(drawing, axes[0])
     caption = (
         "Profile likelihood of every parameter: all others chosen anew for each value. Where the curve stays "
-        "below the dashed line up to a bound, the records do not determine the parameter on that side."
+        "below the dotted line up to a bound, the records do not determine the parameter on that side. "
+        "Dashed, with open circles: beyond the emulator's simulations, extrapolated."
     )
-    checked = [
-        f"{label(check['name'])} "
-        f"{fixed(max(abs(a - b) for a, b in zip(check['emulated'], check['solved'])), 2)}"
-        for check in content["checks"]
-    ]
+    checked = [_checked(check) for check in content["checks"]]
     if checked:
         caption += f" At the ends, emulator and solver differ by (in the same unit): {', '.join(checked)}."
     words = ", ".join(f"{label(name)} {one['verdict']}" for name, one in profiles.items())
     return Figure("profiles", svg(drawing, "profiles", f"Profile likelihood: {words}"), caption)
 
 
-def _difference(check: Json) -> float:
-    return float(max(abs(a - b) for a, b in zip(check["emulated"], check["solved"], strict=True)))
+def _draw_profile(ax: Axes, one: Json) -> None:
+    """A profile, dashed and with open circles where it is extrapolated."""
+    values, rise = np.array(one["values"]), np.array(one["rise"])
+    beyond = np.array(one["extrapolated"], dtype=bool)
+    # The neighbours too, so that the two lines meet.
+    dashed = np.where(beyond | np.r_[beyond[1:], False] | np.r_[False, beyond[:-1]], rise, np.nan)
+    ax.plot(values, np.where(beyond, np.nan, rise), color=SIMULATED, marker="o", ms=2.5, label="profile")
+    ax.plot(values, dashed, color=SIMULATED, ls="--", lw=1.0, zorder=1.9, label="extrapolated")
+    ax.plot(values[beyond], rise[beyond], color=SIMULATED, ls="", marker="o", ms=3.0, mfc="none")
+
+
+def _checked(check: Json) -> str:
+    """By how much emulator and solver differ at the ends of a profile."""
+    pairs = zip(check["emulated"], check["solved"], strict=True)
+    off = [abs(a - b) for a, b in pairs if b is not None]
+    failed = "" if len(off) == len(check["solved"]) else ", not simulated at each end"
+    return f"{label(check['name'])} {fixed(max(off, default=None), 2)} (the {check['why']}{failed})"
 
 
 def _evidence(content: Json) -> Table | None:
@@ -194,7 +218,11 @@ def _predictions(content: Json) -> Table:
         Row(
             (
                 heading(row["site"]),
-                numeric(fixed(row["inside_percent"], 0)),
+                numeric(
+                    f"not predicted: {row['reason']}"
+                    if row.get("reason")
+                    else fixed(row["inside_percent"], 0)
+                ),
                 numeric(fixed(row["half_width_percent"])),
                 *(numeric(fixed(row[f"{key}_sd_percent"], 2)) for key in keys),
             ),

@@ -13,6 +13,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from ..errors import InputError
 from ..mesh import read_grid, read_vtu
+from ..phases import find_phases, loading_end
 from ..pipeline.stages.traces import read_curves
 from ..web.arrays import pack
 from ..web.shapes import volume_of
@@ -104,7 +105,8 @@ def _deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
 
 def _peak_time(curve: Path) -> float:
     columns = read_curves(curve)
-    return float(columns["time_s"][np.argmax(columns["displacement_mm"])])
+    loading = loading_end(find_phases(columns["time_s"], columns["displacement_mm"]))
+    return 0.0 if loading is None else loading.end_s
 
 
 def _file(folder: StudyFolder, source: str, site: str, moment: int) -> Path:

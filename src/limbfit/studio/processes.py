@@ -15,39 +15,20 @@ import psutil
 
 from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
+from ..pipeline.store import holder_of, is_held
 from ..study import load_study
 from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder
-
-try:
-    import fcntl
-except ImportError:  # Windows: the process number in the lock's file is all there is
-    fcntl = None  # type: ignore[assignment]
 
 _HOLDER = re.compile(r"process (\d+) \(since ([^)]*)\)")
 
 
 def running(folder: StudyFolder) -> dict[str, Any] | None:
     """``process`` and ``since`` of the run that holds the study; None where none does."""
-    file = folder.results / ".lock"
-    try:
-        found = _HOLDER.match(file.read_text(encoding="utf-8"))
-    except OSError:
-        return None
-    if found is None or not psutil.pid_exists(int(found[1])) or not _is_held(file):
+    found = _HOLDER.match(holder_of(folder.results))
+    if found is None or not psutil.pid_exists(int(found[1])) or not is_held(folder.results):
         return None
     return {"process": int(found[1]), "since": found[2]}
-
-
-def _is_held(file: Path) -> bool:
-    if fcntl is None:
-        return True
-    with file.open("rb") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
-    return False
 
 
 def starting(folder: StudyFolder) -> int | None:

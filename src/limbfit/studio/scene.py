@@ -13,7 +13,8 @@ from ..anatomy.sites import project_to_skin
 from ..anatomy.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
-from ..pipeline.stages.geometry import given_anatomy, place_site
+from ..pipeline.stages.sites import place_site
+from ..pipeline.stages.surfaces import given_anatomy
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, cell_quality, interface, patient_frame, volume_of

@@ -220,7 +220,7 @@ class IdentificationView {
     this.curveNote.textContent = `Simulated: ${found.of}.`;
     const { time_s: x, displacement_mm: depth } = found;
     const series = [{ label: "measured", colour: "--measured", width: 2, x, y: found.force_measured_N },
-      { label: "simulated", colour: "--simulated", dash: "dashed", width: 2.5, x, y: found.force_simulated_N }];
+      { label: "simulated", colour: "--simulated", dash: "dashed", width: 2.5, x, y: found.force_simulated_N }].filter((line) => line.y);
     if (found.force_one_material_N) series.push({ label: "one material", colour: "--second", dash: "dotted", width: 1.5, x, y: found.force_one_material_N });
     const band = found.force_low_N ? { label: "95 %", colour: "--simulated", x, low: found.force_low_N, high: found.force_high_N } : undefined;
     this.plot("curves", this.curveHost, { label: `Force at site ${name}, to ${Math.max(...depth).toFixed(1)} mm.`, x: { title: "Time from touch-down", unit: "s" },

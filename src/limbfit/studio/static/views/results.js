@@ -162,7 +162,7 @@ class ResultsView {
       one("one material", "--second", ours.force_one_material_N, { dash: "dashed" }),
       one("this run", "--simulated", ours.force_simulated_N),
     ].filter((line) => line.y);
-    if (theirs) series.push({ label: this.other, colour: "--third", dash: "dashdot", x: theirs[this.against], y: theirs.force_simulated_N });
+    if (theirs?.force_simulated_N) series.push({ label: this.other, colour: "--third", dash: "dashdot", x: theirs[this.against], y: theirs.force_simulated_N });
     if (this.time !== null && this.against === "time_s" && this.player.times.length > 1) {
       series.push({ label: "moment shown", colour: "--soft", width: 1, dash: "dotted", x: [this.time, this.time], y: [0, Math.max(...ours.force_measured_N)] });
     }

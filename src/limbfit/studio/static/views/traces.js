@@ -224,6 +224,7 @@ class TracesView {
       ["Peak", `${number(facts.peak_s, 3)} s (${by("peak_s")})`],
       ["Depth from touch-down", `${number(facts.depth_mm, 2)} mm`],
       ["Largest force", `${number(facts.peak_force_N, 2)} N, noise ${number(facts.noise_N, 3)} N`],
+      ["Phases", facts.phases_in_words],
       ["Speed in, out", `${number(facts.speed_load_mm_s, 2)}, ${number(facts.speed_unload_mm_s, 2)} mm/s`],
       ["Samples", samples.toLocaleString("en")],
     ];

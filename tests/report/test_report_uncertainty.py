@@ -1,0 +1,54 @@
+"""What is extrapolated looks so."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from stored_results import write_results
+
+from limbfit.report.store import load_store
+from limbfit.report.uncertainty import _draw_profile, _profile_words, profile_figure
+
+PROFILE = {
+    "values": [1.0, 2.0, 3.0, 4.0, 6.0, 9.0],
+    "rise": [8.0, 4.0, 0.5, 0.0, 1.0, 2.0],
+    "threshold": 3.84,
+    "interval_95": [2.04, 9.0],
+    "closed": [True, False],
+    "verdict": "determined on one side",
+    "extrapolated": [True, False, False, False, True, True],
+    "ends_extrapolated": [False, True],
+}
+CHECKS = [
+    {
+        "name": "skin.m",
+        "why": "widest",
+        "emulated": [3.84, 2.0],
+        "solved": [3.5, None],
+        "extrapolated": [False, True],
+    }
+]
+
+
+def test_extrapolated_parts_of_a_profile_are_dashed():
+    ax = Figure().add_subplot()
+    _draw_profile(ax, PROFILE)
+    lines = {line.get_linestyle(): np.asarray(line.get_ydata()) for line in ax.get_lines()}
+    assert np.isnan(lines["-"]).tolist() == PROFILE["extrapolated"]
+    # The neighbours of what is extrapolated belong to the dashed line, so that nothing is left out between.
+    assert np.isnan(lines["--"]).tolist() == [False, False, True, False, False, False]
+    assert lines["None"].tolist() == [8.0, 1.0, 2.0]
+
+
+def test_the_figure_of_profiles_says_what_dashes_mean_and_what_the_solver_said(tmp_path):
+    store = load_store(write_results(tmp_path))
+    figure = profile_figure(store, {"profiles": {"skin.m": PROFILE}, "checks": CHECKS})
+    assert "beyond the emulator's simulations" in figure.caption
+    assert "0.34 (the widest, not simulated at each end)" in figure.caption
+
+
+def test_the_table_names_the_ends_that_are_extrapolated():
+    row = {"profile_verdict": "determined on one side", "profile_extrapolated": [False, True]}
+    assert _profile_words(row) == "determined on one side; high end extrapolated"
+    assert _profile_words(row | {"profile_extrapolated": [False, False]}) == "determined on one side"
+    assert _profile_words({"profile_verdict": None, "profile_extrapolated": None}) == "–"
