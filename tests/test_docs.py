@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import doctest
 import re
+import subprocess
+import sys
 import tomllib
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+import limbfit
 from limbfit.study import Study
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = Path(limbfit.__file__).parent
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
@@ -47,3 +53,58 @@ def test_study_in_the_readme_is_valid() -> None:
     study = Study(**tomllib.loads("\n".join(blocks)))
     assert [site.name for site in study.fitted] == ["1"]
     assert study.segmentation.labels == Path("corrected.seg.nrrd")
+
+
+TYPES = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+HOMES = re.findall(r"^\| `(\w+)` \| `([\w.]+)` \|", TYPES, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("name", "home"), HOMES)
+def test_the_main_types_live_where_the_table_says(name: str, home: str) -> None:
+    assert getattr(import_module(f"limbfit.{home}"), name).__module__ == f"limbfit.{home}"
+
+
+def test_pages_agree_on_where_a_corrected_segmentation_is_saved() -> None:
+    for page in ("README.md", "docs/segmentation.md", "docs/getting-started.md"):
+        text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
+        assert "in place" in text
+        assert "beside `study.toml` - not in" not in text
+
+
+DOCTESTS = [
+    ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+    for file in sorted(PACKAGE.rglob("*.py"))
+    if ">>> " in file.read_text(encoding="utf-8")
+]
+
+
+@pytest.mark.parametrize("module", DOCTESTS)
+def test_examples_in_docstrings_run(module: str) -> None:
+    found = doctest.testmod(import_module(module))
+    assert found.attempted
+    assert not found.failed
+
+
+def python_in(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [f"docs/{page.name}" for page in PAGES if page.parent.name == "docs"])
+def test_python_of_the_pages_runs(page: str) -> None:
+    for code in python_in(page):
+        exec(compile(code, page, "exec"), {"__name__": "example"})
+
+
+def test_python_of_the_readme_runs(study: Path, coarse_settings: str) -> None:
+    """As a script, on a study that is small."""
+    with (study / "study.toml").open("a") as stream:
+        stream.write(coarse_settings)
+    study.rename(study.parent / "patient")
+    (code,) = python_in("README.md")
+    (study.parent / "example.py").write_text(code)
+    done = subprocess.run(
+        [sys.executable, "example.py"], cwd=study.parent, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (study.parent / "patient" / "results" / "report" / "report.html").is_file()
+    assert "'state': 'done'" in done.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 
@@ -11,8 +12,7 @@ from limbfit.errors import InputError
 from limbfit.pipeline import Progress, study_status
 from limbfit.pipeline.experiments import catalogue
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment
-from limbfit.pipeline.provenance import code_digest
-from limbfit.pipeline.run import STAGES, keys
+from limbfit.pipeline.run import keys
 from limbfit.pipeline.store import write_json
 from limbfit.study import load_study
 
@@ -37,9 +37,7 @@ def run_peaks(context, folder, *, factor: float = 1.0):
     return {}
 
 
-PEAKS = Experiment(
-    "peaks", run_peaks, needs=("traces",), tables=("material",), rooms=("errors",), options={"factor": 1.0}
-)
+PEAKS = Experiment("peaks", run_peaks, needs=("traces",), tables=("material",), options={"factor": 1.0})
 
 
 @pytest.fixture(autouse=True)
@@ -100,10 +98,24 @@ def test_the_report_is_stale_once_there_is_an_experiment_to_show(study):
     assert after == before
 
 
-def test_an_experiment_changes_when_its_code_does(study, monkeypatch):
+OTHER_CODE = """
+from limbfit.mesh import Mesh
+
+
+def run_peaks(context, folder, *, factor=1.0):
+    return {}
+"""
+
+
+def test_an_experiment_changes_when_its_code_does(study, monkeypatch, tmp_path):
     run_experiment(load_study(study), "peaks", listener=quiet)
-    monkeypatch.setattr(catalogue, "EXPERIMENTS", (replace(PEAKS, rooms=("errors", "mesh")),))
+    (tmp_path / "other_code.py").write_text(OTHER_CODE)
+    monkeypatch.syspath_prepend(tmp_path)
+    other = import_module("other_code").run_peaks
+    monkeypatch.setattr(catalogue, "EXPERIMENTS", (replace(PEAKS, run=other),))
     assert state(study) == "stale"
+    (row,) = [row for row in study_status(load_study(study)) if row["stage"] == "peaks"]
+    assert "code of" in " ".join(row["why"])
 
 
 def test_what_there_is_not_is_refused(study):
@@ -118,8 +130,3 @@ def test_names_are_folders_that_do_not_shadow_each_other():
     names = [experiment.name for experiment in EXPERIMENTS]
     assert len(set(names)) == len(names)
     assert not [(a, b) for a in names for b in names if b.startswith(f"{a}-")]
-
-
-def test_the_code_that_decides_stages_and_experiments_is_there():
-    for stage in (*STAGES, *EXPERIMENTS):
-        assert code_digest(stage.rooms)

@@ -10,7 +10,7 @@ from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
 from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.experiments.refinement import richardson
+from limbfit.pipeline.experiments.extrapolation import richardson
 from limbfit.pipeline.experiments.sensitivity import (
     other_indenters,
     run_contact,
@@ -112,7 +112,7 @@ def test_other_indenters_have_the_studys_width_and_are_not_its_own():
 @pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
 def test_extrapolation_finds_limit_and_order(order):
     edges = np.array([4.0, 5.6, 2.8])
-    found = richardson(edges, 10.0 + 0.05 * edges**order)
+    found = richardson(edges, 10.0 + 0.05 * edges**order, 2.0)
     assert found.measured
     assert found.order == pytest.approx(order, rel=1e-6)
     assert found.limit == pytest.approx(10.0)
@@ -120,8 +120,8 @@ def test_extrapolation_finds_limit_and_order(order):
 
 
 def test_extrapolation_assumes_an_order_where_none_shows():
-    swinging = richardson([4.0, 2.8, 2.0], [10.1, 9.9, 10.05])
-    two = richardson([4.0, 2.0], [10.4, 10.1])
+    swinging = richardson([4.0, 2.8, 2.0], [10.1, 9.9, 10.05], 2.0)
+    two = richardson([4.0, 2.0], [10.4, 10.1], 2.0)
     assert not swinging.measured
     assert not two.measured
     assert two.limit == pytest.approx(10.0)

@@ -58,6 +58,9 @@ def test_the_experiment_on_a_stump(done, tmp_path):
     assert np.isfinite(
         emulator(np.array([row["calibrated"] for row in stored["parameters"]]))[0].force_N
     ).all()
+    for profile in stored["profiles"].values():
+        assert len(profile["extrapolated"]) == len(profile["values"])
+    assert [check["why"] for check in stored["checks"]] == ["narrowest", "widest"]
     page = build_report(study / "results", tmp_path).read_text()
     assert "What the records determine" in page
     assert "Profile likelihood" in page

@@ -5,27 +5,32 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
+from limbfit.fe import Doubt
 from limbfit.indentation import Simulation
 from limbfit.pipeline import simulations
+from limbfit.pipeline.stages.doubted import Doubted, doubts_record
 from limbfit.report import build_report
 
 sys.path.insert(0, str(Path(__file__).parent / "report"))
 from stored_results import write_results
 
-DOUBT = "7 elements are inside out at a node at 9.1 mm"
+FOLD = Doubt("folded", "7 elements are inside out at a node at 9.1 mm", 7, 9.1, 1.0)
+DOUBT = FOLD.text
 
 
 def test_a_kept_simulation_keeps_its_warnings(tmp_path, monkeypatch):
-    made = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {"steps": 2}, (DOUBT,))
+    made = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {"steps": 2}, (FOLD,))
     monkeypatch.setattr(simulations, "job_digest", lambda job: "one")
     simulations.SimulationCache(tmp_path)._keep(None, made)
     again = next(simulations.SimulationCache(tmp_path).run([None], SerialExecutor()))
+    assert again.doubts == (FOLD,)
     assert again.warnings == (DOUBT,)
     assert again.completed
 
@@ -44,3 +49,23 @@ def test_the_report_shows_them(tmp_path, doubted):
     file.write_text(json.dumps(content))
     text = build_report(results, tmp_path / "report.html").read_text()
     assert (f"Site {content['sites'][0]['site']}: {DOUBT}" in text) == doubted
+
+
+def test_the_report_counts_the_doubtful_simulations_of_the_search(tmp_path):
+    results = write_results(tmp_path / "results")
+    file = results / "calibrate" / "calibration.json"
+    content = json.loads(file.read_text())
+    slip = Doubt("slipped", "the force falls from 5 N to 4 N", 1, 6.0, 0.75)
+    found = SimpleNamespace(names=("c",), history=[SimpleNamespace(parameters=(1.0,))])
+    searched = [Doubted(1, "tibia", (1.0,), FOLD), Doubted(2, "tibia", (2.0,), slip)]
+    answer = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {}, (FOLD,))
+    content["doubts"] = doubts_record(searched, {"tibia": answer}, 8, found)
+    content["contact"] = {"tibia": {"from_rest_percent": 0.3}}
+    file.write_text(json.dumps(content))
+    text = build_report(results, tmp_path / "report.html").read_text()
+    assert "2 of 8 simulations of the search completed but are doubtful" in text
+    assert "1 of these doubts are at accepted iterates" in text
+    assert f"At the answer, site tibia: {DOUBT}" in text
+    assert "force from rest differs from the fitted one by 0.30 % at site tibia" in text
+    assert "force falls in loading" in text
+    assert [row["iterate"] for row in content["doubts"]["search"]] == [0, None]

@@ -141,7 +141,8 @@ def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, tmp_path: Path) -> 
     assert abs(report.volume_error) < 0.005
     fat = report.layer_thickness_mm["fat"]
     assert fat["min"] == pytest.approx(2.5, abs=0.5)
-    assert fat["max"] == pytest.approx(8.5, abs=0.6)
+    # Of the map itself, whose own error (see the test above) depends on how the skin was remeshed.
+    assert fat["max"] == pytest.approx(again.max() - 1.5, abs=0.6)
 
 
 def test_a_map_needs_fat(fatty: tuple) -> None:

@@ -64,7 +64,7 @@ flatness = 1.6
 relative_tolerance = 0.01   # a finer search would creep along a valley
 """,
 }
-_STEPS = "load_steps = 7\nunload_steps = 5\n"
+STEPS = {"load_steps": 6, "unload_steps": 8}
 
 _SURFACE_EDGE_MM = {"coarse": 4.0, "paper": 3.0}
 
@@ -88,7 +88,7 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         width=INDENTER_MM,
         edge=INDENTER_EDGE_MM,
         penalty=PENALTY_PER_MM,
-        mesh=_STEPS + _MESH[detail],
+        mesh="".join(f"{key} = {value}\n" for key, value in STEPS.items()) + _MESH[detail],
     )
     parts = [head]
     for site in sites:
