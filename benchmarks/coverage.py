@@ -38,7 +38,7 @@ from limbfit.identify.noise import depth_slope
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.context import Context
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
-from limbfit.pipeline.stages.calibrate import unknowns
+from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.traces import SiteRecord, site_record
 from limbfit.pipeline.store import Store
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise

@@ -44,7 +44,7 @@ from limbfit.indentation import (
 )
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.simulations import job_digest
-from limbfit.pipeline.stages.calibrate import unknowns
+from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.traces import read_curves
 from limbfit.pipeline.store import RUNS, Store, digest
 

@@ -25,9 +25,8 @@ FLOORS = [
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
 # The pipeline's own floors: its verbs stand in the folder itself above its rooms, what all share below them.
 INNER_FLOORS = ["experiments", "stages", "shared"]
-SHARED = {
-    *("causes", "context", "corrections", "keys", "provenance", "simulations", "sources", "store", "tabular")
-}
+_SHARED = "causes context corrections extrapolation keys provenance simulations sources store tabular"
+SHARED = set(_SHARED.split())
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
 
 

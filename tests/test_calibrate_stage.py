@@ -14,7 +14,8 @@ from limbfit.errors import StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import to_vector
 from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.stages.calibrate import groupings, run_calibrate
+from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.stages.laboratory import groupings
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.pipeline.store import Store
 from limbfit.study import Study, load_study

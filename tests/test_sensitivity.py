@@ -10,7 +10,6 @@ from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
 from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.experiments.extrapolation import richardson
 from limbfit.pipeline.experiments.sensitivity import (
     other_indenters,
     run_contact,
@@ -20,6 +19,7 @@ from limbfit.pipeline.experiments.sensitivity import (
 )
 from limbfit.pipeline.experiments.variants import choose_sites
 from limbfit.pipeline.experiments.volumes import volume_facts
+from limbfit.pipeline.extrapolation import richardson
 from limbfit.pipeline.store import Store, read_json, write_json
 from limbfit.study import IndenterTable, load_study
 

@@ -17,7 +17,8 @@ from limbfit.indentation import SimulationJob, simulate, to_parameters, to_vecto
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.context import Context, Progress
 from limbfit.pipeline.run import keys
-from limbfit.pipeline.stages.calibrate import run_calibrate, unknowns
+from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report import build_report
 from limbfit.study import PARAMETERS, SolverTable, Study, load_study

@@ -35,8 +35,9 @@ def matern(times_s: Array, correlation: float) -> Array:
 
 @dataclass(frozen=True)
 class ResidualModel:
-    """Covariance of the residuals, site by site: noise of the record plus the model's misfit.
+    """Covariance of the residuals, site by site: noise of the record, error of the mesh, the model's misfit.
 
+    ``mesh_N`` (n,) per site is one standard deviation of the mesh's error, none where it was not measured;
     ``misfit`` (sites,) is the standard deviation of the misfit over the largest force ``peaks_N`` (sites,).
     ``known_scale`` is the number of independent residuals on which the size of the misfit rests.
     """
@@ -47,6 +48,7 @@ class ResidualModel:
     correlation: float
     known_scale: float
     criterion: float = field(default=0.0, repr=False)
+    mesh_N: tuple[Array, ...] = ()
 
     @property
     def misfit_elsewhere(self) -> float:
@@ -64,8 +66,9 @@ class ResidualModel:
                     "compared_noise_sd_N": float(np.sqrt(np.trace(noise.covariance) / len(noise.times_s))),
                     "misfit_sd_N": float(misfit * peak),
                     "misfit_share": float(misfit),
+                    "mesh_share": self._mesh_share(i),
                 }
-                for noise, misfit, peak in zip(self.noise, self.misfit, self.peaks_N)
+                for i, (noise, misfit, peak) in enumerate(zip(self.noise, self.misfit, self.peaks_N))
             },
             "misfit_elsewhere": self.misfit_elsewhere,
             "correlation": self.correlation,
@@ -73,13 +76,22 @@ class ResidualModel:
             "effective_samples": self.effective_samples(),
         }
 
+    def _mesh_share(self, i: int) -> float | None:
+        """Root mean square of the mesh's error over the largest force of site i; None where not measured."""
+        return float(np.sqrt(np.mean(self.mesh_N[i] ** 2)) / self.peaks_N[i]) if self.mesh_N else None
+
+    def known(self, i: int) -> Array:
+        """Covariance (n, n) of what is known beside the misfit of site i: noise, and error of the mesh."""
+        noise = self.noise[i].covariance
+        return noise + np.outer(self.mesh_N[i], self.mesh_N[i]) if self.mesh_N else noise
+
     def discrepancy(self, i: int) -> Array:
         """Covariance (n, n) of the misfit of site i."""
         return (self.misfit[i] * self.peaks_N[i]) ** 2 * matern(self.noise[i].times_s, self.correlation)
 
     def covariance(self, i: int) -> Array:
         """Covariance (n, n) of the residuals of site i."""
-        return self.noise[i].covariance + self.discrepancy(i)
+        return self.known(i) + self.discrepancy(i)
 
     def at(self, times_s: Array, peak_N: float) -> Array:
         """Covariance (n, n) of the misfit at another site."""
@@ -95,20 +107,20 @@ class ResidualModel:
         return total
 
     def spectra(self) -> tuple[Spectrum, ...]:
-        return tuple(Spectrum.of(noise.covariance, self.discrepancy(i)) for i, noise in enumerate(self.noise))
+        return tuple(Spectrum.of(self.known(i), self.discrepancy(i)) for i in range(len(self.noise)))
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A site's residuals in coordinates in which noise has variance 1 and misfit ``values`` (n,)."""
+    """A site's residuals in coordinates in which what is known has variance 1 and misfit ``values`` (n,)."""
 
     transform: Array
     values: Array
-    log_determinant: float  # of the noise
+    log_determinant: float  # of what is known
 
     @classmethod
-    def of(cls, noise: Array, misfit: Array) -> Spectrum:
-        L = cholesky(noise, lower=True)
+    def of(cls, known: Array, misfit: Array) -> Spectrum:
+        L = cholesky(known, lower=True)
         inner = solve_triangular(L, solve_triangular(L, misfit, lower=True).T, lower=True)
         values, vectors = eigh((inner + inner.T) / 2)
         transform = solve_triangular(L, vectors, lower=True, trans="T").T
@@ -121,16 +133,20 @@ def estimate_discrepancy(
     noise: Sequence[SiteNoise],
     peaks_N: Array,
     precision: Array,
+    mesh_N: Sequence[Array] = (),
 ) -> ResidualModel:
     """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per site.
 
     Derivatives are with respect to the logarithms of the parameters, ``precision`` (p, p) is what is known of
-    them beforehand. Misfits of sites are alike within a factor of about two unless residuals say otherwise.
+    them beforehand, ``mesh_N`` (n,) per site the error of the mesh. Misfits of sites are alike within a
+    factor of about two unless residuals say otherwise.
     """
     best: tuple[float, Array, float, _Rows] | None = None
+    unit = np.ones(len(noise))
+    model = ResidualModel(tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0, mesh_N=tuple(mesh_N))
     start = np.array([_first_guess(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
     for correlation in CORRELATIONS:
-        rows = _Rows(residuals, jacobians, noise, peaks_N, precision, correlation)
+        rows = _Rows(residuals, jacobians, replace(model, correlation=correlation), precision)
         bounds = [(np.log(_LEAST), np.log(_MOST))] * len(start)
         found = minimize(rows.criterion, start, jac=True, method="L-BFGS-B", bounds=bounds)
         if best is None or found.fun < best[0]:
@@ -138,9 +154,12 @@ def estimate_discrepancy(
         start = found.x
     assert best is not None
     value, logs, correlation, rows = best
-    misfit = np.exp(logs)
-    return ResidualModel(
-        tuple(noise), np.asarray(peaks_N), misfit, correlation, rows.known_scale(logs), value
+    return replace(
+        model,
+        misfit=np.exp(logs),
+        correlation=correlation,
+        known_scale=rows.known_scale(logs),
+        criterion=value,
     )
 
 
@@ -150,21 +169,12 @@ def _first_guess(residual: Array, noise: SiteNoise, peak: float) -> float:
 
 
 class _Rows:
-    """All sites in coordinates in which noise and misfit are diagonal, for one correlation."""
+    """All sites in coordinates in which ``unit``, with misfits of the largest forces, is diagonal."""
 
     def __init__(
-        self,
-        residuals: Sequence[Array],
-        jacobians: Sequence[Array],
-        noise: Sequence[SiteNoise],
-        peaks_N: Array,
-        precision: Array,
-        correlation: float,
+        self, residuals: Sequence[Array], jacobians: Sequence[Array], unit: ResidualModel, precision: Array
     ) -> None:
-        spectra = [
-            Spectrum.of(site.covariance, peak**2 * matern(site.times_s, correlation))
-            for site, peak in zip(noise, peaks_N)
-        ]
+        spectra = unit.spectra()
         self.site = np.concatenate([np.full(len(s.values), i) for i, s in enumerate(spectra)])
         self.values = np.concatenate([s.values for s in spectra])
         self.residual = np.concatenate([s.transform @ r for s, r in zip(spectra, residuals)])

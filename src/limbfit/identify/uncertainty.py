@@ -1,9 +1,9 @@
 """What the data tell about the parameters, and what they do not.
 
 Linearised at the answer, in logarithms of the parameters. The residuals have one covariance C, noise of the
-records plus misfit of the model (``noise``, ``discrepancy``), and the covariance is that of the calibration
-as it was done, with its own objective and weights, under C (``estimator``). A stated prior is one more
-reading: its median is off the truth by its stated deviation. What is most probable under C lies one
+records, error of the mesh and misfit of the model (``noise``, ``discrepancy``), and the covariance is that of
+the calibration as it was done, with its own objective and weights, under C (``estimator``). A stated prior is
+one more reading: its median is off the truth by its stated deviation. What is most probable under C lies one
 generalised least-squares step away; where that step is longer than C explains, the rest of it is one more
 deviation. The bounds count as the spread of a uniform distribution between them: where the data are silent,
 that is all that is known, and the interval says so. The size of the misfit is itself estimated from few
@@ -122,6 +122,7 @@ def estimate_uncertainty(
     noise: Sequence[SiteNoise] | None = None,
     grouping: Grouping | None = None,
     settings: CalibrationSettings | None = None,
+    mesh_N: Sequence[Array] = (),
 ) -> Uncertainty:
     """Covariance, intervals and verdicts at calibrated ``parameters`` (p,).
 
@@ -132,6 +133,7 @@ def estimate_uncertainty(
         (``curve_noise``), which suits curves that were not smoothed.
     grouping : of the last stage; by default every parameter is free.
     settings : with which the parameters were found: the covariance is that of this estimator.
+    mesh_N : (n,) per site, one standard deviation of the mesh's error in the force; none: it is left out.
     """
     left = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
     if noise is None:
@@ -144,7 +146,7 @@ def estimate_uncertainty(
     z = space.reduce(np.log(parameters))
     prior = Beliefs.of(unknowns, space)
     peaks = np.array([site.force_N.max() for site in measured])
-    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision)
+    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N)
     estimator = Estimator.at(left, scaled, measured, prior.rows, settings or CalibrationSettings())
     linear = _Linear.at(left, scaled, estimator, model, prior, space, z)
     return _told(np.asarray(parameters), linear, model, unknowns, space, prior)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..anatomy.layers import LayerSpec
-from .forces import PENALTY_PER_MM
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 _HEAD = """\
@@ -30,7 +29,6 @@ width_mm = {width:.1f}
 edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sharp edge they never do
 
 [solver]
-penalty_per_mm = {penalty:.1f}
 {mesh}
 # One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
 # The fitted sites identify the material; all others are predicted and compared.
@@ -87,7 +85,6 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         surface=_SURFACE_EDGE_MM[detail],
         width=INDENTER_MM,
         edge=INDENTER_EDGE_MM,
-        penalty=PENALTY_PER_MM,
         mesh="".join(f"{key} = {value}\n" for key, value in STEPS.items()) + _MESH[detail],
     )
     parts = [head]

@@ -35,7 +35,7 @@ from ...identify.spread import spread_points
 from ...indentation import to_vector
 from ..context import Context
 from ..simulations import experiment_cache
-from ..stages.calibrate import Laboratory, unknowns
+from ..stages.laboratory import Laboratory, unknowns
 from ..store import write_json
 from ..tabular import write_table
 
@@ -105,8 +105,9 @@ class _Bench:
         covariance = np.array(stored["uncertainty"]["covariance_log"])
         # Where nothing is known, fits go anywhere; the emulator must not.
         drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
-        at_best, self.as_fine = laboratory.correction(self.best)
-        self.points, self.runs = [self.best], [at_best]
+        anchored = laboratory.anchored(self.best)
+        self.as_fine = anchored.as_fine
+        self.points, self.runs = [self.best], [anchored.responses]
         self.learn(list(drawn))
 
     def learn(self, points: Sequence[Array]) -> Runs:

@@ -20,7 +20,7 @@ from ...indentation import Parameters, SimulationJob, SiteModel, to_vector
 from ...study import Study
 from ..context import Context
 from ..simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
-from ..stages.calibrate import unknowns
+from ..stages.laboratory import unknowns
 from ..store import write_json
 from ..tabular import write_table
 

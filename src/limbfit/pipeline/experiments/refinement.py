@@ -10,10 +10,10 @@ from typing import Any
 from ...errors import InputError
 from ...indentation import Simulation
 from ..context import Context
+from ..extrapolation import MESH_ORDERS, richardson
 from ..simulations import experiment_cache
 from ..stages.mesh import make_mesh, mesh_job, mesh_settings
 from ..store import file_digest, read_json
-from .extrapolation import MESH_ORDERS, richardson
 from .sensitivity import identified_parameters, store_runs
 from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants
 

@@ -18,7 +18,7 @@ from ...indentation import flat_names, to_parameters, to_vector
 from ...study import Site
 from ..context import Context
 from ..simulations import SimulationCache, experiment_cache
-from ..stages.calibrate import Laboratory, groupings, unknowns
+from ..stages.laboratory import Laboratory, groupings, unknowns
 from ..stages.traces import SiteRecord, as_response, site_record
 from ..store import write_json
 from ..tabular import write_table

@@ -21,7 +21,7 @@ from ...identify.sources import Gain
 from ...indentation import Parameters, to_vector
 from ..context import Context
 from ..simulations import experiment_cache
-from ..stages.calibrate import Laboratory, groupings, linearised, stage_titles, unknowns
+from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
 from ..stages.record_noise import site_noise
 from ..stages.traces import as_response, site_record
 from .uncertainty_record import Found, Predicted, write_results
@@ -42,7 +42,7 @@ class FittedSites(Laboratory):
         """``earlier``: parameters that the calibration simulated, and where it started them from."""
         super().__init__(context, experiment_cache(context, folder), context.study.fitted, NAME)
         self.best, self.earlier = best, earlier
-        self.at_best, self.as_fine = self.correction(best)
+        self.at_best = self.anchored(best)
 
     def simulate(self, points: Sequence[Array]) -> list[list[SiteResponse]]:
         """Responses of all sites at several parameters (p,)."""
@@ -55,7 +55,7 @@ class FittedSites(Laboratory):
             found.append(record.respond(simulation))
             self.context.tell(NAME, len(found), len(jobs), f"site {simulation.site}")
         n = len(self.searched)
-        return [self.as_fine(found[i : i + n]) for i in range(0, len(found), n)]
+        return [self.at_best.as_fine(found[i : i + n]) for i in range(0, len(found), n)]
 
     def _first_guess(self, point: Array) -> Array | None:
         """Where a simulation starts from: as in the calibration, or from the answer; None: from rest."""
@@ -86,7 +86,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         tell=lambda text: context.tell(NAME, 0, 0, text),
     )
     evidence = _evidence(context, explored, known.residual_model) if len(study.tissues) > 1 else None
-    gain = Gain.at(best, sites.at_best, known.residual_model, unknowns(study), space)
+    gain = Gain.at(best, sites.at_best.responses, known.residual_model, unknowns(study), space)
     found: list[Change] = []
     if table.sources:
         wanted = variants(context, folder, sites.searched, best)

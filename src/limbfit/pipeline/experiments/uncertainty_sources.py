@@ -21,11 +21,12 @@ from ...fe import ORDER_IN_TIME
 from ...indentation import SimulationJob, SiteModel
 from ...study import SolverTable, Study, Vector
 from ..context import Context
+from ..extrapolation import MESH_ORDERS, error_of_coarser
 from ..simulations import SimulationCache
+from ..stages.laboratory import error_of_own_mesh
 from ..stages.mesh import coarse_settings, make_mesh, mesh_job, mesh_settings
 from ..stages.traces import SiteRecord, site_record
 from ..store import file_digest
-from .extrapolation import MESH_ORDERS, error_of_coarser, error_of_finer
 
 Array = NDArray[np.float64]
 
@@ -202,7 +203,9 @@ def _of_mesh(
         models = _meshed(context, folder / "finer", [record.model for record in records], finer)
         jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     change, scale = mesh_share(study)
-    return Variant("mesh", change, tuple(jobs), plain, False, True, scale)
+    # With coarse meshes the residuals' covariance has it already.
+    counted = study.mesh.coarse is None
+    return Variant("mesh", change, tuple(jobs), plain, False, counted, scale)
 
 
 def mesh_share(study: Study) -> tuple[str, float]:
@@ -210,8 +213,9 @@ def mesh_share(study: Study) -> tuple[str, float]:
     order = MESH_ORDERS[study.mesh.element]
     how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
     if study.mesh.coarse is not None:
-        ratio = study.mesh.coarse.edge_near_mm / study.mesh.edge_near_mm
-        return f"what the fine mesh lacks, from coarse and fine: {how}", error_of_finer(order, ratio)
+        return f"what the fine mesh lacks ({how}); every interval has it already", error_of_own_mesh(
+            study.mesh
+        )
     what = f"what the mesh lacks, from edges {FINER:g} times as long: {how}"
     return what, error_of_coarser(order, 1 / FINER)
 
