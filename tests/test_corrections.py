@@ -71,6 +71,7 @@ def with_a_notch(labels: LabelMap) -> LabelMap:
     return labels.with_array(array)
 
 
+@pytest.mark.slow
 def test_hand_work_in_the_results_wins_and_survives(folder):
     """Saved over the stored map it is used through changed settings and repeated runs, and kept as it is."""
     study = study_of(folder)
@@ -103,6 +104,7 @@ def test_hand_work_is_kept_where_the_study_names_labels(folder):
     assert np.array_equal(kept.array, with_a_notch(first).array)
 
 
+@pytest.mark.slow
 def test_contours_of_the_results_make_the_same_labels(folder):
     study = study_of(folder)
     first = segmented(study)

@@ -275,6 +275,7 @@ def told(job, reason):
     return f"{Path(str(job)).name}: {reason}"
 
 
+@pytest.mark.slow
 def test_a_hung_worker_costs_one_retry_and_twice_is_lost_with_the_reason(tmp_path):
     with ProcessExecutor(2, limits=Limits(time_s=20.0)) as executor:
         answers = list(executor.map(hang_once, [str(tmp_path / "x")], lost=told))

@@ -42,6 +42,7 @@ def finished_simulations(study) -> dict[str, int]:
     return {p.name: p.stat().st_mtime_ns for p in study.glob("results/.work-calibrate-*/runs/*.npz")}
 
 
+@pytest.mark.slow
 def test_interrupted_calibration_goes_on_and_ends_the_same(coarse, tmp_path_factory):
     other = shutil.copytree(coarse, tmp_path_factory.mktemp("other") / "study")
     with pytest.raises(StoppedError):
@@ -129,6 +130,7 @@ def check_identified_parameters_are_used_until_stale(study) -> None:
     assert simulate_site(load_study(study), "1", parameters=given, listener=quiet)["parameters"] == given
 
 
+@pytest.mark.slow
 def test_planned_indentation_is_simulated_without_a_record(coarse):
     file = coarse / "study.toml"
     planned = "depth_mm = 3.0\nposition = [0.0, 40.0, 50.0]"

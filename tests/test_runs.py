@@ -120,6 +120,7 @@ def run_cli(*words: str, limit_bytes: int | None = None, **more) -> subprocess.C
     )
 
 
+@pytest.mark.slow
 def test_no_room_for_a_file_is_one_clear_line_and_the_run_goes_on_later(alone):
     done = run_cli("run", str(alone), "--until", "traces", limit_bytes=1500)
     assert done.returncode == 1

@@ -83,6 +83,7 @@ print(json.dumps({stage.name: code_digest(stage.run) for stage in (*STAGES, *EXP
 """
 
 
+@pytest.mark.slow
 def test_a_changed_file_changes_what_it_decides_and_nothing_else(tmp_path):
     big = shutil.ignore_patterns("__pycache__", "niivue*")
     copy = shutil.copytree(PACKAGE, tmp_path / "limbfit", ignore=big)

@@ -127,6 +127,7 @@ def run(examples: int) -> None:
     )
 
 
+@pytest.mark.slow
 def test_sixteen_sequences() -> None:
     run(16)
 

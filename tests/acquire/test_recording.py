@@ -193,6 +193,7 @@ def test_what_is_wrong_is_named(tmp_path) -> None:
     assert checks(thinned)["samples"] is False
 
 
+@pytest.mark.slow
 def test_ramps_that_do_not_repeat_are_named(tmp_path) -> None:
     _, recording = session(
         tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, pause_s=3.0, settle_s=0.5

@@ -72,6 +72,7 @@ def test_three_layers_are_as_thick_as_asked(element: str) -> None:
     assert report.region_cells["fat"] > report.region_cells["skin"]
 
 
+@pytest.mark.slow
 def test_layers_are_thinned_over_bone_instead_of_trimming_it() -> None:
     anatomy = limb(bone_offset=19.0)
     thin = replace(COARSE, bone_policy="thin-skin")

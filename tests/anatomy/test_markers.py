@@ -51,6 +51,7 @@ def check_found(found: tuple[Marker, ...], sites) -> None:
     assert all(2.0 < marker.height < 8.0 for marker in found)
 
 
+@pytest.mark.slow
 def test_markers_of_a_second_image_of_a_moved_limb() -> None:
     """And they are misplaced by about the motion where it is not taken back."""
     limb, _, plain, marked = scans(1)
@@ -73,6 +74,7 @@ def test_motion_of_a_limb() -> None:
     assert motion.correlation > 0.95
 
 
+@pytest.mark.slow
 def test_another_limb_is_no_motion() -> None:
     _, _, plain, _ = scans(1)
     noise = np.random.default_rng(0).uniform(0, 1, plain.array.shape).astype(np.float32)
@@ -96,6 +98,7 @@ def test_markers_of_one_image_alone_are_found_and_taken_off() -> None:
     assert far.max() < 20.0
 
 
+@pytest.mark.slow
 def test_no_marker_where_there_is_none() -> None:
     _, _, plain, _ = scans(1)
     outline = marked_skin(plain)[0]

@@ -58,6 +58,7 @@ def on_a_table(image: Volume, inside: np.ndarray, level: float, thick_mm: float)
     return image.with_array(array)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("contrast", "level"), [("UTE", 0.6), ("T1", 1.0), ("CT", -80.0)])
 def test_a_table_that_touches_the_limb_is_no_limb(images, inside, contrast, level):
     image = on_a_table(images[contrast], inside, level, 12.0)

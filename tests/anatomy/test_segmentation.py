@@ -46,6 +46,7 @@ def test_limb_along_another_grid_axis():
     assert dice(back == labels.value("fibula"), truth.mask("fibula")) > 0.92
 
 
+@pytest.mark.slow
 def test_phantom_with_all_four_bones():
     """The demo's image: limb above 0.98, every bone above 0.93 (Dice)."""
     limb = make_limb(1)
@@ -59,6 +60,7 @@ def test_phantom_with_all_four_bones():
         assert dice(labels.mask(name), limb.bone(name, points) < 0) > 0.93, name
 
 
+@pytest.mark.slow
 def test_more_noise_and_no_bias_correction():
     image, truth = leg_image(SPACING, SHAPE, DIRECTIONS["oblique"], noise=0.05)
     labels = segment(image, bias_correction=False)
@@ -66,6 +68,7 @@ def test_more_noise_and_no_bias_correction():
     assert dice(labels.mask("tibia"), truth.mask("tibia")) > 0.9
 
 
+@pytest.mark.slow
 def test_small_bones_are_left_out_and_no_bone_is_an_error():
     image, _ = leg_image(SPACING, SHAPE, DIRECTIONS["straight"])
     assert segment(image, min_bone_volume_mm3=3e4).bone_names == ("tibia",)

@@ -68,6 +68,7 @@ def rss_after(megabytes: int) -> float:
     return max_rss_MB() + 0.0 * held[0]
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_process_alone():
     mine = np.ones(400 * 131072)
     small, large = (in_fresh_process(rss_after, size, 1) for size in (1, 200))

@@ -71,9 +71,15 @@ def test_travel_ends_at_the_bone(robustness, site):
 
 @pytest.mark.parametrize(("skin", "muscle", "depth"), [(SOFT, STIFF, 1.5), (STIFF, SOFT, 4.0)])
 def test_opposite_corners_of_the_bounds(skin, muscle, depth):
-    """A thousandfold contrast of the moduli; soft skin gives way by half of its thickness."""
-    result = solve(punch("tet10", 2, 1, depth=depth, materials={"skin": skin, "muscle": muscle}))
+    """A thousandfold contrast of the moduli; soft skin gives way by half of its thickness.
+
+    Plain tet10 folds here, and which of several equilibria it takes hangs on the last digits.
+    """
+    result = solve(
+        punch("tet10", 2, 1, depth=depth, materials={"skin": skin, "muscle": muscle}, element="tet10v")
+    )
     assert result.completed, result.reason
+    assert not result.doubts
     assert result.penetration.max() <= 0.01 * depth
     assert (result.force >= 0).all()
     assert result.force[-1] < 1e-3 * result.peak_force

@@ -23,6 +23,7 @@ def calibrated(noise=0.03, seed=4, **extra):
     return data, found, estimate_uncertainty(found.parameters, found.responses, data, PAPER)
 
 
+@pytest.mark.slow
 def test_an_exploration_spends_its_runs_and_holds_the_truth():
     data, found, known = calibrated()
     asked = []
@@ -79,6 +80,7 @@ def test_a_source_shifts_the_answer_as_a_new_calibration_would():
     assert gain.covariance(bump, shared=True) == pytest.approx(np.outer(gain.shift(bump), gain.shift(bump)))
 
 
+@pytest.mark.slow
 def test_coverage_of_whole_calibrations():
     def record(repeat, forces):
         data = records(0.03, seed=repeat)

@@ -40,6 +40,7 @@ def valley_record(repeat, forces):
     return [Measured("s", forces[0] + noise)], [claimed]
 
 
+@pytest.mark.slow
 def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
     found = coverage_study(Valley(), BENT_TRUTH, BENT, valley_record, repeats=24)
     assert found.linearised.share < 0.85  # what it was

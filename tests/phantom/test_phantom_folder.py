@@ -91,6 +91,7 @@ def test_another_seed_is_another_patient() -> None:
         assert 3.8 < parameters["muscle"]["c_kPa"] < 5.2
 
 
+@pytest.mark.slow
 def test_a_limb_with_fat_has_three_tissues_and_is_the_same_otherwise(tmp_path, made) -> None:
     jobs = []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 from stored_results import write_results
 
 from limbfit.report import build_report
@@ -22,6 +23,7 @@ def compared(folder, peak=3.0, reason=""):
     np.savetxt(folder / "1.csv", columns, delimiter=",", header=head, comments="")
 
 
+@pytest.mark.slow
 def test_the_comparison_is_shown_where_there_is_one(tmp_path):
     write_results(tmp_path / "results")
     plain = build_report(tmp_path / "results", tmp_path / "plain").read_text()

@@ -9,6 +9,7 @@ pytest.importorskip("fastapi", reason="the studio's extra is not installed")
 from browsing import until
 
 
+@pytest.mark.slow
 def test_a_part_of_a_curve_is_enlarged_and_all_shown_again(study, serve, open_page):
     page = open_page(serve(study) + "#/traces")
     touch, peak = (page.locator(f"[data-key={key}]").first for key in ("touch_down_s", "peak_s"))

@@ -51,6 +51,7 @@ def test_a_click_on_the_skin_becomes_a_site_within_a_millimetre(study, serve, op
     assert serious_findings(page) == []
 
 
+@pytest.mark.slow
 def test_an_animation_is_played_and_its_files_are_downloaded(study, serve, open_page, tmp_path):
     write_stored(study / "results")
     page = open_page(serve(study) + "#/results")
@@ -72,6 +73,7 @@ def test_an_animation_is_played_and_its_files_are_downloaded(study, serve, open_
     assert serious_findings(page) == []
 
 
+@pytest.mark.slow
 def test_a_hidden_view_reads_nothing_until_it_is_shown(study, serve, open_page):
     page, asked = open_page(serve(study) + "#/model"), []
     page.get_by_role("checkbox", name="skin").wait_for()
