@@ -28,41 +28,19 @@ shape = "square"
 width_mm = {width:.1f}
 edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sharp edge they never do
 
-[solver]
-{mesh}
-# One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
+{mesh}# One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
 # The fitted sites identify the material; all others are predicted and compared.
 """
 
-# The far field, which hardly strains, is meshed wide. A coarse phantom is there to be identified in minutes;
-# meshes of the paper's detail are within 0.3 % of the peak force of finer ones (docs/identification.md).
+# What a study states nothing of is limbfit's choice: only a phantom of the paper's detail asks for more.
 _MESH = {
-    "coarse": """
+    "coarse": "",
+    "paper": """\
 [mesh]
-edge_near_mm = 3.5
-edge_far_mm = 30.0
-near_radius_mm = 12.0
-growth = 0.9
-flatness = 1.6
+accuracy = "fine"
 
-[calibration]
-relative_tolerance = 0.01   # forces of meshes this coarse are off by more than a finer search could tell
-""",
-    "paper": """
-[mesh]
-edge_near_mm = 3.0
-edge_far_mm = 24.0
-near_radius_mm = 14.0
-growth = 0.6
-flatness = 1.6
-
-[mesh.coarse]   # parameters are searched on these meshes; those above correct their forces
-
-[calibration]
-relative_tolerance = 0.01   # a finer search would creep along a valley
 """,
 }
-STEPS = {"load_steps": 6, "unload_steps": 8}
 
 _SURFACE_EDGE_MM = {"coarse": 4.0, "paper": 3.0}
 
@@ -85,7 +63,7 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         surface=_SURFACE_EDGE_MM[detail],
         width=INDENTER_MM,
         edge=INDENTER_EDGE_MM,
-        mesh="".join(f"{key} = {value}\n" for key, value in STEPS.items()) + _MESH[detail],
+        mesh=_MESH[detail],
     )
     parts = [head]
     for site in sites:

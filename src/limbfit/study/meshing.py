@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -30,14 +31,34 @@ def smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -
     return float(edges[np.argmax(np.array(cells) <= MOST_CELLS)])
 
 
+def _edges(near: float, far: float, radius: float, growth: float, flatness: float) -> dict[str, float]:
+    return {
+        "edge_near_mm": near,
+        "edge_far_mm": far,
+        "near_radius_mm": radius,
+        "growth": growth,
+        "flatness": flatness,
+    }
+
+
+# What ``mesh.accuracy`` stands for: a site's own mesh and the coarse one. Edges far from the indenter, where
+# tissue hardly strains, cost unknowns and change no force (docs/convergence.md).
+ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float]]] = {
+    "fast": (_edges(5.5, 30.0, 12.0, 0.9, 1.6), _edges(8.0, 40.0, 12.0, 1.2, 1.8)),
+    "standard": (_edges(3.5, 30.0, 12.0, 0.9, 1.6), _edges(7.0, 36.0, 12.0, 1.2, 1.8)),
+    "fine": (_edges(3.0, 24.0, 14.0, 0.6, 1.6), _edges(5.5, 30.0, 12.0, 0.9, 1.6)),
+}
+_OWN, _COARSE = ACCURACIES["standard"]
+
+
 class CoarseMeshTable(Table):
     """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
 
-    edge_near_mm: Positive = 5.5
-    edge_far_mm: Positive = 30.0
-    near_radius_mm: Positive = 12.0
-    growth: Positive = 0.9
-    flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
+    edge_near_mm: Positive = _COARSE["edge_near_mm"]
+    edge_far_mm: Positive = _COARSE["edge_far_mm"]
+    near_radius_mm: Positive = _COARSE["near_radius_mm"]
+    growth: Positive = _COARSE["growth"]
+    flatness: Annotated[float, Field(ge=1, le=2)] = _COARSE["flatness"]
 
     @model_validator(mode="after")
     def _few_enough(self) -> CoarseMeshTable:
@@ -48,19 +69,31 @@ class CoarseMeshTable(Table):
 class MeshTable(Table):
     """The mesh of each site: element and edge lengths near the indenter and far from it.
 
+    ``accuracy`` sets all edge lengths; those that are stated go before it. With ``coarse``, parameters are
+    searched on coarse meshes, whose forces these meshes correct: without edges of its own a study has them.
     ``element``: linear tetrahedra, or quadratic ones with the pressure as it comes or constant in each.
-    With ``coarse``, parameters are searched on coarse meshes, whose forces these meshes correct.
     """
 
+    accuracy: Literal["fast", "standard", "fine"] = Field(default="standard", exclude=True)  # edges say it
+
     element: Literal["tet4", "tet10", "tet10p0"] = "tet10p0"
-    edge_near_mm: Positive = 3.5
-    edge_far_mm: Positive = 12.0
-    near_radius_mm: Positive = 16.0
-    growth: Positive = 0.35
-    flatness: Annotated[float, Field(ge=1, le=2)] = 1.0
+    edge_near_mm: Positive = _OWN["edge_near_mm"]
+    edge_far_mm: Positive = _OWN["edge_far_mm"]
+    near_radius_mm: Positive = _OWN["near_radius_mm"]
+    growth: Positive = _OWN["growth"]
+    flatness: Annotated[float, Field(ge=1, le=2)] = _OWN["flatness"]
     engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
-    coarse: CoarseMeshTable | None = None
+    coarse: CoarseMeshTable | None = CoarseMeshTable()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_accuracy(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping):
+            return given
+        own, coarse = ACCURACIES.get(str(given.get("accuracy", "standard")), ACCURACIES["standard"])
+        stated = own.keys() & given.keys()
+        return {**own, "coarse": None if stated else coarse, **given}
 
     @model_validator(mode="after")
     def _few_enough(self) -> MeshTable:

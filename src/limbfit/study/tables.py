@@ -307,7 +307,7 @@ class CalibrationTable(Table):
 
     objective: Literal["pointwise", "paper"] = "pointwise"
     stopping: Literal["relative", "paper"] = "relative"
-    relative_tolerance: Positive = 1e-3
+    relative_tolerance: Positive = 0.01
     max_iterations: Annotated[int, Field(ge=1, le=200)] = 25
     fixed: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
