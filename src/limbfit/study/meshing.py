@@ -31,6 +31,21 @@ def smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -
     return float(edges[np.argmax(np.array(cells) <= MOST_CELLS)])
 
 
+def _refuse_too_many(table: CoarseMeshTable | MeshTable) -> None:
+    far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
+    cells = estimated_cells(table.edge_near_mm, far, radius, growth)
+    if cells <= MOST_CELLS:
+        return
+    counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
+    where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
+    least = smallest_edge_mm(far, radius, growth)
+    finest = np.ceil(100 * least) / 100
+    raise ValueError(
+        f"{where} makes about {counted} cells per site, and {MOST_CELLS / 1e6:g} million are the most; give "
+        f"edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"
+    )
+
+
 def _edges(near: float, far: float, radius: float, growth: float, flatness: float) -> dict[str, float]:
     return {
         "edge_near_mm": near,
@@ -104,18 +119,3 @@ class MeshTable(Table):
     def cell_type(self) -> Literal["tet4", "tet10"]:
         """The cells of the mesh, whatever is solved on them."""
         return "tet4" if self.element == "tet4" else "tet10"
-
-
-def _refuse_too_many(table: CoarseMeshTable | MeshTable) -> None:
-    far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
-    cells = estimated_cells(table.edge_near_mm, far, radius, growth)
-    if cells <= MOST_CELLS:
-        return
-    counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
-    where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
-    least = smallest_edge_mm(far, radius, growth)
-    finest = np.ceil(100 * least) / 100
-    raise ValueError(
-        f"{where} makes about {counted} cells per site, and {MOST_CELLS / 1e6:g} million are the most; give "
-        f"edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"
-    )
