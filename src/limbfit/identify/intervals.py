@@ -78,6 +78,7 @@ def sampled_uncertainty(
     space: Space,
     kept: Kept,
     simulate: Simulate,
+    further: int = FURTHER_SIMULATIONS,
     seed: int = 0,
 ) -> Uncertainty:
     """``known`` with sampled intervals, combinations, verdicts and correlations.
@@ -88,7 +89,7 @@ def sampled_uncertainty(
         of the answer stays.
     space : of the calibration's last stage.
     kept : what the calibration simulated.
-    simulate : for at most ten further simulations of single sites; one that fails is tried again half-way.
+    simulate : for ``further`` simulations of single sites; one that fails is tried again half-way.
 
     Notes
     -----
@@ -105,7 +106,7 @@ def sampled_uncertainty(
         model, doubting = known.residual_model, emulator.forces_and_doubt
         return Likelihood(emulator, measured, model, unknowns, space, doubting)
 
-    for _ in range(min(_MOST_EVALUATIONS, FURTHER_SIMULATIONS // len(measured))):
+    for _ in range(min(_MOST_EVALUATIONS, further // len(measured))):
         now = likelihood()
         _learn(runs, simulate, _most_probable(now, _sample(now, runs, seed)))
     return both_readings(known, _sample(likelihood(), runs, seed, last=True), unknowns, space)

@@ -56,24 +56,24 @@ def _edges(near: float, far: float, radius: float, growth: float, flatness: floa
     }
 
 
-# What ``mesh.accuracy`` stands for: a site's own mesh and the coarse one. Edges far from the indenter, where
-# tissue hardly strains, cost unknowns and change no force (docs/convergence.md).
-ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float]]] = {
-    "fast": (_edges(5.5, 30.0, 12.0, 0.9, 1.6), _edges(8.0, 40.0, 12.0, 1.2, 1.8)),
-    "standard": (_edges(3.5, 30.0, 12.0, 0.9, 1.6), _edges(7.0, 36.0, 12.0, 1.2, 1.8)),
+# What ``mesh.accuracy`` stands for: a site's own mesh, and a coarse one where that is much cheaper. Edges far
+# from the indenter, where tissue hardly strains, cost unknowns and change no force (docs/convergence.md).
+ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
+    "fast": (_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
+    "standard": (_edges(3.5, 30.0, 14.0, 0.9, 1.6), None),
     "fine": (_edges(3.0, 24.0, 14.0, 0.6, 1.6), _edges(5.5, 30.0, 12.0, 0.9, 1.6)),
 }
-_OWN, _COARSE = ACCURACIES["standard"]
+_OWN = ACCURACIES["standard"][0]
 
 
 class CoarseMeshTable(Table):
     """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
 
-    edge_near_mm: Positive = _COARSE["edge_near_mm"]
-    edge_far_mm: Positive = _COARSE["edge_far_mm"]
-    near_radius_mm: Positive = _COARSE["near_radius_mm"]
-    growth: Positive = _COARSE["growth"]
-    flatness: Annotated[float, Field(ge=1, le=2)] = _COARSE["flatness"]
+    edge_near_mm: Positive = 5.5
+    edge_far_mm: Positive = 30.0
+    near_radius_mm: Positive = 12.0
+    growth: Positive = 0.9
+    flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
 
     @model_validator(mode="after")
     def _few_enough(self) -> CoarseMeshTable:
@@ -85,7 +85,7 @@ class MeshTable(Table):
     """The mesh of each site: element and edge lengths near the indenter and far from it.
 
     ``accuracy`` sets all edge lengths; those that are stated go before it. With ``coarse``, parameters are
-    searched on coarse meshes, whose forces these meshes correct: without edges of its own a study has them.
+    searched on coarse meshes, whose forces these meshes correct.
     ``element``: linear tetrahedra, or quadratic ones with the pressure as it comes or constant in each.
     """
 
@@ -99,7 +99,7 @@ class MeshTable(Table):
     flatness: Annotated[float, Field(ge=1, le=2)] = _OWN["flatness"]
     engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
-    coarse: CoarseMeshTable | None = CoarseMeshTable()
+    coarse: CoarseMeshTable | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -41,7 +41,7 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     benches = {name: Laboratory(context, cache, fitted, "regions") for name, (fitted, _) in members.items()}
     made = {name: _region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
     found = fit_regions(made, unknowns(study), whole)
-    rows = [_row(context, name, benches[name], members[name], fit) for name, fit in found.items()]
+    rows = [_row(context, name, benches[name], members[name], fit, folder) for name, fit in found.items()]
     content = {
         "sites_used": sites,
         "left_out": _left_out(context, members),
@@ -119,11 +119,12 @@ def _row(
     laboratory: Laboratory,
     chosen: tuple[list[Site], list[Site]],
     fit: RegionFit,
+    folder: Path,
 ) -> dict[str, Any]:
     """What ``regions.json`` holds of a region."""
     study, found = context.study, fit.calibration
     fitted, mine = chosen
-    known = laboratory.uncertainty(found, groupings(study)[-1])
+    known = laboratory.uncertainty(found, groupings(study)[-1], folder / "coarser")
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, key), limits in zip(flat_names(study.tissues), known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits

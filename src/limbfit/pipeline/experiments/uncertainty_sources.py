@@ -24,9 +24,8 @@ from ..context import Context
 from ..extrapolation import MESH_ORDERS, error_of_coarser
 from ..simulations import SimulationCache
 from ..stages.laboratory import error_of_own_mesh
-from ..stages.mesh import coarse_settings, make_mesh, mesh_job, mesh_settings
+from ..stages.mesh import coarse_settings, mesh_settings, meshed_models, scaled_edges
 from ..stages.traces import SiteRecord, site_record
-from ..store import file_digest
 
 Array = NDArray[np.float64]
 
@@ -164,24 +163,9 @@ def _thicker(context: Context, folder: Path, models: Sequence[SiteModel]) -> lis
         layers[index] = replace(layer, min_thickness_mm=(layer.min_thickness_mm or 0.0) + more)
     else:
         layers[index] = replace(layer, thickness_mm=layer.thickness_mm + more)
-    return _meshed(context, folder / "thicker", models, replace(settings, layers=tuple(layers)))
-
-
-def _meshed(
-    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
-) -> list[SiteModel]:
-    """The models on meshes of other settings; those of an interrupted run are kept."""
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = [
-        mesh_job(context, model.name, model.position, model.axis, settings, folder / f"{model.name}.vtu")
-        for model in models
-    ]
-    missing = [job for job in jobs if not job.file.with_suffix(".json").is_file()]
-    for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
-        context.tell("uncertainty", 0, 0, f"mesh of site {job.site}, {folder.name}")
-    return [
-        replace(model, mesh=job.file, mesh_digest=file_digest(job.file)) for model, job in zip(models, jobs)
-    ]
+    return meshed_models(
+        context, folder / "thicker", models, replace(settings, layers=tuple(layers)), "uncertainty"
+    )
 
 
 def _of_mesh(
@@ -197,10 +181,10 @@ def _of_mesh(
     if study.mesh.coarse is not None:
         jobs = [site_record(context, record.site).job(parameters, sensitivities=False) for record in records]
     else:
-        finer = replace(
-            settings, edge_near_mm=FINER * settings.edge_near_mm, edge_far_mm=FINER * settings.edge_far_mm
+        finer = scaled_edges(settings, FINER)
+        models = meshed_models(
+            context, folder / "finer", [record.model for record in records], finer, "uncertainty"
         )
-        models = _meshed(context, folder / "finer", [record.model for record in records], finer)
         jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     change, scale = mesh_share(study)
     # With coarse meshes the residuals' covariance has it already.

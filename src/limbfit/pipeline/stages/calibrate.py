@@ -46,7 +46,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     tried = multistart(run, unknowns(study), table.starts, table.seed)
     found = tried.best
-    known = laboratory.uncertainty(found, stages[-1])
+    known = laboratory.uncertainty(found, stages[-1], folder / "coarser")
     rounds = rounds_of[tried.number]
     answers = laboratory.answer(found.parameters)
     for site, texts in laboratory.warnings.items():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from ...errors import RunError
 from ...identify.calibration import Calibration, CalibrationSettings, State, calibrate
 from ...identify.correction import CoarseToFine
 from ...identify.fidelity import FidelitySettings, Round, calibrate_corrected
-from ...identify.intervals import Kept, sampled_uncertainty
+from ...identify.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
 from ...identify.objective import Measured, SiteResponse
 from ...identify.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
 from ...identify.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
@@ -24,11 +25,13 @@ from ..context import Context
 from ..extrapolation import MESH_ORDERS, error_of_finer
 from ..simulations import SimulationCache
 from .doubted import Doubted
+from .mesh import mesh_settings, meshed_models, scaled_edges
 from .record_noise import site_noise
 from .traces import SiteRecord, site_record
 
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
+COARSER = 1.3  # times the edges: another mesh that tells the error of the study's own
 NEAR = 1.5  # in logarithms of parameters: as far as another simulation's states save work as first guesses
 ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too sure"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
@@ -139,15 +142,19 @@ class Laboratory:
                 raise RunError(f"site {one.site} cannot be simulated at the answer: {one.reason}")
         return anchored
 
-    def uncertainty(self, found: Calibration, grouping: Grouping) -> Uncertainty:
+    def uncertainty(self, found: Calibration, grouping: Grouping, meshes: Path) -> Uncertainty:
         """What the records tell about an answer, sampled on what was simulated near it and a little more.
 
-        Where that cannot be, for simulations that fail, it is linearised and a line says so.
+        Where that cannot be, for simulations that fail, it is linearised and a line says so. ``meshes`` is a
+        folder for the coarser meshes that tell the error of the study's own, where it has no others.
         """
         study = self.context.study
-        anchored = Anchored(list(found.responses), list, ())
+        further = FURTHER_SIMULATIONS
         if self.has_coarse:
             anchored = self.anchored(found.parameters)
+        else:
+            anchored = Anchored(list(found.responses), list, self._mesh_error(found, meshes))
+            further -= len(self.records)
         known = linearised(study, self.records, found.parameters, anchored)
         kept = Kept()
         for point, run in zip(self.kept.points, self.kept.responses, strict=True):
@@ -159,10 +166,35 @@ class Laboratory:
 
         bounds = unknowns(study)
         space = search_space(bounds, grouping)
-        sampled = sampled_uncertainty(known, self.measured, bounds, space, kept, simulate)
+        sampled = sampled_uncertainty(known, self.measured, bounds, space, kept, simulate, further)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
         return sampled
+
+    def _mesh_error(self, found: Calibration, folder: Path) -> tuple[Array, ...]:
+        """One standard deviation (n,) N of what the study's meshes lack at every site, from coarser ones.
+
+        Zero where the coarser mesh cannot be simulated: a line says so.
+        """
+        study = self.context.study
+        settings = scaled_edges(mesh_settings(study), COARSER)
+        own = [record.model for record in self.records]
+        models = meshed_models(self.context, folder, own, settings, self.title)
+        jobs = [
+            replace(record.job(found.parameters, sensitivities=False), model=model)
+            for record, model in zip(self.records, models, strict=True)
+        ]
+        share, lacking = error_of_finer(MESH_ORDERS[study.mesh.element], COARSER), []
+        done = self.cache.run(jobs, self.context.executor, again=True)
+        for record, simulation, fitted in zip(self.records, done, found.responses, strict=True):
+            coarse = record.respond(simulation)
+            told = f"coarser mesh, site {simulation.site}"
+            if not coarse.completed:
+                told = f"warning: site {simulation.site}: the error of its mesh is not known: {coarse.reason}"
+            self.context.tell(self.title, 0, 0, told)
+            known = coarse.force_N if coarse.completed else fitted.force_N
+            lacking.append(share * (fitted.force_N - known))
+        return tuple(lacking)
 
     def _facts(self, state: State) -> dict[str, Any]:
         """The newest iterate in numbers: error in percent of the largest force, parameters, cost."""

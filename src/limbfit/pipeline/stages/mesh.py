@@ -14,10 +14,11 @@ from ...anatomy.layers import LayerSpec
 from ...anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
 from ...anatomy.surfaces import Anatomy, load_anatomy
 from ...anatomy.thickness import read_thickness
+from ...indentation import SiteModel
 from ...mesh import write_vtu
 from ...study import Study
 from ..context import Context
-from ..store import COARSE, read_json, write_json
+from ..store import COARSE, file_digest, read_json, write_json
 from .files import THICKNESS
 
 
@@ -110,6 +111,32 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     for facts in (*folder.glob("*.vtu"), *folder.glob(f"{COARSE}/*.vtu")):
         facts.with_suffix(".json").unlink()
     return {}
+
+
+def meshed_models(
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str
+) -> list[SiteModel]:
+    """The models on meshes of other settings, in ``folder``; those of an interrupted run are kept.
+
+    ``title`` is the stage or experiment that is told of progress.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = [
+        mesh_job(context, model.name, model.position, model.axis, settings, folder / f"{model.name}.vtu")
+        for model in models
+    ]
+    missing = [job for job in jobs if not _is_meshed(job)]
+    for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
+        context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
+    return [
+        replace(model, mesh=job.file, mesh_digest=file_digest(job.file)) for model, job in zip(models, jobs)
+    ]
+
+
+def scaled_edges(settings: MeshSettings, factor: float) -> MeshSettings:
+    """The same with edges ``factor`` times as long."""
+    near, far = factor * settings.edge_near_mm, factor * settings.edge_far_mm
+    return replace(settings, edge_near_mm=near, edge_far_mm=far)
 
 
 def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
