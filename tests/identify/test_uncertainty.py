@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from limbfit.identify import (
     separate,
     summarise,
 )
-from limbfit.identify.discrepancy import _Rows, matern
+from limbfit.identify.discrepancy import ResidualModel, _Rows, matern
 from limbfit.identify.noise import curve_noise
 
 
@@ -29,14 +30,14 @@ def fitted(data, run=simulate):
     return found, estimate_uncertainty(found.parameters, found.responses, data, PAPER)
 
 
-def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER):
+def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=()):
     """How far one Gauss-Newton step from the truth goes, in logarithms, and the uncertainty there."""
     responses = [site.respond(truth) for site in sites]
     J = np.concatenate([r.jacobian * truth * d.scale for r, d in zip(responses, data)])
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
-    found = estimate_uncertainty(truth, moved, data, unknowns)
+    found = estimate_uncertainty(truth, moved, data, unknowns, mesh_N=mesh_N)
     return step, found
 
 
@@ -80,6 +81,29 @@ def test_intervals_cover_the_truth_where_the_model_is_wrong():
     shares = coverage(smooth_misfit, repeats=100)
     assert np.all(shares > 0.86), shares
     assert 0.90 < shares.mean() < 0.99
+
+
+def test_the_error_of_the_mesh_is_in_the_intervals():
+    """Records of a finer mesh, 3 % softer everywhere: c takes it all, and no residual tells of it."""
+    softer = [replace(record, force_N=0.97 * record.force_N) for record in records()]
+    softer = [replace(d, force_N=d.force_N + n) for d, n in zip(softer, scatter(0.01))]
+    step, without = linear_fit(softer)
+    mesh = [0.03 * record.force_N for record in records()]
+    _, counted = linear_fit(softer, mesh_N=mesh)
+
+    def farthest(u):
+        return max(abs(c.weights @ step) / np.log(c.factor_95) for c in u.combinations)
+
+    assert farthest(without) > 2
+    assert farthest(counted) < 1
+    told = [u.residual_model.to_dict()["sites"]["s0"]["mesh_share"] for u in (without, counted)]
+    assert told[0] is None
+    assert 0.005 < told[1] < 0.03
+
+
+def scatter(sd):
+    rng = np.random.default_rng(4)
+    return [sd * rng.standard_normal(record.force_N.size) for record in records()]
 
 
 def test_misfit_and_noise_are_told_apart():
@@ -240,13 +264,15 @@ def test_the_error_is_the_papers():
     assert np.isnan(summarise([]).mean_percent)
 
 
-def test_the_slope_of_the_restricted_likelihood_is_its_derivative():
+@pytest.mark.parametrize("mesh", [(), [0.02 * np.linspace(0, 1, 60)] * 4], ids=["no mesh", "mesh"])
+def test_the_slope_of_the_restricted_likelihood_is_its_derivative(mesh):
     data = records(0.02, seed=1)
     left = [r.force_N - d.force_N for r, d in zip(simulate(TRUTH), data)]
     noise = [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
     peaks = np.array([d.force_N.max() for d in data])
     scaled = [r.jacobian * TRUTH for r in simulate(TRUTH)]
-    rows = _Rows(left, scaled, noise, peaks, np.eye(8), 0.2)
+    unit = ResidualModel(tuple(noise), peaks, np.ones(4), 0.2, 0.0, mesh_N=tuple(mesh))
+    rows = _Rows(left, scaled, unit, np.eye(8))
     at, h = np.log([0.01, 0.02, 0.005, 0.03]), 1e-5
     slopes = [(rows.criterion(at + h * e)[0] - rows.criterion(at - h * e)[0]) / (2 * h) for e in np.eye(4)]
     assert rows.criterion(at)[1] == pytest.approx(np.array(slopes), rel=1e-4)
