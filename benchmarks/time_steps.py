@@ -22,7 +22,6 @@ from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu
 from limbfit.phantom.forces import STEPS as TRUTH
 from limbfit.phantom.sites import INDENTER_EDGE_MM, INDENTER_MM
-from limbfit.phantom.studyfile import STEPS as DEMO
 from limbfit.study import IndenterTable
 
 T = 10.0  # s, one way
@@ -33,7 +32,6 @@ HISTORIES = {
 }
 CONTROLS = {
     "default": StepControl(),
-    "demo": StepControl(**DEMO),
     "truth": StepControl(load_steps=TRUTH.load_steps, unload_steps=TRUTH.unload_steps),
     "default, linear": StepControl(stress="linear"),
 }

@@ -64,7 +64,7 @@ def test_a_good_study(folder: Path) -> None:
     assert [site.name for site in study.fitted] == ["1"]
     assert study.results == folder / "results"
     assert study.mesh.edge_near_mm == 3.0
-    assert study.mesh.edge_far_mm == 12.0
+    assert study.mesh.edge_far_mm == 30.0
     assert study.path(study.sites[0].trace or Path()) == folder / "1.csv"
     assert study.site("2").depth_mm == 6.0
 

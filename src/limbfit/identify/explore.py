@@ -142,6 +142,8 @@ class _Exploration:
         """Simulate; what the emulator expected there is kept beside what came."""
         found = list(self.simulate(points))
         whole = [i for i, run in enumerate(found) if all(r.completed for r in run)]
+        if len(whole) < len(found):
+            self.tell(f"{len(found) - len(whole)} of {len(found)} simulations failed: they are left out")
         if self.rounds:
             errors = [self.emulator.check(points[i], found[i]) for i in whole]
             self.new_percent = tuple(np.mean(errors, axis=0).tolist()) if errors else ()
@@ -243,6 +245,7 @@ class _Exploration:
         wanted = [self.best.parameters, *(end for _, one in chosen for end in one.ends)]
         at_best, *found = self.simulate(wanted)
         if not all(r.completed for r in at_best):
+            self.tell("warning: the answer's own simulation failed: no end of a profile is checked")
             return ()
         pairs = zip(found[::2], found[1::2], strict=True)
         return tuple(

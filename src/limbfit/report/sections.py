@@ -294,18 +294,29 @@ def parameters(store: Store) -> Section:
 
 
 def _residuals(store: Store) -> str:
-    """What the intervals rest on: noise of the records and misfit of the model, site by site."""
+    """What the intervals rest on: noise, misfit of the model and error of the mesh, site by site."""
     found = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
+    rows = found.get("sites") or {}
+    if not rows:
+        return ""
     sites = ", ".join(
         f"{name} {tables.fixed(site['noise_sd_N'], 3)} N and {tables.fixed(site['misfit_sd_N'], 3)} N"
-        for name, site in (found.get("sites") or {}).items()
+        for name, site in rows.items()
     )
-    if not sites:
-        return ""
+    meshes = ", ".join(
+        f"{name} {tables.fixed(100 * site['mesh_share'], 1)} %"
+        for name, site in rows.items()
+        if site.get("mesh_share") is not None
+    )
     return (
         "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
         f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
-        f"{tables.fixed(100 * found['correlation'], 0)} % of a record."
+        f"{tables.fixed(100 * found['correlation'], 0)} % of a record. "
+        + (
+            f"To these comes the error of the meshes, from others, in percent of the largest force: {meshes}."
+            if meshes
+            else "The error of the meshes is not in them: no other mesh was simulated."
+        )
     )
 
 

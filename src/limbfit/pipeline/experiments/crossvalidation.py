@@ -116,7 +116,12 @@ class _Bench:
         for i, point in enumerate(points):
             self.context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
             runs.append(self.as_fine(self.laboratory.search(point)))
-        self.points, self.runs = [*self.points, *points], [*self.runs, *runs]
+        for point, run in zip(points, runs, strict=True):
+            if failed := _failed(run):
+                told = f"warning: a simulation failed at site {failed}: the emulator does without it"
+                self.context.tell("crossvalidate", 0, 0, told)
+            else:
+                self.points, self.runs = [*self.points, point], [*self.runs, run]
         self.emulator = Emulator.fit(self.bounds.names, np.array(self.points), self.runs)
         return runs
 
@@ -148,7 +153,7 @@ class _Bench:
         runs = self.learn([fold.parameters for fold in folds])
         rows = []
         for fold, cheap, run in zip(folds, emulated, runs):
-            if not all(response.completed for response in run):
+            if _failed(run):
                 continue
             held = fold.heldout
             solved = [error_percent(run[i].force_N, self.measured[i].force_N) for i in held]
@@ -164,6 +169,11 @@ class _Bench:
                 }
             )
         return rows
+
+
+def _failed(run: Sequence[SiteResponse]) -> str:
+    """The sites whose simulation did not complete, in words; empty where all did."""
+    return ", ".join(response.site for response in run if not response.completed)
 
 
 def _content(
