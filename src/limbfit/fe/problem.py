@@ -165,8 +165,8 @@ def _check_choices(problem: Problem) -> None:
     if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
         raise ProblemError("the mesh has region indices without a name")
     if problem.contact_rule not in ELEMENTS[name].face_rules:
-        rules = "'nodes', 'gauss' or, on quadratic faces, 'gauss7'"
-        raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy=f"use {rules}")
+        rules = ", ".join(ELEMENTS[name].face_rules)
+        raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy=f"use one of {rules}")
     if problem.friction not in ("frictionless", "sticky"):
         raise ProblemError(f"unknown friction {problem.friction!r}", remedy="use 'frictionless' or 'sticky'")
     if problem.start not in ("touching", "as-given"):
