@@ -8,9 +8,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 import pyvista as pv
+import typer
 
 from limbfit import __version__
 from limbfit.cli import main
+from limbfit.cli.app import app
+from limbfit.cli.groups import GROUPS
 
 HEADER = "time_s,displacement_mm,force_N"
 
@@ -69,6 +72,15 @@ def test_check_tells_the_facts(limbfit, study):
     assert "tibia" in out
     assert "1 of 2 sites are fitted" in out
     assert not (study / "results").exists()
+
+
+def test_help_lists_every_verb_once_with_its_whole_sentence(limbfit):
+    code, told, _ = limbfit("--help")
+    assert code == 0
+    listed = [name for names in GROUPS.values() for name in names]
+    assert sorted(listed) == sorted(typer.main.get_command(app).commands)
+    assert "..." not in told.replace("[ARGS]...", "")
+    assert all(f"{group}:" in told for group in GROUPS)
 
 
 def test_check_as_json(limbfit, study):

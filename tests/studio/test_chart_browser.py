@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from browsing import until
 
 

@@ -8,8 +8,6 @@ from warnings import catch_warnings, simplefilter
 import pydicom
 import pytest
 
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from browsing import PATIENCE_MS, until
 from conftest import write_trace
 from limbfit.phantom.geometry import make_limb

@@ -10,9 +10,6 @@ import sys
 import nrrd
 import numpy as np
 import pytest
-
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from fastapi.testclient import TestClient
 from limb_image import make_segmented
 

@@ -7,8 +7,6 @@ import time
 
 import pytest
 
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from acquiring import fitsocket, start
 from browsing import serious_findings, until
 from limbfit.acquire import read_recording

@@ -8,9 +8,6 @@ import time
 
 import numpy as np
 import pytest
-
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from fastapi.testclient import TestClient
 
 from limbfit.acquire import Recorder

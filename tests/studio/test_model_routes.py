@@ -8,9 +8,6 @@ import tomllib
 import numpy as np
 import pytest
 import pyvista as pv
-
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from fastapi.testclient import TestClient
 
 from limbfit import load_study

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from browsing import until
 from conftest import COARSE
 from limbfit import load_study

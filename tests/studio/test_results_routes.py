@@ -6,9 +6,6 @@ import time
 
 import numpy as np
 import pytest
-
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from fastapi.testclient import TestClient
 from stored_fields import block, fields, write_outcome, write_stored
 

@@ -9,9 +9,6 @@ import shutil
 import numpy as np
 import psutil
 import pytest
-
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from limb_image import make_segmented
 
 from browsing import serious_findings, until

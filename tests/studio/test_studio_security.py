@@ -10,13 +10,9 @@ from urllib.parse import quote, unquote
 
 import httpx
 import pytest
+from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
-from fastapi.testclient import TestClient
-
-import limbfit
 from limbfit.cli import app as command_line
 from limbfit.errors import InputError, RunError
 from limbfit.studio.app import STATIC, create_app
@@ -400,9 +396,3 @@ def test_the_server_listens_on_loopback_and_says_where(study):
 def _own_addresses() -> list[str]:
     found = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
     return sorted(one for one in found if not one.startswith("127."))
-
-
-def test_what_is_missing_is_said_with_the_command_that_installs_it(study, monkeypatch):
-    monkeypatch.setattr("limbfit.studio.NEEDED", ("fastapi", "no_such_package"))
-    with pytest.raises(RunError, match=r"needs no_such_package, .*pip install 'limbfit\[studio\]'"):
-        limbfit.serve_studio(study, tell=print)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import pyvista as pv
-
-pytest.importorskip("fastapi", reason="the studio's extra is not installed")
-
 from stored_fields import write_stored
 
 from browsing import WITHOUT_WEBGL, serious_findings, until

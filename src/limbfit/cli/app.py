@@ -14,6 +14,7 @@ from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
 from . import acquire, bench, commands, experiments, febio, geometry, runs, studio, trust
 from .console import INTERRUPTED, STDOUT, fail, prompt_interrupt
+from .groups import Grouped
 
 app = typer.Typer(
     name="limbfit",
@@ -21,7 +22,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    add_completion=False,
+    cls=Grouped,
 )
 
 

@@ -54,6 +54,12 @@ def demo(
         summary = limbfit.run_demo(folder, seed=seed, listener=listener)
     summary["seconds"] = round(perf_counter() - start, 1)
     show_summary(summary, as_json)
+    if not as_json:
+        STDOUT.print(
+            f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} asks what "
+            f"the records determine; {folder / 'study.toml'} is what a study of your own looks like",
+            soft_wrap=True,
+        )
 
 
 def phantom(
