@@ -56,8 +56,8 @@ def demo(
     show_summary(summary, as_json)
     if not as_json:
         STDOUT.print(
-            f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} asks what "
-            f"the records determine; {folder / 'study.toml'} is what a study of your own looks like",
+            f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} asks "
+            f"what the records determine; {folder / 'study.toml'} is what a study of your own looks like",
             soft_wrap=True,
         )
 
