@@ -323,6 +323,15 @@ def _unit(name: str) -> str:
     return f" {UNITS[name]}" if UNITS[name] != NOTHING else ""
 
 
+def _mesh_error(sites: Json) -> str:
+    """The meshes' part of the residuals' covariance, in words; nothing where it was not measured."""
+    shares = [100 * one["mesh_share"] for one in sites.values() if one.get("mesh_share") is not None]
+    if not shares:
+        return ""
+    least, most = fixed(min(shares), 1), fixed(max(shares), 1)
+    return f", and for the error of the meshes: {least} to {most} % of the largest force, from others"
+
+
 def _uncertainty(store: Store) -> str:
     residuals = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
     if not residuals:
@@ -334,9 +343,9 @@ def _uncertainty(store: Store) -> str:
     )
     return (
         "Residuals at the fitted sites are taken for noise of the records and a smooth misfit of the model, "
-        f"correlated along the record (standard deviations, site by site: {words}). 95 % intervals follow "
-        "from "
-        "their covariance and the exact derivatives, in the logarithms of the parameters."
+        f"correlated along the record (standard deviations, site by site: {words}){_mesh_error(sites)}. 95 % "
+        "intervals follow from their covariance and the exact derivatives, in the logarithms of the "
+        "parameters."
     )
 
 
