@@ -105,8 +105,12 @@ def build_anatomy(
         For a cut that misses the limb.
     """
     labels = labels.nearest_lps()
-    end = proximal_end(labels.limb, labels)
-    point, normal = _default_cut(labels, end) if proximal_cut is None else _plane(*proximal_cut)
+    if proximal_cut is None:
+        end = proximal_end(labels.limb, labels)
+        point, normal = _default_cut(labels, end)
+    else:
+        point, normal = _plane(*proximal_cut)  # a short limb may be wider than long: the cut tells its axis
+        end = proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
     built = _built(labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal))

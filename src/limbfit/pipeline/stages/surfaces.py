@@ -11,6 +11,7 @@ from ...anatomy.amputation import amputate
 from ...anatomy.imaging import LabelMap, read_labels
 from ...anatomy.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
 from ...anatomy.thickness import fat_depth, write_thickness
+from ...anatomy.voxels import amputated
 from ...study import Study
 from ..context import Context
 from .files import THICKNESS, labelled_file, naming
@@ -56,7 +57,10 @@ def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
 
 
 def given_anatomy(study: Study) -> Anatomy:
-    """The checked anatomy of given surfaces; without a stated cut its end is the highest (z) of the skin."""
+    """The checked anatomy of given surfaces, after the virtual amputation where there is one.
+
+    Without a stated cut its end is the highest (z) of the skin.
+    """
     assert study.surfaces is not None
     tables = study.surfaces
     files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
@@ -69,4 +73,11 @@ def given_anatomy(study: Study) -> Anatomy:
         point, normal = np.array([0.0, 0.0, skin.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
     anatomy = Anatomy(skin=skin, bones=surfaces, cut_point=point, cut_normal=normal)
     check_anatomy(anatomy, files)
-    return anatomy
+    geometry = study.geometry
+    if geometry.amputation is None:
+        return anatomy
+    plane, pad = geometry.amputation, geometry.amputation_pad_mm
+    with naming(files["skin"]):
+        stump = amputated(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
+        check_anatomy(stump)
+    return stump
