@@ -7,7 +7,7 @@ leave in the soft tissue is open there.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -259,8 +259,8 @@ def signed_distance(surface: Surface, points: ArrayLike) -> Array:
     return np.asarray(distance).ravel()
 
 
-def save_anatomy(folder: str | Path, anatomy: Anatomy) -> None:
-    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas) into a folder."""
+def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()) -> None:
+    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas, notes) into a folder."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_surface(folder / "skin.stl", anatomy.skin)
@@ -273,6 +273,7 @@ def save_anatomy(folder: str | Path, anatomy: Anatomy) -> None:
         "cut_normal": anatomy.cut_normal.tolist(),
         "skin": _measures(anatomy.skin),
         "bones": {name: _measures(bone) for name, bone in anatomy.bones.items()},
+        "notes": list(notes),
     }
     (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 

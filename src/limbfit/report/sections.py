@@ -214,6 +214,7 @@ def model(store: Store) -> Section:
         pictures.marker_figure(store),
         tables.volume_table(store),
         tables.place_table(store) if store.sites else None,
+        Bullets(tuple(store.surfaces["notes"])) if store.surfaces.get("notes") else None,
         otherwise="No surfaces and sites are stored yet.",
     )
     source = store.segment.get("method")
