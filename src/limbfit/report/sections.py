@@ -226,7 +226,9 @@ def model(store: Store) -> Section:
 def meshes(store: Store) -> Section:
     """Cut meshes and their quality."""
     warnings = tuple(
-        f"Site {site}: {text}" for site, facts in store.mesh.items() for text in facts.get("warnings") or ()
+        f"Site {site}: {text}"
+        for site, facts in store.mesh.items()
+        for text in (*(facts.get("repairs") or ()), *(facts.get("warnings") or ()))
     )
     blocks = _blocks(
         pictures.mesh_figure(store, store.fitted[:4]),
