@@ -17,7 +17,8 @@ from limbfit.anatomy.layered import with_layers
 from limbfit.anatomy.layers import LimbFields
 from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.anatomy.sites import indenter_axis, project_to_skin
-from limbfit.anatomy.untangling import inverted, repaired, untangled
+from limbfit.anatomy.smoothing import held
+from limbfit.anatomy.untangling import inverted, repaired, thinned, untangled
 from limbfit.errors import MeshingError
 from limbfit.mesh import check, quality
 
@@ -61,6 +62,14 @@ def through(mesh, node: int):
     return mesh.with_points(points)
 
 
+def crossed(mesh, stack):
+    """Three neighbouring columns whose heads have changed sides."""
+    points, feet = mesh.points.copy(), mesh.points[stack.base]
+    heads = stack.top[np.linalg.norm(feet - feet[40], axis=1).argsort()[:3]]
+    points[heads] = 1.5 * points[heads].mean(axis=0) - 0.5 * points[heads]
+    return mesh.with_points(points)
+
+
 def inner_node(mesh, stack) -> int:
     """A node of the core, on no surface."""
     surface = np.union1d(mesh.node_sets["fixed_bone"], stack.base)
@@ -68,18 +77,15 @@ def inner_node(mesh, stack) -> int:
     return int(core[mesh.points[core, 2] < -5.0][0])
 
 
-@pytest.mark.parametrize("where", ["core", "skin", "foot of a column"])
+@pytest.mark.parametrize("where", ["core", "skin", "foot of a column", "columns"])
 def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
     places = []
 
     def spoil(mesh, stack):
-        node = {
-            "core": inner_node(mesh, stack),
-            "skin": int(stack.top[40]),
-            "foot of a column": int(stack.base[40]),
-        }[where]
+        nodes = {"skin": stack.top[40], "foot of a column": stack.base[40], "columns": stack.top[40]}
+        node = int(nodes.get(where, inner_node(mesh, stack)))
         places.append(mesh.points[node])
-        worse = through(mesh, node)
+        worse = crossed(mesh, stack) if where == "columns" else through(mesh, node)
         assert (volumes(worse.points, worse.cells) <= 0).any()
         return worse
 
@@ -93,6 +99,22 @@ def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
     assert np.linalg.norm(told - base.fields.frame.to_patient(places[0])) < 25.0
     assert "inverted cells at (" in report.repairs[0].text
     assert abs(report.volume_error) < 0.01
+
+
+def test_thinner_layers_alone_make_crossed_columns_sound(monkeypatch, anatomy, site):
+    made = []
+
+    def spoil(mesh, stack):
+        made.append((crossed(mesh, stack), stack))
+        return mesh
+
+    spoiled(monkeypatch, spoil)
+    base = base_mesh(anatomy, COARSE)
+    mesh_site(anatomy, *site, COARSE, base)
+    worse, stack = made[0]
+    assert inverted(worse).any()
+    points = thinned(worse.points, worse, stack, *held(worse, base.fields, stack))
+    assert (volumes(points, worse.cells) > 0).all()
 
 
 def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, anatomy, site):

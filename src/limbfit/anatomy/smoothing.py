@@ -28,14 +28,19 @@ def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     Inner nodes move freely, those of the layers along the skin, those on bone or cut along these, nodes on
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
-    on_plane, _, on_bone = _places(mesh, stack)
     normals, movable = held(mesh, fields, stack)
     points = improved(mesh.points, mesh.cells, WORKED_BELOW_DEG, normals, movable)
+    return mesh.with_points(put_back(points, mesh, fields, stack))
+
+
+def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
+    """Moved points (n, 3) of a mesh, those of bone and layers put on their surfaces as far as cells allow."""
+    on_plane, in_layers, on_bone = _places(mesh, stack)
     target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
-    bone = np.flatnonzero(on_bone & movable)
+    bone = np.flatnonzero(on_bone & (on_plane.astype(int) + in_layers + on_bone < 2))
     for nodes, level in ((bone, fields.void), (stack.base, fields.layer), (stack.top, fields.depth)):
         target[nodes] = projected(level, target[nodes], free[nodes])
-    return mesh.with_points(guarded(points, target, mesh.cells, GOOD_DEG))
+    return guarded(points, target, mesh.cells, GOOD_DEG)
 
 
 def held(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray[np.bool_]]:

@@ -16,7 +16,7 @@ from ..mesh import Mesh, node_jacobians
 from .background import volumes
 from .columns import Columns
 from .layers import Frame, LimbFields
-from .smoothing import DIRECTIONS, held
+from .smoothing import DIRECTIONS, held, put_back
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -24,6 +24,7 @@ Bools = NDArray[np.bool_]
 
 SOUND = 0.03  # volume over that of a regular tetrahedron of the same edges; worked on below it
 SWEEPS = 12
+FARTHEST = 1.0  # that a node goes, over the mean edge at it
 STEPS = (0.6, 0.3, 0.15, 0.05)  # of the mean edge at the node
 THINNER = 0.5  # what a layer keeps of its thickness at first, and again the second time
 _REGULAR = 6.0 * np.sqrt(2.0)  # cube of the edge over volume
@@ -52,8 +53,11 @@ def repaired(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tupl
     on_plane = mesh.points[:, 2] == 0.0
     free = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(mesh.points), 3)))
     attempts: tuple[tuple[str, Callable[[Array], Array]], ...] = (
-        ("nodes moved along their surfaces", lambda p: untangled(p, mesh.cells, normals, movable)),
-        ("layers thinned", lambda p: _thinned(p, mesh, stack, normals, movable)),
+        (
+            "nodes moved along their surfaces",
+            lambda p: put_back(untangled(p, mesh.cells, normals, movable), mesh, fields, stack),
+        ),
+        ("layers thinned", lambda p: thinned(p, mesh, stack, normals, movable)),
         ("nodes moved off their surfaces", lambda p: untangled(p, mesh.cells, free, movable | ~on_plane)),
     )
     repairs = []
@@ -83,7 +87,8 @@ def _repair(what: str, before: Array, after: Array, cells: Ints, count: int, fra
 
 
 def untangled(points: Array, tets: Ints, normals: Array, movable: Bools) -> Array:
-    """Points (n, 3) with nodes of inverted and nearly flat tetrahedra where the worst about each is best.
+    """Points (n, 3) with nodes of inverted tetrahedra, and of nearly flat ones beside them, where the worst
+    about each is best.
 
     Parameters
     ----------
@@ -91,28 +96,34 @@ def untangled(points: Array, tets: Ints, normals: Array, movable: Bools) -> Arra
     normals : (n, 3) unit normals of the surface that a node moves on; zero where it moves freely.
     movable : (n,) nodes that may move.
     """
-    points = points.copy()
+    before, points = points, points.copy()
     order = np.argsort(tets, axis=None, kind="stable")
     starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
+    about = tets[np.isin(tets, tets[volumes(points, tets) <= 0.0]).any(axis=1)]
     for _ in range(SWEEPS):
-        if (volumes(points, tets) > 0.0).all():
+        poor = _roundness(points[about]) < SOUND
+        if not poor.any():
             break
-        nodes = np.unique(tets[_roundness(points[tets]) < SOUND])
+        nodes = np.unique(about[poor])
         for node in nodes[movable[nodes]]:
             star = tets[order[starts[node] : starts[node + 1]] // 4]
-            points[node] = _best_place(points, star, node, normals[node])
+            points[node] = _best_place(points, star, node, normals[node], before)
     return points
 
 
-def _best_place(points: Array, star: Ints, node: int, normal: Array) -> Array:
-    """Where the worst of the cells about a node is best: here, among a pattern, or amidst its neighbours."""
+def _best_place(points: Array, star: Ints, node: int, normal: Array, before: Array) -> Array:
+    """Where the worst of the cells about a node is best: here, among a pattern, or amidst its neighbours.
+
+    No farther from where it was at first than its neighbours were: a node would run from hopeless cells.
+    """
     here, corners, mine = points[node], points[star], star == node
     around = corners[~mine]
-    reach = np.linalg.norm(around - here, axis=1).mean()
+    reach = np.linalg.norm(before[star[~mine]] - before[node], axis=1).mean()
     moves = np.vstack(
         [np.zeros(3), around.mean(axis=0) - here, *(step * reach * DIRECTIONS for step in STEPS)]
     )
     places = here + moves - (moves @ normal)[:, None] * normal
+    places = places[(np.linalg.norm(places - before[node], axis=1) <= FARTHEST * reach) | ~moves.any(axis=1)]
     trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
     worst = _roundness(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
     return np.asarray(places[int(np.argmax(worst))])
@@ -126,7 +137,7 @@ def _roundness(corners: Array) -> Array:
     return np.asarray(_REGULAR * volume / np.maximum((edges**2).sum(axis=2).mean(axis=1) ** 1.5, 1e-30))
 
 
-def _thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Bools) -> Array:
+def thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Bools) -> Array:
     """Layers thinner from below where their cells are inverted: columns that cross do so at their feet."""
     points = points.copy()
     own = stack.top[0] + np.arange(len(stack.owner))
