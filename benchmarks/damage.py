@@ -121,11 +121,14 @@ class Study:
         lines = ["[study]", 'name = "damaged"']
         if inputs.image:
             lines += ["[image]", f'path = "{inputs.image}"']
-        lines += ["[segmentation]", "bias_correction = false"]  # it takes most of the time
         if inputs.labels:
-            lines += [f'labels = "{inputs.labels}"']
-        lines += ["[geometry]", f"surface_edge_mm = {EDGE_MM}"]
-        if inputs.surfaces is not None:
+            lines += ["[segmentation]", f'labels = "{inputs.labels}"']
+        elif inputs.surfaces is None:
+            lines += ["[segmentation]", "bias_correction = false"]  # it takes most of the time
+        lines += ["[geometry]"]
+        if inputs.surfaces is None:
+            lines += [f"surface_edge_mm = {EDGE_MM}"]
+        else:
             skin, bones = inputs.surfaces
             point, normal = self.cut
             named = ", ".join(f'"{name}" = "{file}"' for name, file in bones.items())

@@ -119,7 +119,7 @@ def stated_unit(random: Random, whole: Whole, folder: Path) -> Inputs:
     return written(random, folder, scaled(UNITS[unit], whole), stated=f'unit = "{unit}"')
 
 
-@kind("surfaces", "refused", "open")
+@kind("surfaces", "either", within_mm=5.0)
 def holes(random: Random, whole: Whole, folder: Path) -> Inputs:
     def opened(surface: Surface) -> Surface:
         keep = np.ones(len(surface.faces), bool)

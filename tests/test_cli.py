@@ -269,3 +269,25 @@ def test_bad_usage(limbfit, study):
     code, _, err = limbfit("simulate", study, "--site", "99")
     assert code == 2
     assert "no site is named '99'" in err
+
+
+def test_check_tells_what_was_closed(limbfit, study):
+    skin = pv.read(study / "skin.stl")
+    skin.extract_cells(skin.cell_centers().points[:, 2] < 119.0).extract_surface(
+        algorithm="dataset_surface"
+    ).save(study / "skin.stl")
+    code, out, _ = limbfit("check", str(study))
+    assert code == 0
+    assert "skin: open at one end, cut flat" in " ".join(out.split())
+
+
+def test_an_amputation_shortens_given_surfaces(limbfit, study):
+    _, whole, _ = limbfit("check", study)
+    bones = 'bones = { tibia = "tibia.stl" }'
+    edit(study, bones, bones + "\n[geometry]\namputation = { point = [0, 0, 30] }")
+    code, out, _ = limbfit("check", study)
+    assert code == 0
+    extent = [text.split("extent of the skin: ")[1].split(" mm")[0] for text in (whole, out)]
+    # From the plane at 30 mm the pad of 15 mm reaches to 15 mm: the limb is 120 - 15 mm long.
+    assert float(extent[1].split(" x ")[2]) == pytest.approx(105, abs=2)
+    assert float(extent[0].split(" x ")[2]) > 145

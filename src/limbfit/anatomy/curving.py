@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +22,15 @@ def curved(mesh: Mesh, target: Array) -> Mesh:
     """A tet10 mesh with nodes moved to ``target`` (n, 3), less or not at all where elements would suffer."""
     straight = node_jacobians(mesh).min(axis=1)
     share = np.ones(len(mesh.points))
-    for attempt in range(BISECTIONS + 1):
+    for attempt in count():
         points = mesh.points + share[:, None] * (target - mesh.points)
         moved = replace(mesh, points=points)
-        bad = node_jacobians(moved).min(axis=1) < SMALLEST_JACOBIAN * straight
-        if not bad.any():
-            return moved
+        bad = (node_jacobians(moved).min(axis=1) < SMALLEST_JACOBIAN * straight) & (straight > 0.0)
         nodes = np.unique(mesh.cells[bad])
+        if not share[nodes].any():
+            return moved
         share[nodes] = share[nodes] / 2 if attempt < BISECTIONS - 1 else 0.0
-    return mesh
+    raise AssertionError("each pass straightens more")
 
 
 def with_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:

@@ -34,6 +34,7 @@ from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
 from .smoothing import polished
 from .surfaces import Anatomy
+from .untangling import inverted, repaired, unrepaired
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -161,7 +162,7 @@ def mesh_site(
     Raises
     ------
     MeshingError
-        When the mesher fails or its mesh has inverted elements.
+        When the mesher fails, or its mesh has inverted elements that cannot be mended: where and why.
     """
     start = time.perf_counter()
     base = base or base_mesh(anatomy, settings)
@@ -175,24 +176,26 @@ def mesh_site(
     core = _snapped(ENGINES[settings.engine](task, settings.time_limit_s), fields)
     mesh, stack = with_layers(core, fields, settings.regions)
     mesh = polished(mesh, fields, stack)
-    if settings.element == "tet10":
+    mesh, repairs = repaired(mesh, fields, stack)
+    if settings.element == "tet10" and not inverted(mesh).any():
         mesh = to_tet10(mesh)
         if settings.curved:
             mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack))
-    _check_usable(mesh)
+    _check_usable(mesh, fields)
     enclosed = base.enclosed_mm3 if settings.local_radius_mm is None else None
     seconds = time.perf_counter() - start
     report = mesh_report(mesh, fields, base.trimmed, enclosed, seconds, settings.engine)
+    report = replace(report, repairs=repairs)
     return mesh.with_points(frame.to_patient(mesh.points)), report
 
 
-def _check_usable(mesh: Mesh) -> None:
+def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
+    if inverted(mesh).any():
+        raise MeshingError(f"{unrepaired(mesh, fields)}; smooth the surface there, or choose smaller edges")
     try:
         check(mesh)
     except ProblemError as error:
-        raise MeshingError(
-            f"the mesh cannot be used: {error.what}; choose smaller edges, or round off sharp skin"
-        ) from None
+        raise MeshingError(f"the mesh cannot be used: {error.what}; choose other edges") from None
 
 
 def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:

@@ -13,6 +13,7 @@ from ..mesh import Mesh, Quality, quality
 from .layered import inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
 from .surfaces import Anatomy, Surface
+from .untangling import Repair
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -29,6 +30,7 @@ class MeshReport:
     ``layer_mean_mm`` and ``layer_std_mm`` are the thickness of all layers together, measured from points all
     over their meshed inner face to the meshed skin; ``layer_thickness_mm`` gives mean, deviation, least and
     greatest of each. ``interface_error_mm`` is how far that inner face is from where it was asked for.
+    ``repairs`` made inverted cells sound.
     """
 
     nodes: int
@@ -49,6 +51,7 @@ class MeshReport:
     seconds: float
     engine: str
     warnings: tuple[str, ...] = field(default_factory=tuple)
+    repairs: tuple[Repair, ...] = field(default_factory=tuple)
 
 
 def mesh_report(

@@ -28,21 +28,38 @@ def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     Inner nodes move freely, those of the layers along the skin, those on bone or cut along these, nodes on
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
+    normals, movable = held(mesh, fields, stack)
+    points = improved(mesh.points, mesh.cells, WORKED_BELOW_DEG, normals, movable)
+    return mesh.with_points(put_back(points, mesh, fields, stack))
+
+
+def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
+    """Moved points (n, 3) of a mesh, those of bone and layers put on their surfaces as far as cells allow."""
+    on_plane, in_layers, on_bone = _places(mesh, stack)
+    target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
+    bone = np.flatnonzero(on_bone & (on_plane.astype(int) + in_layers + on_bone < 2))
+    for nodes, level in ((bone, fields.void), (stack.base, fields.layer), (stack.top, fields.depth)):
+        target[nodes] = projected(level, target[nodes], free[nodes])
+    return guarded(points, target, mesh.cells, GOOD_DEG)
+
+
+def held(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray[np.bool_]]:
+    """Unit normals (n, 3) of the surface that a node moves on, zero for inner ones; which may move (n,)."""
     points = mesh.points
-    on_plane = points[:, 2] == 0.0
-    in_layers, on_bone = np.zeros((2, len(points)), dtype=bool)
-    in_layers[stack.base], in_layers[stack.top[0] :] = True, True
-    on_bone[mesh.node_sets["fixed_bone"]] = True
+    on_plane, in_layers, on_bone = _places(mesh, stack)
     normals = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(points), 3)))
     for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void)):
         normals[chosen] = level(points[chosen])[1]
-    movable = on_plane.astype(int) + in_layers + on_bone < 2
-    points = improved(points, mesh.cells, WORKED_BELOW_DEG, normals, movable)
-    target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
-    bone = np.flatnonzero(on_bone & movable)
-    for nodes, level in ((bone, fields.void), (stack.base, fields.layer), (stack.top, fields.depth)):
-        target[nodes] = projected(level, target[nodes], free[nodes])
-    return mesh.with_points(guarded(points, target, mesh.cells, GOOD_DEG))
+    return normals, on_plane.astype(int) + in_layers + on_bone < 2
+
+
+def _places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
+    """Which nodes lie on the cut plane, in the layers, on bone (3, n)."""
+    on_plane, in_layers, on_bone = np.zeros((3, len(mesh.points)), dtype=bool)
+    on_plane[:] = mesh.points[:, 2] == 0.0
+    in_layers[stack.base], in_layers[stack.top[0] :] = True, True
+    on_bone[mesh.node_sets["fixed_bone"]] = True
+    return np.stack([on_plane, in_layers, on_bone])
 
 
 def improved(points: Array, tets: Ints, goal_deg: float, normals: Array, movable: NDArray[np.bool_]) -> Array:

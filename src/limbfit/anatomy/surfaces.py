@@ -7,7 +7,7 @@ leave in the soft tissue is open there.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -105,8 +105,12 @@ def build_anatomy(
         For a cut that misses the limb.
     """
     labels = labels.nearest_lps()
-    end = proximal_end(labels.limb, labels)
-    point, normal = _default_cut(labels, end) if proximal_cut is None else _plane(*proximal_cut)
+    if proximal_cut is None:
+        end = proximal_end(labels.limb, labels)
+        point, normal = _default_cut(labels, end)
+    else:
+        point, normal = _plane(*proximal_cut)  # a short limb may be wider than long: the cut tells its axis
+        end = proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
     built = _built(labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal))
@@ -255,8 +259,8 @@ def signed_distance(surface: Surface, points: ArrayLike) -> Array:
     return np.asarray(distance).ravel()
 
 
-def save_anatomy(folder: str | Path, anatomy: Anatomy) -> None:
-    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas) into a folder."""
+def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()) -> None:
+    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas, notes) into a folder."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_surface(folder / "skin.stl", anatomy.skin)
@@ -269,6 +273,7 @@ def save_anatomy(folder: str | Path, anatomy: Anatomy) -> None:
         "cut_normal": anatomy.cut_normal.tolist(),
         "skin": _measures(anatomy.skin),
         "bones": {name: _measures(bone) for name, bone in anatomy.bones.items()},
+        "notes": list(notes),
     }
     (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 

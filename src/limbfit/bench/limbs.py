@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..anatomy.amputation import amputate
-from ..anatomy.imaging import LabelMap, read_volume
+from ..anatomy.grid import Grid
+from ..anatomy.imaging import read_volume
 from ..anatomy.segmentation import segment
 from ..anatomy.sites import indenter_axis
 from ..anatomy.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
+from ..anatomy.voxels import label_map
 from ..errors import InputError
 from ..phantom.geometry import BONES, make_limb
 from ..phantom.mri import make_grid
@@ -47,16 +49,15 @@ def limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
 def phantom_limb(seed: int, detail: str = "paper") -> Anatomy:
     """The surfaces of a phantom as a label map on its scanner's grid shows them."""
     limb, grid = make_limb(seed), make_grid(make_limb(seed), detail, seed)
-    array = np.zeros(grid.shape, np.uint8)
+    skin, *bones = np.zeros((1 + len(BONES), *grid.shape), dtype=bool)
     for k in range(0, grid.shape[0], SLAB):
         slab = slice(k, min(k + SLAB, grid.shape[0]))
         points = grid.points(slab, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
-        array[slab] = limb.skin(points) < 0
-        for value, name in enumerate(BONES, start=2):
-            array[slab][limb.bone(name, points) < 0] = value
-    names = {1: "soft tissue", **dict(enumerate(BONES, start=2))}
-    labels = LabelMap(array, np.array(grid.spacing), grid.origin, grid.direction, names)
-    return _checked(build_anatomy(labels))
+        skin[slab] = limb.skin(points) < 0
+        for bone, name in zip(bones, BONES):
+            bone[slab] = limb.bone(name, points) < 0
+    voxels = Grid(skin, np.array(grid.spacing), grid.origin, grid.direction)
+    return _checked(build_anatomy(label_map(voxels, skin, dict(zip(BONES, bones)))))
 
 
 def openlimb_mean(folder: Path) -> Anatomy:

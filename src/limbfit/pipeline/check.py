@@ -36,7 +36,8 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     """
     facts = list(study.notes)
     listener(Progress("check", 0, 2, "geometry"))
-    facts += _image_facts(study) if study.image is not None else _surface_facts(study)
+    given, notes = given_anatomy(study) if study.surfaces is not None else (None, ())
+    facts += _image_facts(study) if given is None else [*notes, *_surface_facts(study, given)]
     if study.indenter.file is not None:
         table = study.indenter.model_copy(update={"file": study.path(study.indenter.file)})
         width = read_indenter(table, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
@@ -53,7 +54,7 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
         )
     facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
-    placed, anatomy = _places(study)
+    placed, anatomy = _places(study, given)
     if sites and not placed:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
@@ -69,11 +70,10 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     }
 
 
-def _places(study: Study) -> tuple[dict[str, dict[str, Any]], Anatomy | None]:
+def _places(study: Study, given: Anatomy | None) -> tuple[dict[str, dict[str, Any]], Anatomy | None]:
     """Sites on the skin and the anatomy, of given surfaces or of stages that are done; else none."""
-    if study.surfaces is not None:
-        anatomy = given_anatomy(study)
-        return {site.name: place_site(site, study, anatomy, None) for site in study.sites}, anatomy
+    if given is not None:
+        return {site.name: place_site(site, study, given, None) for site in study.sites}, given
     store = Store(study.results)
     if store.stamp("sites") is None or store.state("sites", keys(study)["sites"]).state != "done":
         return {}, None
@@ -101,8 +101,7 @@ def _sampling(name: str, volume: Volume) -> str:
     return f"{name}: {size} voxels of {spacing} mm"
 
 
-def _surface_facts(study: Study) -> list[str]:
-    anatomy = given_anatomy(study)
+def _surface_facts(study: Study, anatomy: Anatomy) -> list[str]:
     facts = [
         f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
         for name, surface in {"skin": anatomy.skin, **anatomy.bones}.items()

@@ -214,6 +214,7 @@ def model(store: Store) -> Section:
         pictures.marker_figure(store),
         tables.volume_table(store),
         tables.place_table(store) if store.sites else None,
+        Bullets(tuple(store.surfaces["notes"])) if store.surfaces.get("notes") else None,
         otherwise="No surfaces and sites are stored yet.",
     )
     source = store.segment.get("method")
@@ -225,7 +226,9 @@ def model(store: Store) -> Section:
 def meshes(store: Store) -> Section:
     """Cut meshes and their quality."""
     warnings = tuple(
-        f"Site {site}: {text}" for site, facts in store.mesh.items() for text in facts.get("warnings") or ()
+        f"Site {site}: {text}"
+        for site, facts in store.mesh.items()
+        for text in (*(facts.get("repairs") or ()), *(facts.get("warnings") or ()))
     )
     blocks = _blocks(
         pictures.mesh_figure(store, store.fitted[:4]),

@@ -27,7 +27,7 @@ def anatomy_of(folder: StudyFolder, study: Study) -> Anatomy | None:
     """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
     if _is_made(folder):
         return load_anatomy(folder.results / "surfaces")
-    return None if study.surfaces is None else given_anatomy(study)
+    return None if study.surfaces is None else given_anatomy(study)[0]
 
 
 def scene_of(folder: StudyFolder) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from ..anatomy.markups import read_markups
 from ..errors import StudyError
+from .vain import refuse_vain
 from .whole import Study
 
 
@@ -41,6 +42,7 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     except ValidationError as error:
         raise _study_error(error, file) from None
     _check_paths(study, recorded)
+    refuse_vain(study, content)
     return study
 
 

@@ -55,6 +55,7 @@ def make_mesh(job: MeshJob) -> dict[str, Any]:
     mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
     write_vtu(mesh, job.file)
     facts = {**asdict(report), "element": job.settings.element}
+    facts["repairs"] = [repair.text for repair in report.repairs]
     write_json(job.file.with_suffix(".json"), facts)
     return facts
 
@@ -159,6 +160,8 @@ def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: s
     for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         facts[job.site] = made
         context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {made['nodes']} nodes")
+        for repair in made["repairs"]:
+            context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {repair}")
     return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
 
 

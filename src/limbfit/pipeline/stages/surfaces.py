@@ -9,8 +9,10 @@ import numpy as np
 
 from ...anatomy.amputation import amputate
 from ...anatomy.imaging import LabelMap, read_labels
+from ...anatomy.mending import closed_anatomy
 from ...anatomy.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
 from ...anatomy.thickness import fat_depth, write_thickness
+from ...anatomy.voxels import amputated
 from ...study import Study
 from ..context import Context
 from .files import THICKNESS, labelled_file, naming
@@ -21,14 +23,17 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     context.tell("surfaces", 0, 2, "building surfaces")
     if study.surfaces is not None:
-        anatomy = given_anatomy(study)
+        anatomy, notes = given_anatomy(study)
+        for note in notes:
+            context.tell("surfaces", 0, 2, note)
     else:
+        notes = ()
         labels = _limb_labels(context)
         anatomy = _imaged_anatomy(study, labels)
         if any(layer.thickness == "map" for layer in study.geometry.model_layers):
             depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
             write_thickness(folder / THICKNESS, anatomy.skin, depth)
-    save_anatomy(folder, anatomy)
+    save_anatomy(folder, anatomy, notes)
     return {}
 
 
@@ -55,18 +60,24 @@ def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
     return anatomy
 
 
-def given_anatomy(study: Study) -> Anatomy:
-    """The checked anatomy of given surfaces; without a stated cut its end is the highest (z) of the skin."""
+def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
+    """The checked anatomy of given surfaces, after the virtual amputation where there is one.
+
+    Returns
+    -------
+    anatomy : without a stated cut it ends just inside the skin's open end, or at the highest (z) of the skin.
+    notes : what was mended to close the surfaces.
+    """
     assert study.surfaces is not None
-    tables = study.surfaces
+    tables, geometry = study.surfaces, study.geometry
     files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
     surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
-    skin = surfaces.pop("skin")
-    cut = study.geometry.proximal_cut
-    if cut is not None:
-        point, normal = np.array(cut.point), np.array(cut.normal)
-    else:
-        point, normal = np.array([0.0, 0.0, skin.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
-    anatomy = Anatomy(skin=skin, bones=surfaces, cut_point=point, cut_normal=normal)
-    check_anatomy(anatomy, files)
-    return anatomy
+    skin, cut = surfaces.pop("skin"), geometry.proximal_cut
+    anatomy, notes = closed_anatomy(skin, surfaces, None if cut is None else (cut.point, cut.normal), files)
+    if geometry.amputation is None:
+        return anatomy, notes
+    plane, pad = geometry.amputation, geometry.amputation_pad_mm
+    with naming(files["skin"]):
+        stump = amputated(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
+        check_anatomy(stump)
+    return stump, notes

@@ -1,0 +1,176 @@
+"""Meshes of anatomy from elsewhere: inverted cells are mended and told, real limbs meshed as they come."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bodies import limb
+from limbs import SHARED, rotation
+
+from limbfit.anatomy import meshing, untangling
+from limbfit.anatomy.background import volumes
+from limbfit.anatomy.engines import VolumeMesh
+from limbfit.anatomy.layered import with_layers
+from limbfit.anatomy.layers import LimbFields
+from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.sites import indenter_axis, project_to_skin
+from limbfit.anatomy.smoothing import held
+from limbfit.anatomy.untangling import inverted, repaired, thinned, untangled
+from limbfit.errors import MeshingError
+from limbfit.mesh import check, quality
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import foreign_meshes
+
+COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=15.0, near_radius_mm=10.0, growth=0.6)
+NO_LIMBS = not (SHARED / "data" / "limbs").is_dir()
+needs_limbs = pytest.mark.skipif(NO_LIMBS, reason="shared/data/limbs is not here")
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return limb(rotation(3))
+
+
+@pytest.fixture(scope="module")
+def site(anatomy):
+    point, _ = project_to_skin(anatomy, anatomy.skin.triangles[900].mean(axis=0))
+    return point, indenter_axis(anatomy.skin, point, 20.0)
+
+
+def spoiled(monkeypatch: pytest.MonkeyPatch, spoil) -> None:
+    """Let something go wrong between the layers' extrusion and the repairs."""
+
+    def layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]):
+        mesh, stack = with_layers(core, fields, regions)
+        return spoil(mesh, stack), stack
+
+    monkeypatch.setattr(meshing, "with_layers", layers)
+    monkeypatch.setattr(meshing, "polished", lambda mesh, fields, stack: mesh)
+
+
+def through(mesh, node: int):
+    """A node pushed through the opposite side of the cells about it."""
+    cells = mesh.cells[(mesh.cells == node).any(axis=1)]
+    far = mesh.points[cells].reshape(-1, 3)
+    away = far[np.linalg.norm(far - mesh.points[node], axis=1).argmax()] - mesh.points[node]
+    points = mesh.points.copy()
+    points[node] += 1.2 * away
+    return mesh.with_points(points)
+
+
+def crossed(mesh, stack):
+    """Three neighbouring columns whose heads have changed sides."""
+    points, feet = mesh.points.copy(), mesh.points[stack.base]
+    heads = stack.top[np.linalg.norm(feet - feet[40], axis=1).argsort()[:3]]
+    points[heads] = 1.5 * points[heads].mean(axis=0) - 0.5 * points[heads]
+    return mesh.with_points(points)
+
+
+def inner_node(mesh, stack) -> int:
+    """A node of the core, on no surface."""
+    surface = np.union1d(mesh.node_sets["fixed_bone"], stack.base)
+    core = np.setdiff1d(np.unique(mesh.cells[mesh.regions == 1]), surface)
+    return int(core[mesh.points[core, 2] < -5.0][0])
+
+
+@pytest.mark.parametrize("where", ["core", "skin", "foot of a column", "columns"])
+def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
+    places = []
+
+    def spoil(mesh, stack):
+        nodes = {"skin": stack.top[40], "foot of a column": stack.base[40], "columns": stack.top[40]}
+        node = int(nodes.get(where, inner_node(mesh, stack)))
+        places.append(mesh.points[node])
+        worse = crossed(mesh, stack) if where == "columns" else through(mesh, node)
+        assert (volumes(worse.points, worse.cells) <= 0).any()
+        return worse
+
+    spoiled(monkeypatch, spoil)
+    base = base_mesh(anatomy, COARSE)
+    mesh, report = mesh_site(anatomy, *site, COARSE, base)
+    check(mesh)
+    assert quality(mesh).inverted == 0
+    assert sum(repair.cells for repair in report.repairs) > 0
+    told = np.array(report.repairs[0].place_mm)
+    assert np.linalg.norm(told - base.fields.frame.to_patient(places[0])) < 25.0
+    assert "inverted cells at (" in report.repairs[0].text
+    assert abs(report.volume_error) < 0.01
+
+
+def test_thinner_layers_alone_make_crossed_columns_sound(monkeypatch, anatomy, site):
+    made = []
+
+    def spoil(mesh, stack):
+        made.append((crossed(mesh, stack), stack))
+        return mesh
+
+    spoiled(monkeypatch, spoil)
+    base = base_mesh(anatomy, COARSE)
+    mesh_site(anatomy, *site, COARSE, base)
+    worse, stack = made[0]
+    assert inverted(worse).any()
+    points = thinned(worse.points, worse, stack, *held(worse, base.fields, stack))
+    assert (volumes(points, worse.cells) > 0).all()
+
+
+def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, anatomy, site):
+    spoiled(monkeypatch, lambda mesh, stack: through(mesh, inner_node(mesh, stack)))
+    monkeypatch.setattr(untangling, "SWEEPS", 0)
+    told = (
+        r"\d+ of \d+ cells are inverted, the first in muscle at \(.*\) mm, .* mm from .*: there is too little"
+    )
+    with pytest.raises(MeshingError, match=told):
+        mesh_site(anatomy, *site, COARSE)
+
+
+def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, site):
+    kept = []
+
+    def watched(mesh, fields, stack):
+        after, repairs = repaired(mesh, fields, stack)
+        kept.append(np.array_equal(after.points, mesh.points) and not inverted(mesh).any())
+        return after, repairs
+
+    monkeypatch.setattr(meshing, "repaired", watched)
+    _, report = mesh_site(anatomy, *site, COARSE)
+    assert kept == [True]
+    assert report.repairs == ()
+
+
+def test_a_tangled_star_is_untangled():
+    # Eight tetrahedra about one node of an octahedron, the node outside of it.
+    tips = np.vstack([np.eye(3), -np.eye(3)])
+    tets = []
+    for x in (0, 3):
+        for y in (1, 4):
+            for z in (2, 5):
+                flip = (x, y, z) if (x < 3) ^ (y < 4) ^ (z < 5) else (y, x, z)
+                tets.append([6, *flip])
+    tets = np.array(tets)
+    middle = np.vstack([tips, [[0.0, 0.0, 0.0]]])
+    if (volumes(middle, tets) < 0).all():
+        tets = tets[:, [0, 2, 1, 3]]
+    assert (volumes(middle, tets) > 0).all()
+    points = np.vstack([tips, [[1.1, 0.9, 0.2]]])
+    movable = np.arange(7) == 6
+    found = untangled(points, tets, np.zeros((7, 3)), movable)
+    assert (volumes(found, tets) > 0).all()
+    assert np.array_equal(found[:6], tips)
+
+
+@needs_limbs
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*(f"limb-{i}" for i in range(1, 10)), "mean"])
+def test_limbs_of_an_atlas_are_meshed_as_they_come(name):
+    file = foreign_meshes.limb_files(SHARED)[name]
+    found = foreign_meshes.read_limb(name, file, 0.0, False)
+    assert any("skin: open at one end" in note for note in found.notes)
+    assert set(found.anatomy.bones) == {"tibia", "fibula", "femur", "patella"}
+    settings = foreign_meshes.default_settings()["coarse"]
+    sites = foreign_meshes.random_sites(found.anatomy, 1, 3)
+    row = foreign_meshes.site_row(found, base_mesh(found.anatomy, settings), settings, sites[0])
+    assert row["sound"], row["failure"]

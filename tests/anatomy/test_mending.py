@@ -1,0 +1,102 @@
+"""Surfaces as scans and atlases give them: open ends are capped, small holes filled, and both are told."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import limb
+from limbs import rotation
+
+from limbfit.anatomy.mending import closed_anatomy, mended, open_loops
+from limbfit.anatomy.surfaces import Surface, check_anatomy, check_closed
+from limbfit.anatomy.triangles import compacted
+from limbfit.errors import SurfaceError
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return limb(rotation(3))
+
+
+def without(surface: Surface, faces: np.ndarray) -> Surface:
+    return compacted(replace(surface, faces=surface.faces[~faces]))
+
+
+def opened(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
+    """Without every face that reaches beyond a plane: a ragged open end."""
+    return without(surface, (((surface.points - point) @ normal)[surface.faces] > 0).any(axis=1))
+
+
+def test_a_closed_surface_is_left_alone(whole):
+    found = mended(whole.skin, "skin")
+    assert found.surface is whole.skin
+    assert found.cap is None
+    assert found.notes == ()
+
+
+def test_open_skin_and_bone_are_capped_and_cut_below_both(whole):
+    normal = whole.cut_normal + 0.15 * np.linalg.svd(whole.cut_normal[None])[2][1]
+    normal /= np.linalg.norm(normal)
+    skin = opened(whole.skin, whole.cut_point - 3 * whole.cut_normal, normal)
+    bone = opened(whole.bones["tibia"], whole.cut_point - 6 * whole.cut_normal, whole.cut_normal)
+    with pytest.raises(SurfaceError, match="open"):
+        check_closed(skin)
+    anatomy, notes = closed_anatomy(skin, {"tibia": bone})
+    check_anatomy(anatomy)
+    assert [note.split(":")[0] for note in notes] == ["skin", "tibia"]
+    assert all("open at one end" in note and "mm2" in note for note in notes)
+    # The cut fits the ragged rim: near the plane that opened the skin, and just below the bone's end.
+    assert anatomy.cut_normal @ normal > 0.99
+    top = anatomy.height(anatomy.bones["tibia"].points).max()
+    assert 1.5 < top < 6.0
+    assert anatomy.skin.volume == pytest.approx(whole.skin.volume, rel=0.12)
+    assert anatomy.skin.volume < whole.skin.volume
+
+
+def test_small_holes_are_filled_and_told_with_their_place(whole):
+    middle = whole.skin.triangles.mean(axis=1)
+    here = np.argmin(np.abs(whole.height(middle) + 50.0))
+    gone = np.zeros(len(middle), dtype=bool)
+    gone[here] = gone[np.linalg.norm(middle - middle[here], axis=1).argsort()[1]] = True
+    found = mended(without(whole.skin, gone), "skin")
+    check_closed(found.surface)
+    assert found.cap is None
+    assert len(found.notes) == 1
+    told = re.search(r"a hole of \d+ edges at \((.*)\) mm filled, [\d.]+ mm2", found.notes[0])
+    assert told is not None
+    assert np.linalg.norm(np.fromstring(told[1], sep=",") - middle[here]) < 5.0
+    assert found.surface.volume == pytest.approx(whole.skin.volume, rel=1e-3)
+
+
+def test_two_open_ends_are_refused_with_their_places(whole):
+    both = opened(whole.skin, whole.cut_point - 3 * whole.cut_normal, whole.cut_normal)
+    both = opened(both, whole.cut_point - 80 * whole.cut_normal, -whole.cut_normal)
+    assert len(open_loops(both)) == 2
+    with pytest.raises(SurfaceError, match=r"skin: 2 open ends .* at \(.*\) mm and \(.*\) mm; close all but"):
+        mended(both, "skin")
+
+
+def test_loose_triangles_are_left_out(whole):
+    far = whole.skin.points[whole.skin.faces[:1]].reshape(3, 3) + 0.5
+    count = len(whole.skin.points)
+    littered = Surface(
+        np.vstack([whole.skin.points, far]), np.vstack([whole.skin.faces, [[count, count + 1, count + 2]]])
+    )
+    found = mended(littered, "skin")
+    check_closed(found.surface)
+    assert "1 loose pieces of 1 triangles left out" in found.notes[0]
+
+
+def test_loops_that_touch_in_a_point_are_taken_apart():
+    # A flat square of 4 x 4 points without two squares that share a corner.
+    index = np.arange(16).reshape(4, 4)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.vstack([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    square = np.tile(np.arange(9), 2)
+    points = np.column_stack([*np.divmod(np.arange(16), 4), np.zeros(16)]).astype(float)
+    loops = open_loops(Surface(points, faces[~np.isin(square, [0, 4])]))
+    assert all(len(set(loop.tolist())) == len(loop) for loop in loops)
+    assert sum(len(loop) for loop in loops) == 16

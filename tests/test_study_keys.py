@@ -1,0 +1,380 @@
+"""Every key of a study changes what is computed, or is refused where it could not."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import limbfit
+from limbfit.acquire import Settings
+from limbfit.errors import StudyError
+from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, experiment_key
+from limbfit.pipeline.keys import Keys
+from limbfit.pipeline.run import keys
+from limbfit.study import Study, load_study
+from limbfit.study.vain import VAIN, VAIN_OF_SITE
+from test_study_docs import KEYS
+
+# Studies in which each key acts: the second is for those that an image, layers or markers rule out.
+IMAGED: dict[str, Any] = {
+    "study": {"name": "one"},
+    "image": {"path": "mri", "markers": "marked"},
+    "geometry": {
+        "layers": [{"name": "skin", "thickness_mm": 1.5}, {"name": "fat", "thickness": "map"}],
+        "amputation": {"point": [0.0, 0.0, 0.0]},
+        "proximal_cut": {"point": [0.0, 0.0, 90.0]},
+    },
+    "mesh": {"coarse": {}},
+    "calibration": {"prior": {"skin.c_kPa": {"median": 5.0, "factor": 2.0}}, "starts": 2},
+    "sites": [
+        {"name": "1", "fitted": True, "trace": "1.csv", "near": [0.0, -50.0, 10.0]},
+        {"name": "2", "trace": "2.csv", "near": [0.0, 50.0, 10.0]},
+    ],
+}
+GIVEN: dict[str, Any] = {
+    "study": {"name": "one"},
+    "surfaces": {"skin": "skin.stl", "bones": {"tibia": "tibia.stl"}},
+    "sites": [
+        {"name": "1", "fitted": True, "trace": "1.csv", "position": [0.0, -50.0, 10.0]},
+        {"name": "2", "depth_mm": 6.0, "position": [0.0, 50.0, 10.0]},
+    ],
+}
+FILES = ("skin.stl", "tibia.stl", "other.stl", "1.csv", "2.csv", "3.csv", "labels.nrrd", "contours.csv")
+START = {"c_kPa": 4.0, "m": 3.5, "gamma": 1.1, "tau_s": 1.9}
+
+# Key, or where it is in the study (a site by number): who computes something else with which value.
+ACTS: dict[str, tuple[str, Any]] = {
+    "study.name": ("report", "two"),
+    "study.description": ("report", "a limb"),
+    "image.path": ("segment", "marked"),
+    "image.series": ("segment", "1.2.3"),
+    "image.markers": ("segment", "same"),
+    "image.markers_series": ("segment", "1.2.3"),
+    "segmentation.labels": ("segment", "labels.nrrd"),
+    "segmentation.contours": ("segment", "contours.csv"),
+    "segmentation.contrast": ("segment", "T1"),
+    "segmentation.seeds": ("segment", {"tibia": [[0.0, 0.0, 0.0]]}),
+    "segmentation.bias_correction": ("segment", False),
+    "segmentation.min_bone_volume_mm3": ("segment", 500.0),
+    "geometry.layers.1.min_thickness_mm": ("mesh", 2.0),
+    "geometry.layers.0.thickness_mm": ("mesh", 2.0),
+    "geometry.layers.1.name": ("mesh", "adipose"),
+    "geometry.layers.0": ("mesh", {"name": "skin", "thickness_mm": 2.5}),
+    "geometry.core": ("mesh", "flesh"),
+    "geometry.bone_policy": ("mesh", "thin-skin"),
+    "geometry.bone_clearance_mm": ("mesh", 2.0),
+    "geometry.amputation.point": ("surfaces", [0.0, 0.0, 9.0]),
+    "geometry.amputation.normal": ("surfaces", [0.0, 0.1, 1.0]),
+    "geometry.amputation_pad_mm": ("surfaces", 12.0),
+    "geometry.proximal_cut.point": ("surfaces", [0.0, 0.0, 99.0]),
+    "geometry.proximal_cut.normal": ("surfaces", [0.0, 0.1, 1.0]),
+    "geometry.surface_edge_mm": ("surfaces", 2.5),
+    "mesh.accuracy": ("mesh", "fast"),
+    "mesh.element": ("mesh", "tet10"),
+    "mesh.edge_near_mm": ("mesh", 4.0),
+    "mesh.edge_far_mm": ("mesh", 25.0),
+    "mesh.near_radius_mm": ("mesh", 15.0),
+    "mesh.growth": ("mesh", 0.7),
+    "mesh.flatness": ("mesh", 1.2),
+    "mesh.engine": ("mesh", "netgen"),
+    "mesh.time_limit_s": ("mesh", 60.0),
+    "mesh.coarse.edge_near_mm": ("mesh", 7.5),
+    "mesh.coarse.edge_far_mm": ("mesh", 25.0),
+    "mesh.coarse.near_radius_mm": ("mesh", 15.0),
+    "mesh.coarse.growth": ("mesh", 0.7),
+    "mesh.coarse.flatness": ("mesh", 1.2),
+    "indenter.shape": ("calibrate", "cylinder"),
+    "indenter.width_mm": ("sites", 18.0),
+    "indenter.edge_radius_mm": ("calibrate", 1.0),
+    "indenter.friction": ("calibrate", "sticky"),
+    "traces.time_s": ("traces", "t"),
+    "traces.displacement_mm": ("traces", "d"),
+    "traces.force_N": ("traces", "F"),
+    "traces.smoothing": ("traces", 1e-3),
+    "sites.0.name": ("sites", "A"),
+    "sites.0.region": ("report", "front"),
+    "sites.1.fitted": ("calibrate", True),
+    "sites.0.weight": ("calibrate", 2.0),
+    "sites.0.trace": ("traces", "3.csv"),
+    "sites.0.touch_down_s": ("traces", 1.0),
+    "sites.0.peak_s": ("traces", 2.0),
+    "sites.0.near": ("sites", [0.0, -51.0, 10.0]),
+    "sites.0.axis": ("sites", [0.0, 1.0, 0.0]),
+    "sites.0.edge": ("calibrate", [0.0, 0.0, 1.0]),
+    "material.kappa_ratio": ("calibrate", 200.0),
+    "material.start": ("calibrate", START),
+    "material.lower": ("calibrate", {**START, "m": 2.5, "gamma": 0.5, "tau_s": 0.5}),
+    "material.upper": ("calibrate", {name: 4 * value for name, value in START.items()}),
+    "material.tissues.fat.start": ("calibrate", {"c_kPa": 2.0}),
+    "material.tissues.fat.lower": ("calibrate", {"c_kPa": 1.0}),
+    "material.tissues.fat.upper": ("calibrate", {"c_kPa": 10.0}),
+    "calibration.stopping": ("calibrate", "paper"),
+    "calibration.relative_tolerance": ("calibrate", 0.02),
+    "calibration.max_iterations": ("calibrate", 9),
+    "calibration.fixed": ("calibrate", ["muscle.gamma"]),
+    "calibration.tied": ("calibrate", [["skin.tau_s", "muscle.tau_s"]]),
+    "calibration.prior.skin.c_kPa.median": ("calibrate", 6.0),
+    "calibration.prior.skin.c_kPa.factor": ("calibrate", 1.5),
+    "calibration.force_error_percent": ("calibrate", 2.0),
+    "calibration.starts": ("calibrate", 3),
+    "calibration.seed": ("calibrate", 1),
+    "calibration.corrections": ("calibrate", 2),
+    "calibration.correction_tolerance_percent": ("calibrate", 0.2),
+    "uncertainty.runs": ("uncertainty", 12),
+    "uncertainty.checked": ("uncertainty", 1),
+    "uncertainty.seed": ("uncertainty", 1),
+    "uncertainty.sources": ("uncertainty", False),
+    "uncertainty.layer_mm": ("uncertainty", 1.0),
+    "uncertainty.position_mm": ("uncertainty", 1.0),
+    "uncertainty.axis_degrees": ("uncertainty", 1.0),
+    "uncertainty.edge_radius_mm": ("uncertainty", 0.5),
+    "solver.load_steps": ("calibrate", 6),
+    "solver.unload_steps": ("calibrate", 6),
+    "solver.penalty_per_mm": ("calibrate", 90.0),
+}
+ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
+    "surfaces.skin": ("surfaces", "other.stl"),
+    "surfaces.bones": ("surfaces", {"tibia": "other.stl"}),
+    "surfaces.coordinates": ("surfaces", "RAS"),
+    "surfaces.unit": ("surfaces", "cm"),
+    "geometry.skin_layer_mm": ("mesh", 2.0),
+    "geometry.amputation": ("surfaces", {"point": [0.0, 0.0, 0.0]}),
+    "geometry.proximal_cut": ("surfaces", {"point": [0.0, 0.0, 90.0]}),
+    "geometry.layers": ("mesh", [{"name": "hide", "thickness_mm": 3.0}]),
+    "calibration.objective": ("calibrate", "paper"),
+    "indenter": ("calibrate", {"shape": "stl", "file": "other.stl"}),
+    "sites.0.position": ("sites", [0.0, -51.0, 10.0]),
+    "sites.1.depth_mm": ("design", 7.0),
+    "sites.1.speed_mm_s": ("design", 2.0),
+}
+# Of no stage: what reads them instead.
+READ: dict[str, str] = {
+    **dict.fromkeys(("solver.solver", "febio.program", "febio.penalty"), "pipeline/simulate.py"),
+    **dict.fromkeys(("febio.threads", "febio.time_limit_s"), "pipeline/simulate.py"),
+    **{key: "pipeline/context.py" for key in KEYS if key.startswith("execution.")},
+    **{key: "acquire/" for key in KEYS if key.startswith("acquire.")},
+    "acquire.key_gap_ms": "cli/acquire.py",
+    **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},
+}
+# How else the tables above name them.
+OTHER_NAMES = {
+    "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
+    "indenter.file": "indenter",
+    **{
+        f"material.{which}.{name}": f"material.{which}"
+        for which in ("start", "lower", "upper")
+        for name in START
+    },
+    "calibration.prior.median": "calibration.prior.skin.c_kPa.median",
+    "calibration.prior.factor": "calibration.prior.skin.c_kPa.factor",
+}
+
+# Studies that state a key in vain: what is set in which study, and the key that is refused.
+AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})
+IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    (GIVEN, {"segmentation.contrast": "T1"}, "segmentation"),
+    *[
+        (
+            IMAGED,
+            {"segmentation.labels": "labels.nrrd", f"segmentation.{key}": ACTS[f"segmentation.{key}"][1]},
+            f"segmentation.{key}",
+        )
+        for key in ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
+    ],
+    (
+        IMAGED,
+        {"segmentation.seeds": {"tibia": [[0.0, 0.0, 0.0]]}, "segmentation.min_bone_volume_mm3": 500.0},
+        "segmentation.min_bone_volume_mm3",
+    ),
+    (
+        IMAGED,
+        {"segmentation.contrast": "CT", "segmentation.bias_correction": True},
+        "segmentation.bias_correction",
+    ),
+    (IMAGED, {"image.path": "labels.nrrd", "image.series": "1.2"}, "image.series"),
+    (IMAGED, {"sites": GIVEN["sites"]}, "image.markers"),
+    (GIVEN, {"geometry.surface_edge_mm": 3.0}, "geometry.surface_edge_mm"),
+    (GIVEN, {"geometry.amputation_pad_mm": 15.0}, "geometry.amputation_pad_mm"),
+    (GIVEN, {"surfaces": {"skin": "skin.stl"}, "geometry.bone_policy": "trim-bone"}, "geometry.bone_policy"),
+    (
+        GIVEN,
+        {"surfaces": {"skin": "skin.stl"}, "geometry.bone_clearance_mm": 2.0},
+        "geometry.bone_clearance_mm",
+    ),
+    (GIVEN, {"mesh": {"edge_near_mm": 8, "edge_far_mm": 8, "growth": 0.5}}, "mesh.growth"),
+    (GIVEN, {"mesh": {"edge_near_mm": 8, "edge_far_mm": 8, "near_radius_mm": 9}}, "mesh.near_radius_mm"),
+    (GIVEN, {"mesh": {"edge_near_mm": 9, "edge_far_mm": 8}}, "mesh.edge_near_mm"),
+    (GIVEN, {"mesh.coarse": {"edge_near_mm": 8, "edge_far_mm": 8, "growth": 0.5}}, "mesh.coarse.growth"),
+    (
+        GIVEN,
+        {"mesh.coarse": {"edge_near_mm": 8, "edge_far_mm": 8, "near_radius_mm": 9}},
+        "mesh.coarse.near_radius_mm",
+    ),
+    (GIVEN, {"mesh.coarse": {"edge_near_mm": 9, "edge_far_mm": 8}}, "mesh.coarse.edge_near_mm"),
+    (
+        GIVEN,
+        {
+            "mesh": {
+                **{"accuracy": "fast", "edge_near_mm": 4, "edge_far_mm": 20},
+                **{"near_radius_mm": 9, "growth": 0.5, "flatness": 1.0},
+            }
+        },
+        "mesh.accuracy",
+    ),
+    (GIVEN, {"indenter": {"shape": "sphere", "edge_radius_mm": 1.0}}, "indenter.edge_radius_mm"),
+    (GIVEN, {"sites": GIVEN["sites"][1:], "traces.time_s": "t"}, "traces"),
+    (
+        GIVEN,
+        {"calibration": {"stopping": "paper", "relative_tolerance": 0.01}},
+        "calibration.relative_tolerance",
+    ),
+    (GIVEN, {"calibration.force_error_percent": 2.0}, "calibration.force_error_percent"),
+    (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
+    (GIVEN, {"mesh.edge_near_mm": 4.0, "calibration.corrections": 2}, "calibration.corrections"),
+    (
+        GIVEN,
+        {"mesh.edge_near_mm": 4.0, "calibration.correction_tolerance_percent": 0.2},
+        "calibration.correction_tolerance_percent",
+    ),
+    *[
+        (GIVEN, {"uncertainty": {"sources": False, key: 1.0}}, f"uncertainty.{key}")
+        for key in ("layer_mm", "position_mm", "axis_degrees", "edge_radius_mm")
+    ],
+    (
+        GIVEN,
+        {"indenter.shape": "cylinder", "uncertainty.edge_radius_mm": 1.0},
+        "uncertainty.edge_radius_mm",
+    ),
+    *[
+        (GIVEN, {"execution": {"workers": 1, key: 9.0}}, f"execution.{key}")
+        for key in ("time_limit_s", "memory_limit_GB")
+    ],
+    (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
+    (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
+    (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),
+]
+
+
+def toml(value: Any) -> str:
+    """A value as TOML; tables are written in line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(key)} = {toml(part)}" for key, part in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return json.dumps(value)
+
+
+def changed(content: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """The study with one key set; ``sites.0.name`` and ``prior.skin.c_kPa.factor`` find their way."""
+    content = copy.deepcopy(dict(content))
+    key = key.replace("skin.c_kPa", "skin/c_kPa")
+    *way, last = (part.replace("/", ".") for part in key.split("."))
+    table: Any = content
+    for part in way:
+        table = table[int(part)] if part.isdecimal() else table.setdefault(part, {})
+    table[int(last) if last.isdecimal() else last] = value
+    return content
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study")
+    for name in FILES:
+        (folder / name).write_text(name)
+    for name in ("mri", "marked"):
+        (folder / name).mkdir()
+        (folder / name / "image").write_text(name)
+    return folder
+
+
+def loaded(folder: Path, content: Mapping[str, Any]) -> Study:
+    (folder / "study.toml").write_text("".join(f"{key} = {toml(part)}\n" for key, part in content.items()))
+    return load_study(folder)
+
+
+def decided(study: Study) -> dict[str, str]:
+    """The key of every stage, and of the experiments that read more of a study."""
+    known, stages = Keys(study), keys(study)
+    more = [e for e in EXPERIMENTS if e.name in ("uncertainty", "design")]
+    return stages | {e.name: experiment_key(e, known, stages, e.options) for e in more}
+
+
+@cache
+def before(folder: Path, imaged: bool) -> dict[str, str]:
+    return decided(loaded(folder, IMAGED if imaged else GIVEN))
+
+
+def plain(key: str) -> str:
+    """A key of the tables above as KEYS has it: sites and layers without numbers, no tissue."""
+    parts = [part for part in key.replace("skin.c_kPa.", "").split(".") if not part.isdecimal()]
+    return ".".join(parts).replace("tissues.fat.", "tissues.")
+
+
+def test_every_key_acts_or_is_refused() -> None:
+    known = {plain(key) for key in (*ACTS, *ACTS_ON_SURFACES, *READ)}
+    refused = {key for _, _, key in IN_VAIN}
+    silent = [key for key in KEYS if OTHER_NAMES.get(key, key) not in known | set(ACTS) | refused]
+    assert silent == []
+
+
+@pytest.mark.parametrize("key", ACTS)
+def test_a_key_of_an_imaged_study_acts(folder: Path, key: str) -> None:
+    stage, value = ACTS[key]
+    content = changed(IMAGED, key, value)
+    assert decided(loaded(folder, content))[stage] != before(folder, True)[stage]
+
+
+@pytest.mark.parametrize("key", ACTS_ON_SURFACES)
+def test_a_key_of_given_surfaces_acts(folder: Path, key: str) -> None:
+    stage, value = ACTS_ON_SURFACES[key]
+    assert decided(loaded(folder, changed(GIVEN, key, value)))[stage] != before(folder, False)[stage]
+
+
+@pytest.mark.parametrize("key", READ)
+def test_a_key_of_no_stage_is_read(key: str) -> None:
+    place = Path(limbfit.__file__).parent / READ[key]
+    files = sorted(place.rglob("*.py")) if place.is_dir() else [place]
+    trees = [ast.parse(file.read_text(encoding="utf-8")) for file in files]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    read = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    read |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    assert key.rpartition(".")[2] in read
+
+
+def test_a_session_takes_every_key_of_acquire(folder: Path) -> None:
+    assert asdict(Settings(**loaded(folder, GIVEN).acquire.model_dump())) == {
+        key.removeprefix("acquire."): value for key, value in KEYS.items() if key.startswith("acquire.")
+    }
+
+
+@pytest.mark.parametrize(("content", "changes", "key"), IN_VAIN, ids=[key for _, _, key in IN_VAIN])
+def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: Any, key: str) -> None:
+    for one, value in changes.items():
+        content = changed(content, one, value)
+    with pytest.raises(StudyError, match="without effect") as caught:
+        loaded(folder, content)
+    told = str(caught.value)
+    assert "\n" not in told
+    named = str(caught.value.place)
+    assert ".".join(part for part in named.split(".") if part not in ("1", "2")) == key
+    assert caught.value.remedy
+
+
+def test_every_refusal_is_tried() -> None:
+    tried = {key for _, _, key in IN_VAIN}
+    stated = {key for rule in VAIN for key in rule.keys}
+    assert stated | {f"sites.{rule.key}" for rule in VAIN_OF_SITE} | {"mesh.accuracy"} == tried
+
+
+def test_what_an_amputation_takes_is_not_in_vain(folder: Path) -> None:
+    content = changed(GIVEN, *AMPUTATED)
+    content["geometry"] |= {"surface_edge_mm": 2.5, "amputation_pad_mm": 9.0}
+    assert decided(loaded(folder, content))["surfaces"] != before(folder, False)["surfaces"]
