@@ -209,7 +209,12 @@ def main() -> int:
         wanted = {one for one in every - known.keys() if _is_asked(one, asked.only)}
         if not wanted:
             continue
-        limb = read_limb(name, file, asked.roughen, asked.decimate)
+        try:
+            limb = read_limb(name, file, asked.roughen, asked.decimate)
+        except LimbfitError as error:
+            known |= {one: {"sound": False, "failure": str(error)} for one in wanted}
+            print(f"{name}: REFUSED, {error}", flush=True)
+            continue
         for note in limb.notes:
             print(f"{name}: {note}", flush=True)
         for key, row in rows(limb, asked, wanted):
