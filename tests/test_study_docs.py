@@ -41,7 +41,7 @@ KEYS = dict(keys_of(Study, "", None))
 ROWS = {
     cells[0].strip("` "): cells[1].strip("` ")
     for cells in re.findall(
-        r"^\| (`[a-z]+\.[^|]*`) \| ([^|]*) \|", DOCS.read_text(encoding="utf-8"), re.MULTILINE
+        r"^\| (`[a-z]+\.[^|]*`) \| ([^|]*) \| .*\|$", DOCS.read_text(encoding="utf-8"), re.MULTILINE
     )
 }
 
