@@ -5,7 +5,7 @@ Nothing here comes from an image's header, and inputs are named by their keys in
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from .page import Prose, Section
 from .store import PARAMETERS, Json, Store
@@ -118,15 +118,22 @@ def _indentations(store: Store) -> str:
         f"{len(facts)} sites have a record of time, displacement and force; {len(store.fitted)} were fitted "
         f"({', '.join(store.fitted)}).{where} The indenter's axis is the mean inward normal of the skin "
         "under it "
-        "unless the study states one. Touch-down was found in each record; from there on displacement was "
-        "made "
-        "piecewise linear and force smoothed, every phase (loading, hold, unloading) by itself so that the "
-        "peak is kept; where "
-        "parameters are searched and judged, the simulated force is smoothed in the same way. "
+        "unless the study states one. Touch-down is where the force of each record leaves its baseline as a "
+        f"power of the depth in a tissue with memory{_touch_downs(facts)}; from there on displacement was "
+        "made piecewise linear and force smoothed, every phase (loading, hold, unloading) by itself so that "
+        "the peak is kept; where parameters are searched and judged, the simulated force is smoothed in the "
+        "same way. "
         f"Depths are {_range(facts, 'depth_mm', 2)} mm, largest forces {_range(facts, 'peak_force_N', 2)} N, "
         f"loading speeds {_range(facts, 'speed_load_mm_s', 2)} mm/s"
         + (f", noise of the force {fixed(min(noise), 3)} to {fixed(max(noise), 3)} N." if noise else ".")
     )
+
+
+def _touch_downs(facts: Sequence[Json]) -> str:
+    known = [one for one in facts if one.get("touch_down_uncertainty_mm") is not None]
+    if not known:
+        return ""
+    return f" (known to {_range(known, 'touch_down_uncertainty_mm', 3)} mm, one standard deviation)"
 
 
 def _range(facts: Iterable[Json], key: str, digits: int) -> str:
