@@ -61,7 +61,7 @@ def test_it_is_no_wider():
         assert not within(name, *mechanics, "anatomy/segmentation")
     assert not within("sites", "anatomy/meshing")
     assert not within("traces", "anatomy/", "report/", "phantom/")
-    assert not within("calibrate", "report/", "phantom/", "anatomy/segmentation", "anatomy/meshing")
+    assert not within("calibrate", "report/", "phantom/", "anatomy/segmentation")
     assert not within("simulation", "anatomy/", "identify/", "pipeline/", "report/", "traces/")
     assert not any(within(name, "studio/", "cli/", "__init__") for name in RUNS)
 

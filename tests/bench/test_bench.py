@@ -51,6 +51,7 @@ def test_block_fills_its_box(cell_type):
     assert cell_volumes(mesh).min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", list(ELEMENTS))
 def test_a_block_of_as_many_unknowns_as_wanted(element):
     divisions = divisions_for(element, 3000)

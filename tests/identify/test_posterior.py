@@ -57,6 +57,7 @@ def test_the_likelihood_is_that_of_the_gaussian():
     assert likelihood.at_responses(line(best.parameters), best.parameters) == pytest.approx(full, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_linear_posterior_is_the_closed_form():
     likelihood, exact, covariance = linear_case()
     found = sample_posterior(likelihood, exact, covariance, steps=1500, seed=1)

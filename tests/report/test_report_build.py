@@ -405,6 +405,7 @@ def test_methods_say_what_was_done_and_name_nobody(results, report):
     assert "nan" not in text.lower().replace("nanometre", "")
 
 
+@pytest.mark.slow
 def test_experiments_are_shown_unless_stale(copy, tmp_path):
     compress_cube(copy / "cube", parameters={"skin": SKIN, "muscle": SKIN})
     run = json.loads((copy / "run.json").read_text())

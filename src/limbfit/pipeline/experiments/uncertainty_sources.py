@@ -24,7 +24,8 @@ from ..context import Context
 from ..extrapolation import MESH_ORDERS, error_of_coarser
 from ..simulations import SimulationCache
 from ..stages.laboratory import error_of_own_mesh
-from ..stages.mesh import coarse_settings, mesh_settings, meshed_models, scaled_edges
+from ..stages.mesh import coarse_settings, mesh_settings
+from ..stages.remesh import meshed_models, scaled_edges
 from ..stages.traces import SiteRecord, site_record
 
 Array = NDArray[np.float64]
@@ -197,9 +198,7 @@ def mesh_share(study: Study) -> tuple[str, float]:
     order = MESH_ORDERS[study.mesh.element]
     how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
     if study.mesh.coarse is not None:
-        return f"what the fine mesh lacks ({how}); every interval has it already", error_of_own_mesh(
-            study.mesh
-        )
+        return f"what the fine mesh lacks, in every interval already: {how}", error_of_own_mesh(study.mesh)
     what = f"what the mesh lacks, from edges {FINER:g} times as long: {how}"
     return what, error_of_coarser(order, 1 / FINER)
 

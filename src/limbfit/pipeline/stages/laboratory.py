@@ -25,8 +25,9 @@ from ..context import Context
 from ..extrapolation import MESH_ORDERS, error_of_finer
 from ..simulations import SimulationCache
 from .doubted import Doubted
-from .mesh import mesh_settings, meshed_models, scaled_edges
+from .mesh import mesh_settings
 from .record_noise import site_noise
+from .remesh import meshed_models, scaled_edges
 from .traces import SiteRecord, site_record
 
 Array = NDArray[np.float64]

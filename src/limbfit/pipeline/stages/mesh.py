@@ -14,11 +14,10 @@ from ...anatomy.layers import LayerSpec
 from ...anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
 from ...anatomy.surfaces import Anatomy, load_anatomy
 from ...anatomy.thickness import read_thickness
-from ...indentation import SiteModel
 from ...mesh import write_vtu
 from ...study import Study
 from ..context import Context
-from ..store import COARSE, file_digest, read_json, write_json
+from ..store import COARSE, read_json, write_json
 from .files import THICKNESS
 
 
@@ -114,32 +113,6 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def meshed_models(
-    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str
-) -> list[SiteModel]:
-    """The models on meshes of other settings, in ``folder``; those of an interrupted run are kept.
-
-    ``title`` is the stage or experiment that is told of progress.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = [
-        mesh_job(context, model.name, model.position, model.axis, settings, folder / f"{model.name}.vtu")
-        for model in models
-    ]
-    missing = [job for job in jobs if not _is_meshed(job)]
-    for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
-        context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
-    return [
-        replace(model, mesh=job.file, mesh_digest=file_digest(job.file)) for model, job in zip(models, jobs)
-    ]
-
-
-def scaled_edges(settings: MeshSettings, factor: float) -> MeshSettings:
-    """The same with edges ``factor`` times as long."""
-    near, far = factor * settings.edge_near_mm, factor * settings.edge_far_mm
-    return replace(settings, edge_near_mm=near, edge_far_mm=far)
-
-
 def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
     """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
     sites = context.stored("sites", "sites.json")["sites"]
@@ -154,7 +127,7 @@ def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: s
         )
         for site in sites
     ]
-    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if _is_meshed(job)}
+    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if is_meshed(job)}
     missing = [job for job in jobs if job.site not in facts]
     context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
     for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
@@ -165,5 +138,5 @@ def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: s
     return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
 
 
-def _is_meshed(job: MeshJob) -> bool:
+def is_meshed(job: MeshJob) -> bool:
     return job.file.is_file() and job.file.with_suffix(".json").is_file()
