@@ -180,14 +180,22 @@ def record_curves(store: Store, sites: Sequence[str]) -> Interactive | None:
             "displacement_mm": regular["displacement_mm"] + start[1],
             "force_N": regular["force_N"],
         }
+        phases = facts.get("phases") or []
         choices[site] = {
             "raw": _plain(raw, _COLUMNS),
             "smooth": _plain(smooth, _COLUMNS),
             "touch": {"time_s": start[0], "displacement_mm": start[1]},
+            "ends": {
+                "time_s": [one["end_s"] for one in phases],
+                "displacement_mm": [one["end_mm"] + start[1] for one in phases],
+            },
         }
     if not choices:
         return None
-    caption = "Every record, raw and regularised; the vertical line is the touch-down that was found."
+    caption = (
+        "Every record, raw and regularised; vertical lines are the touch-down that was found and the ends "
+        "of the indenter's phases."
+    )
     return Interactive("records", "records", "Records of all sites.", caption, {"sites": choices})
 
 

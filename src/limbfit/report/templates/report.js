@@ -153,18 +153,20 @@ function quantile(values, share) {
   return sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))];
 }
 
-/** Records: a site and an axis to choose, raw and regularised curves, and the touch-down as a line. */
+/** Records: a site and an axis to choose, raw and regularised curves; touch-down and ends of phases as lines. */
 function showRecords(figure, { sites }) {
   const names = Object.keys(sites);
   const now = { site: names[0], against: "time_s" };
   const box = element("div", {});
   const content = () => {
-    const { raw, smooth, touch } = sites[now.site], { against } = now;
+    const { raw, smooth, touch, ends } = sites[now.site], { against } = now;
     const forces = [...raw.force_N, ...smooth.force_N].filter((value) => value !== null);
+    const low = Math.min(0, ...forces), high = Math.max(...forces);
     const series = [
       { label: "as recorded", colour: "--muted", width: 1.2, x: raw[against], y: raw.force_N },
       { label: "regularised", colour: "--simulated", x: smooth[against], y: smooth.force_N },
-      { label: "touch-down", colour: "--ink", dash: "dashed", width: 1.2, x: [touch[against], touch[against]], y: [Math.min(0, ...forces), Math.max(...forces)] },
+      { label: "touch-down", colour: "--ink", dash: "dashed", width: 1.2, x: [touch[against], touch[against]], y: [low, high] },
+      { label: "phases", colour: "--muted", dash: "dotted", width: 1, x: ends[against].flatMap((at) => [at, at, null]), y: ends[against].flatMap(() => [low, high, null]) },
     ];
     return { label: `Record of site ${now.site}.`, x: AGAINST[against], y: FORCE, series };
   };
