@@ -215,8 +215,9 @@ def _traces(folder: Path, sites: tuple) -> None:
 def _phases(first_s: float, touch_s: float, seconds: float) -> list[dict]:
     ends = [first_s, touch_s, touch_s + 0.4 * seconds, touch_s + 0.6 * seconds, touch_s + seconds]
     kinds = ("approach", "load", "hold", "unload")
-    rows = zip(kinds, ends, ends[1:], strict=False)
-    return [{"kind": kind, "start_s": a, "end_s": b} for kind, a, b in rows]
+    depths = [0.0, 5.0, 5.0, 0.0]
+    rows = zip(kinds, ends, ends[1:], depths, strict=False)
+    return [{"kind": kind, "start_s": a, "end_s": b, "end_mm": depth} for kind, a, b, depth in rows]
 
 
 def _limb_mesh() -> Mesh:
