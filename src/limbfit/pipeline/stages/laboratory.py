@@ -185,7 +185,7 @@ class Laboratory:
             replace(record.job(found.parameters, sensitivities=False), model=model)
             for record, model in zip(self.records, models, strict=True)
         ]
-        share, lacking = error_of_finer(MESH_ORDERS[study.mesh.element], COARSER), []
+        share, lacking = error_of_own_mesh(study.mesh), []
         done = self.cache.run(jobs, self.context.executor, again=True)
         for record, simulation, fitted in zip(self.records, done, found.responses, strict=True):
             coarse = record.respond(simulation)
@@ -279,9 +279,9 @@ def linearised(study: Study, records: Sequence[SiteRecord], parameters: Array, a
 
 
 def error_of_own_mesh(table: MeshTable) -> float:
-    """One standard deviation of what the study's own mesh lacks, over its difference from the coarse one."""
-    assert table.coarse is not None
-    return error_of_finer(MESH_ORDERS[table.element], table.coarse.edge_near_mm / table.edge_near_mm)
+    """One standard deviation of what the study's own mesh lacks, over its difference from the coarser one."""
+    ratio = COARSER if table.coarse is None else table.coarse.edge_near_mm / table.edge_near_mm
+    return error_of_finer(MESH_ORDERS[table.element], ratio)
 
 
 def settings(study: Study) -> CalibrationSettings:
