@@ -9,8 +9,9 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from threading import Thread
+from threading import Event, Thread
 from time import perf_counter, sleep
+from types import FrameType
 from typing import Annotated, Any
 
 import typer
@@ -28,6 +29,7 @@ import limbfit
 
 INTERRUPTED = "interrupted; run the same command again to go on"
 _PATIENCE_S = 3.0  # for an interrupt to be heard
+_CLEARING_S = 15.0  # for what heard it to end its workers and files
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
@@ -97,21 +99,29 @@ def prompt_interrupt() -> Iterator[None]:
     near, far = socket.socketpair()
     for end in (near, far):
         end.setblocking(False)
-    before = signal.set_wakeup_fd(far.fileno(), warn_on_full_buffer=False)
+    wakeup = signal.set_wakeup_fd(far.fileno(), warn_on_full_buffer=False)
     near.setblocking(True)
+    heard = Event()
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.set()
+        raise KeyboardInterrupt
 
     def watch() -> None:
         while numbers := near.recv(64):
             if signal.SIGINT in numbers:
-                sleep(_PATIENCE_S)
+                if heard.wait(_PATIENCE_S):
+                    sleep(_CLEARING_S)
                 os.write(2, f"error: {INTERRUPTED}\n".encode())
                 os._exit(130)
 
     Thread(target=watch, daemon=True).start()
+    handler = signal.signal(signal.SIGINT, hear)
     try:
         yield
     finally:
-        signal.set_wakeup_fd(before)
+        signal.signal(signal.SIGINT, handler)
+        signal.set_wakeup_fd(wakeup)
         far.close()  # which ends the watch
 
 
