@@ -7,7 +7,7 @@ import pytest
 
 from layered import layered_block
 from limbfit.bench.blocks import block_site
-from limbfit.identify import FIXED, CalibrationSettings, Measured, Unknowns, calibrate, shared
+from limbfit.identify import FIXED, CalibrationSettings, Measured, Unknowns, calibrate
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.pipeline.stages.traces import as_response
 from limbfit.study import SolverTable
@@ -18,7 +18,7 @@ SLIPPING = (0.5, 5.0, 1.0, 1.0, 30.0, 5.0, 1.0, 1.0)  # soft skin that is squeez
 
 
 class Block:
-    """A punch on plain quadratic tetrahedra, which fold under its edge; keeps the kinds of doubt by parameters."""
+    """A punch on plain quadratic tetrahedra, which fold under its edge."""
 
     def __init__(self, folder):
         steps = SolverTable(load_steps=4, unload_steps=2)
