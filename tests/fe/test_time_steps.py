@@ -48,6 +48,16 @@ def test_cycles_and_rates_are_within_the_goal(name, tau):
     assert worst < 1.0
 
 
+@pytest.mark.parametrize("tau", [0.4, 0.5, 1.0, 1.6, 3.0])
+def test_slow_tissue_that_has_not_come_back_is_met_on_the_way(tau):
+    """At a time that no step foresees: the curve goes to zero there, not at the step before it."""
+    layer = {"prony": ((3.0, tau),)}
+    exact = reference_layer(HISTORIES["cycles"], **layer)
+    rms, worst = curve_error(solve_layer(HISTORIES["cycles"], USUAL, **layer), exact)
+    assert rms < 0.3
+    assert worst < 1.8
+
+
 @pytest.mark.parametrize(("control", "most"), [(USUAL, 18), (FEWER, 14)])
 @pytest.mark.parametrize("tau", [0.1, 0.32, 1.0, 3.0])
 def test_a_ramp_takes_no_more_steps_than_stated(control, most, tau):

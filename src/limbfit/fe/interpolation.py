@@ -1,7 +1,8 @@
 """The force between steps: a spline over each phase, in the root of time where steps are dense at its start.
 
 After a turn steps are dense, for the force relaxes there; a spline in time through steps so uneven swings.
-Phases end in kinks, and so does contact: where it is lost, the spline of the steps before goes on to zero.
+Phases end in kinks, and so does contact: where it is lost, the spline of the steps before goes on to zero, and
+where it is found again, that of the steps after comes from there.
 """
 
 from __future__ import annotations
@@ -34,8 +35,13 @@ def interpolate(times: Array, force: Array, kinks: Array, values: Array, at: Arr
         if nodes > 2 and pushes[-1] <= 0.0:
             ends = [_spline(x[-1 - n : -1], pushes[-1 - n : -1])(x[-1]) for n in (3, nodes - 1) if n < nodes]
             nodes -= int(max(ends) <= 0.0)  # contact ended on the way
-        inside = inside[(pushing := _spline(x[:nodes], pushes[:nodes])(t) > 0.0)]
-        out[inside] = _spline(x[:nodes], values[first : first + nodes])(t[pushing])
+        skip = 0
+        if nodes > 2 and pushes[0] <= 0.0 and np.any(force[:first] > 0.0):
+            starts = [_spline(x[1 : n + 1], pushes[1 : n + 1])(x[0]) for n in (2, 3) if n < nodes]
+            skip = int(max(starts) <= 0.0)  # tissue that had not come back yet was met on the way
+        kept = slice(skip, nodes)
+        inside = inside[(pushing := _spline(x[kept], pushes[kept])(t) > 0.0)]
+        out[inside] = _spline(x[kept], values[first : last + 1][kept])(t[pushing])
     return out
 
 
