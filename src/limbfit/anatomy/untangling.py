@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ..mesh import Mesh, node_jacobians
 from .background import volumes
 from .columns import Columns
-from .layers import Frame, LimbFields
+from .frame import Frame
+from .layers import LimbFields
 from .smoothing import DIRECTIONS, held, put_back
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
 from .amputation import amputate
+from .frame import limb_frame
 from .grid import SOFT_TISSUE, Grid, LabelMap
-from .layers import limb_frame
 from .surfaces import Anatomy, build_anatomy
 from .triangles import Surface
 
