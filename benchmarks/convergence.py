@@ -28,8 +28,8 @@ import numpy as np
 from convergence_analysis import analyse, draw, tables
 from numpy.typing import NDArray
 
-from limbfit.anatomy.meshing import MeshSettings, mesh_site
-from limbfit.anatomy.surfaces import Anatomy, read_surface
+from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
+from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
 from limbfit.bench.measuring import max_rss_MB, warm_up
 from limbfit.bench.reference import find_reference
 from limbfit.fe import ELEMENTS, Problem, StepControl, solve

@@ -33,14 +33,14 @@ from scipy.linalg import block_diag
 from limbfit import load_study
 from limbfit.execution import SerialExecutor
 from limbfit.identify import Emulator, Measured, SiteNoise, SiteResponse, Unknowns, record_noise
-from limbfit.identify.coverage import Coverage, coverage_study
-from limbfit.identify.noise import depth_slope
+from limbfit.identify.uncertainty.coverage import Coverage, coverage_study
+from limbfit.identify.uncertainty.noise import depth_slope
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
-from limbfit.pipeline.context import Context
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.traces import SiteRecord, site_record
-from limbfit.pipeline.store import Store
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ import numpy as np
 
 from limbfit import load_study, run_study
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume
-from limbfit.anatomy.surfaces import Anatomy, load_anatomy
+from limbfit.anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid, write_series
 

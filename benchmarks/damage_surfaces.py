@@ -10,7 +10,7 @@ import numpy as np
 import pyvista as pv
 from damage import Inputs, Whole, kind
 
-from limbfit.anatomy.surfaces import Surface
+from limbfit.anatomy.surfaces.surfaces import Surface
 
 Random = np.random.Generator
 SUFFIXES = (".stl", ".ply", ".obj", ".vtp")

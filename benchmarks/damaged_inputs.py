@@ -36,7 +36,7 @@ import igl
 import numpy as np
 from damage import KINDS, Kind, Whole, make_whole, read_whole
 
-from limbfit.anatomy.surfaces import Anatomy, Surface, load_anatomy
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy
 from limbfit.cli import main as limbfit
 from limbfit.pipeline import check_study, run_study
 

@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbfit.anatomy.mending import closed_anatomy, open_loops
-from limbfit.anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.surfaces import Anatomy, Surface, bodies, read_surface
-from limbfit.anatomy.triangles import from_pyvista
-from limbfit.anatomy.under import tissue_under
+from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.sites.under import tissue_under
+from limbfit.anatomy.surfaces.mending import closed_anatomy, open_loops
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, bodies, read_surface
+from limbfit.anatomy.surfaces.triangles import from_pyvista
 from limbfit.bench.limbs import INDENTER_MM, random_sites
 from limbfit.bench.meshing import cpu_seconds
 from limbfit.errors import LimbfitError

@@ -32,7 +32,7 @@ from limbfit import check_study, load_study, run_study
 from limbfit.errors import LimbfitError
 from limbfit.execution import SerialExecutor, sharing
 from limbfit.fe import solve
-from limbfit.identify.multistart import random_starts
+from limbfit.identify.fit.multistart import random_starts
 from limbfit.indentation import (
     Simulation,
     SimulationJob,
@@ -43,10 +43,10 @@ from limbfit.indentation import (
     to_vector,
 )
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.simulations import job_digest
+from limbfit.pipeline.shared.simulations import job_digest
+from limbfit.pipeline.shared.store import RUNS, Store, digest
 from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.traces import read_curves
-from limbfit.pipeline.store import RUNS, Store, digest
 
 Record = dict[str, Any]
 SAME = 0.01  # of the squared error: as good a fit as the best

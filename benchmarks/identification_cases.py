@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.sites import indenter_axis, project_to_skin
-from limbfit.anatomy.surfaces import Anatomy, save_anatomy
+from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
+from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.fe import StepControl, solve
 from limbfit.indentation import Parameters, SiteModel, build_problem
 from limbfit.phantom.build import true_parameters

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbfit.anatomy.imaging import LabelMap, Volume
-from limbfit.anatomy.marked import marked_skin, without_markers
-from limbfit.anatomy.markers import Marker, find_markers, match_markers
-from limbfit.anatomy.registration import limb_motion
-from limbfit.anatomy.surfaces import Surface, build_anatomy
+from limbfit.anatomy.sites.marked import marked_skin, without_markers
+from limbfit.anatomy.sites.markers import Marker, find_markers, match_markers
+from limbfit.anatomy.sites.registration import limb_motion
+from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import Limb, make_limb, rotation_about
 from limbfit.phantom.mri import Grid, image_of, make_grid

@@ -24,9 +24,9 @@ import numpy as np
 
 from limbfit import load_study, run_study
 from limbfit.indentation import flat_names, to_vector
-from limbfit.pipeline.context import Progress
-from limbfit.pipeline.demo import make_phantom_study
-from limbfit.pipeline.store import Store, read_json
+from limbfit.pipeline.shared.context import Progress
+from limbfit.pipeline.shared.store import Store, read_json
+from limbfit.pipeline.verbs.demo import make_phantom_study
 
 Record = dict[str, Any]
 

@@ -21,8 +21,8 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from limbfit.anatomy.grid import FAT, LabelMap
-from limbfit.anatomy.segmentation import segment
-from limbfit.anatomy.surfaces import Anatomy, build_anatomy, signed_distance
+from limbfit.anatomy.segmentation.segmentation import segment
+from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, signed_distance
 from limbfit.phantom.geometry import BONES, Limb, gradient_of, make_limb
 from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, image_of, make_grid
 from limbfit.phantom.surfaces import true_anatomy

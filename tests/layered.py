@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from limbfit.anatomy.surfaces import Anatomy, save_anatomy
-from limbfit.anatomy.triangles import Surface
+from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.bench.blocks import SIX_TETS, block_site, boxes, upright
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.phantom.record import Ramp, record
-from limbfit.pipeline.context import Context
-from limbfit.pipeline.simulations import COARSE
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import COARSE
+from limbfit.pipeline.shared.store import Store, write_json
 from limbfit.pipeline.stages.traces import run_traces
-from limbfit.pipeline.store import Store, write_json
 from limbfit.study import Study
 
 TISSUES = ("skin", "fat", "muscle")

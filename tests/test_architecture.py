@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 import limbfit
 
 PACKAGE = Path(limbfit.__file__).parent
@@ -23,10 +25,13 @@ FLOORS = [
     {"errors", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
-# The pipeline's own floors: its verbs stand in the folder itself above its rooms, what all share below them.
-INNER_FLOORS = ["experiments", "stages", "shared"]
-_SHARED = "causes context corrections extrapolation keys provenance simulations sources store tabular"
-SHARED = set(_SHARED.split())
+# Floors inside a room, from the top; "" is what stands in the room's own folder.
+INNER_FLOORS = {
+    "anatomy": ["imaging", "meshing", "sites", "segmentation", "surfaces", "labels", "images", ""],
+    "identify": ["__init__", "checks", "uncertainty", "fit"],
+    "pipeline": ["__init__", "verbs", "experiments", "stages", "shared"],
+    "report": ["__init__ build html files", "sections", "drawing", "page store tables"],
+}
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
 
 
@@ -86,21 +91,43 @@ def test_arrows_point_down():
     assert not wrong, "\n".join(wrong)
 
 
-def test_arrows_point_down_inside_the_pipeline():
-    def floor(module: str) -> int:
-        room = module.split(".")[2]
-        name = "shared" if room in SHARED else room
-        return -1 - INNER_FLOORS.index(name) if name in INNER_FLOORS else 0
+def inner_floor(room: str, parts: list[str]) -> int:
+    """The floor of a module inside its room, counted from the ground; ``parts`` follow the room's name."""
+    own = parts[0] if parts else "__init__"
+    floors = [set(names.split()) for names in INNER_FLOORS[room]]
+    level = next((k for k, names in enumerate(floors) if own in names), None)
+    if level is None:
+        assert set() in floors, f"{room}/{own} has no floor"
+        level = floors.index(set())
+    return -level
 
+
+@pytest.mark.parametrize("room", sorted(INNER_FLOORS))
+def test_arrows_point_down_inside_a_room(room):
     wrong = []
+    modules = {module_name(path) for path in files()}
     for path in files():
-        here = module_name(path)
-        if not here.startswith("limbfit.pipeline."):
+        here = module_name(path).split(".")
+        if here[1] != room:
             continue
         for target, line, _ in imports(path):
-            if target.startswith("limbfit.pipeline.") and floor(target) > floor(here):
+            while target not in modules:
+                target = target.rpartition(".")[0]
+            there = target.split(".")
+            if there[1:2] != [room] or there[2:3] == here[2:3]:
+                continue
+            if inner_floor(room, there[2:]) > inner_floor(room, here[2:]):
                 wrong.append(f"{path.relative_to(PACKAGE)}:{line} imports {target}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_corridors_are_short():
+    """No folder has more than twenty doors."""
+    counts = {}
+    for path in files():
+        counts[path.parent] = counts.get(path.parent, 0) + 1
+    wide = {str(folder.relative_to(PACKAGE)): n for folder, n in counts.items() if n > 20}
+    assert not wide, wide
 
 
 def test_no_import_hides_in_a_function():

@@ -13,11 +13,11 @@ from layered import store_blocks
 from limbfit.errors import StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import to_vector
-from limbfit.pipeline.context import Context, Progress
+from limbfit.pipeline.shared.context import Context, Progress
+from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import groupings
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.pipeline.store import Store
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "muscle")

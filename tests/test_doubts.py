@@ -7,7 +7,7 @@ import pytest
 
 from conftest import write_trace
 from limbfit import check_study, load_study
-from limbfit.report.doubts import doubts
+from limbfit.report.sections.doubts import doubts
 from limbfit.report.store import Store
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])

@@ -12,8 +12,8 @@ from limbfit.errors import InputError
 from limbfit.pipeline import Progress, study_status
 from limbfit.pipeline.experiments import catalogue
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment
-from limbfit.pipeline.run import keys
-from limbfit.pipeline.store import write_json
+from limbfit.pipeline.shared.store import write_json
+from limbfit.pipeline.verbs.run import keys
 from limbfit.study import load_study
 
 

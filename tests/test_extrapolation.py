@@ -8,7 +8,7 @@ import pytest
 from limbfit.fe import ELEMENTS, ORDER_IN_TIME
 from limbfit.fe.materials import prony_factors
 from limbfit.pipeline.experiments.uncertainty_sources import FINER, mesh_share
-from limbfit.pipeline.extrapolation import MESH_ORDERS, error_of_coarser, richardson
+from limbfit.pipeline.shared.extrapolation import MESH_ORDERS, error_of_coarser, richardson
 from limbfit.study import load_study
 
 COARSE = "[mesh.coarse]\nedge_near_mm = 5.0\n"

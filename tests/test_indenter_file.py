@@ -10,8 +10,8 @@ import pyvista as pv
 
 from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SiteModel, read_indenter
-from limbfit.pipeline.run import keys
-from limbfit.pipeline.simulations import SimulationJob, job_digest
+from limbfit.pipeline.shared.simulations import SimulationJob, job_digest
+from limbfit.pipeline.verbs.run import keys
 from limbfit.study import IndenterTable, Study, load_study
 
 TEXT = """

@@ -15,11 +15,11 @@ from limbfit import indentation
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
 from limbfit.mesh import write_vtu
-from limbfit.pipeline.context import Context
-from limbfit.pipeline.simulations import COARSE, job_digest
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import COARSE, job_digest
+from limbfit.pipeline.shared.store import Store, write_json
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.pipeline.stages.traces import read_curves
-from limbfit.pipeline.store import Store, write_json
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "muscle")

@@ -17,8 +17,8 @@ import pytest
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, sharing
 from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
-from limbfit.pipeline.doctor import squeeze_cube
-from limbfit.pipeline.journal import discreet
+from limbfit.pipeline.verbs.doctor import squeeze_cube
+from limbfit.pipeline.verbs.journal import discreet
 from limbfit.study import load_study
 
 

@@ -9,7 +9,6 @@ from conftest import coarse_mesh
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
-from limbfit.pipeline.context import Context, Progress
 from limbfit.pipeline.experiments.sensitivity import (
     other_indenters,
     run_contact,
@@ -19,8 +18,9 @@ from limbfit.pipeline.experiments.sensitivity import (
 )
 from limbfit.pipeline.experiments.variants import choose_sites
 from limbfit.pipeline.experiments.volumes import volume_facts
-from limbfit.pipeline.extrapolation import richardson
-from limbfit.pipeline.store import Store, read_json, write_json
+from limbfit.pipeline.shared.context import Context, Progress
+from limbfit.pipeline.shared.extrapolation import richardson
+from limbfit.pipeline.shared.store import Store, read_json, write_json
 from limbfit.study import IndenterTable, load_study
 
 SETTINGS = coarse_mesh("tet10", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"

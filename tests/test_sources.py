@@ -15,8 +15,8 @@ import pytest
 
 from limbfit.indentation import simulate
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS
-from limbfit.pipeline.run import STAGES
-from limbfit.pipeline.sources import PACKAGE, shown, sources_of
+from limbfit.pipeline.shared.sources import PACKAGE, shown, sources_of
+from limbfit.pipeline.verbs.run import STAGES
 
 RUNS = {stage.name: stage.run for stage in (*STAGES, *EXPERIMENTS)} | {"simulation": simulate}
 
@@ -77,8 +77,8 @@ def test_it_holds_what_lists_by_hand_forgot():
 DIGESTS = """
 import json
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS
-from limbfit.pipeline.run import STAGES
-from limbfit.pipeline.sources import code_digest
+from limbfit.pipeline.verbs.run import STAGES
+from limbfit.pipeline.shared.sources import code_digest
 print(json.dumps({stage.name: code_digest(stage.run) for stage in (*STAGES, *EXPERIMENTS)}))
 """
 

@@ -10,7 +10,15 @@ import sys
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.store import EARLIER, Store, disk_errors, file_digest, lock, read_json, write_json
+from limbfit.pipeline.shared.store import (
+    EARLIER,
+    Store,
+    disk_errors,
+    file_digest,
+    lock,
+    read_json,
+    write_json,
+)
 
 
 def test_stage_is_done_only_for_its_key(tmp_path):
@@ -119,7 +127,7 @@ def test_file_digest_sees_names_and_contents(tmp_path):
 
 def test_second_run_is_refused_while_the_first_lives(tmp_path):
     program = (
-        "import sys; from pathlib import Path; from limbfit.pipeline.store import lock\n"
+        "import sys; from pathlib import Path; from limbfit.pipeline.shared.store import lock\n"
         "with lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen(

@@ -17,8 +17,8 @@ import limbfit
 from limbfit.acquire import Settings
 from limbfit.errors import StudyError
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, experiment_key
-from limbfit.pipeline.keys import Keys
-from limbfit.pipeline.run import keys
+from limbfit.pipeline.shared.keys import Keys
+from limbfit.pipeline.verbs.run import keys
 from limbfit.study import Study, load_study
 from limbfit.study.vain import VAIN, VAIN_OF_SITE
 from test_study_docs import KEYS

@@ -15,11 +15,11 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify import Unknowns, separate, shared, two_stages
 from limbfit.indentation import SimulationJob, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.context import Context, Progress
-from limbfit.pipeline.run import keys
+from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.predict import run_predict
+from limbfit.pipeline.verbs.run import keys
 from limbfit.report import build_report
 from limbfit.study import PARAMETERS, SolverTable, Study, load_study
 

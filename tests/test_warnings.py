@@ -14,7 +14,7 @@ from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
 from limbfit.fe import Doubt
 from limbfit.indentation import Simulation
-from limbfit.pipeline import simulations
+from limbfit.pipeline.shared import simulations
 from limbfit.pipeline.stages.doubted import Doubted, doubts_record
 from limbfit.report import build_report
 

@@ -19,7 +19,7 @@ import numpy as np
 import pyvista as pv
 
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume
-from limbfit.anatomy.surfaces import Anatomy, load_anatomy
+from limbfit.anatomy.surfaces.surfaces import Anatomy, load_anatomy
 
 COLOURS = {"limb": "#e34a33", "tibia": "#3bb2d0", "fibula": "#f4c542"}
 

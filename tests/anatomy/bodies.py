@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from limbfit.anatomy.surfaces import Anatomy, Surface
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 LENGTH, DISTAL, PROXIMAL, BONE_RADIUS = 70.0, 28.0, 34.0, 9.0
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from limbs import DIRECTIONS, leg_image
 
-from limbfit.anatomy.amputation import amputate
 from limbfit.anatomy.imaging import LabelMap
-from limbfit.anatomy.surfaces import build_anatomy, check_anatomy
+from limbfit.anatomy.segmentation.amputation import amputate
+from limbfit.anatomy.surfaces.surfaces import build_anatomy, check_anatomy
 from limbfit.errors import LabelError
 
 PAD = 16.0

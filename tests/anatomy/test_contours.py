@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from limbs import DIRECTIONS, grid, leg_image
 
-from limbfit.anatomy.contours import even_odd, outlines, rasterise, read_contours, write_contours
+from limbfit.anatomy.labels.contours import even_odd, outlines, rasterise, read_contours, write_contours
 from limbfit.errors import LabelError
 
 SHAPE, SPACING = (12, 40, 44), [1.2, 1.3, 5.0]

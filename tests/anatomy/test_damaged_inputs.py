@@ -11,7 +11,7 @@ from damage import KINDS, Kind, Whole
 from damaged_inputs import FORK, judge, make_whole, read_whole, run_case
 from limbs import leg_image, rotation, write_dicom
 
-from limbfit.anatomy.surfaces import build_anatomy
+from limbfit.anatomy.surfaces.surfaces import build_anatomy
 from limbfit.cli import main
 
 SEED = 1

@@ -10,15 +10,14 @@ import pytest
 from bodies import limb
 from limbs import SHARED, rotation
 
-from limbfit.anatomy import meshing, untangling
-from limbfit.anatomy.background import volumes
-from limbfit.anatomy.engines import VolumeMesh
-from limbfit.anatomy.layered import with_layers
-from limbfit.anatomy.layers import LimbFields
-from limbfit.anatomy.meshing import MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.sites import indenter_axis, project_to_skin
-from limbfit.anatomy.smoothing import held
-from limbfit.anatomy.untangling import inverted, repaired, thinned, untangled
+from limbfit.anatomy.meshing.background import volumes
+from limbfit.anatomy.meshing.engines import VolumeMesh
+from limbfit.anatomy.meshing.layered import with_layers
+from limbfit.anatomy.meshing.layers import LimbFields
+from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site, meshing, untangling
+from limbfit.anatomy.meshing.smoothing import held
+from limbfit.anatomy.meshing.untangling import inverted, repaired, thinned, untangled
+from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
 from limbfit.errors import MeshingError
 from limbfit.mesh import check, quality
 

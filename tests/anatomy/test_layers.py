@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from test_meshing import COARSE, conforms, limb, site_of
 
-from limbfit.anatomy.background import volumes
-from limbfit.anatomy.columns import columns, even_steps
 from limbfit.anatomy.grid import LabelMap
-from limbfit.anatomy.layers import LayerSpec
-from limbfit.anatomy.meshing import base_mesh, mesh_site
-from limbfit.anatomy.surfaces import Anatomy, build_anatomy
-from limbfit.anatomy.thickness import fat_depth, read_thickness, write_thickness
+from limbfit.anatomy.meshing.background import volumes
+from limbfit.anatomy.meshing.columns import columns, even_steps
+from limbfit.anatomy.meshing.layers import LayerSpec
+from limbfit.anatomy.meshing.meshing import base_mesh, mesh_site
+from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy
+from limbfit.anatomy.surfaces.thickness import fat_depth, read_thickness, write_thickness
 from limbfit.errors import LabelError, SurfaceError
 from limbfit.mesh import Mesh
 

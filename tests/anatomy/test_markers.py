@@ -6,13 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from limbfit.anatomy.body import limb_mask, smoothed
 from limbfit.anatomy.grid import LabelMap, Volume
-from limbfit.anatomy.marked import marked_skin, outline_height, without_markers
-from limbfit.anatomy.markers import Marker, bumps, find_markers, match_markers
-from limbfit.anatomy.registration import limb_motion
-from limbfit.anatomy.surfaces import extract_surface
-from limbfit.anatomy.triangles import Surface
+from limbfit.anatomy.segmentation.body import limb_mask, smoothed
+from limbfit.anatomy.sites.marked import marked_skin, outline_height, without_markers
+from limbfit.anatomy.sites.markers import Marker, bumps, find_markers, match_markers
+from limbfit.anatomy.sites.registration import limb_motion
+from limbfit.anatomy.surfaces.surfaces import extract_surface
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import ImageError, SiteError
 from limbfit.phantom.geometry import make_limb, rotation_about
 from limbfit.phantom.mri import image_of, make_grid

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from limbfit.anatomy.markups import read_markups
+from limbfit.anatomy.sites.markups import read_markups
 from limbfit.errors import InputError, SiteError
 from limbfit.study import load_study
 

@@ -10,9 +10,9 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.mending import closed_anatomy, mended, open_loops
-from limbfit.anatomy.surfaces import Surface, check_anatomy, check_closed
-from limbfit.anatomy.triangles import compacted
+from limbfit.anatomy.surfaces.mending import closed_anatomy, mended, open_loops
+from limbfit.anatomy.surfaces.surfaces import Surface, check_anatomy, check_closed
+from limbfit.anatomy.surfaces.triangles import compacted
 from limbfit.errors import SurfaceError
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.anatomy.body import limb_mask, smoothed
-from limbfit.anatomy.contrast import is_ct
-from limbfit.anatomy.fat import bright_fat, depth_below, subcutaneous
 from limbfit.anatomy.grid import FAT, Volume
-from limbfit.anatomy.segmentation import segment
-from limbfit.anatomy.supports import without_supports
+from limbfit.anatomy.segmentation.body import limb_mask, smoothed
+from limbfit.anatomy.segmentation.contrast import is_ct
+from limbfit.anatomy.segmentation.fat import bright_fat, depth_below, subcutaneous
+from limbfit.anatomy.segmentation.segmentation import segment
+from limbfit.anatomy.segmentation.supports import without_supports
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import BONES, SKIN_AND_FAT, Limb, make_limb
 from limbfit.phantom.mri import CONTRASTS, image_of, make_grid

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from limbs import DIRECTIONS, leg_image
 
-from limbfit.anatomy.quality import LIMB, assess
-from limbfit.anatomy.sheet import draw_sheet
+from limbfit.anatomy.labels.quality import LIMB, assess
+from limbfit.report.drawing.sheet import draw_sheet
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
 

@@ -14,9 +14,15 @@ from limbs import leg_image, rotation, write_dicom
 from scipy.spatial import cKDTree
 
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_labels, write_volume
-from limbfit.anatomy.meshing import MeshSettings, mesh_site
-from limbfit.anatomy.sites import indenter_axis
-from limbfit.anatomy.surfaces import Anatomy, build_anatomy, load_anatomy, save_anatomy, signed_distance
+from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
+from limbfit.anatomy.sites.sites import indenter_axis
+from limbfit.anatomy.surfaces.surfaces import (
+    Anatomy,
+    build_anatomy,
+    load_anatomy,
+    save_anatomy,
+    signed_distance,
+)
 from limbfit.mesh import write_vtu
 
 TOLERANCE_MM = 0.01

@@ -7,10 +7,10 @@ import pytest
 from limbs import CALF, DIRECTIONS, leg_image
 from scipy.ndimage import label
 
-from limbfit.anatomy.body import ball, bias_field, limb_mask, smoothed
-from limbfit.anatomy.bones import escape_level, find_bones, name_bones
 from limbfit.anatomy.imaging import BONES, LabelMap, Volume, read_volume
-from limbfit.anatomy.segmentation import segment
+from limbfit.anatomy.segmentation.body import ball, bias_field, limb_mask, smoothed
+from limbfit.anatomy.segmentation.bones import escape_level, find_bones, name_bones
+from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid, slabs

@@ -9,9 +9,9 @@ import pytest
 import pyvista as pv
 from limbs import SHARED
 
-from limbfit.anatomy.sites import indenter_axis, project_to_skin, square_edges
-from limbfit.anatomy.surfaces import Anatomy, read_surface
-from limbfit.anatomy.triangles import from_pyvista
+from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin, square_edges
+from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
+from limbfit.anatomy.surfaces.triangles import from_pyvista
 from limbfit.errors import SiteError
 
 OPENLIMB = SHARED / "reference" / "openlimb-study"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.surfacefiles import UNITS_MM, read_surface
-from limbfit.anatomy.triangles import check_closed
+from limbfit.anatomy.surfaces.surfacefiles import UNITS_MM, read_surface
+from limbfit.anatomy.surfaces.triangles import check_closed
 from limbfit.errors import SurfaceError
 
 

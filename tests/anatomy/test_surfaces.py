@@ -11,9 +11,9 @@ import pytest
 import pyvista as pv
 from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
 
-from limbfit.anatomy.extraction import fine_surface, untangled
 from limbfit.anatomy.imaging import LabelMap, read_volume
-from limbfit.anatomy.surfaces import (
+from limbfit.anatomy.surfaces.extraction import fine_surface, untangled
+from limbfit.anatomy.surfaces.surfaces import (
     Anatomy,
     Surface,
     build_anatomy,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.surfaces import Anatomy, Surface
-from limbfit.anatomy.under import DEEPEST_MM, tissue_under
+from limbfit.anatomy.sites.under import DEEPEST_MM, tissue_under
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 
 def cylinder(radius: float, offset: float = 0.0) -> Surface:

@@ -7,8 +7,8 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.surfaces import check_anatomy
-from limbfit.anatomy.voxels import amputated, voxelised
+from limbfit.anatomy.segmentation.voxels import amputated, voxelised
+from limbfit.anatomy.surfaces.surfaces import check_anatomy
 from limbfit.errors import LabelError
 
 PAD, EDGE = 10.0, 3.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.anatomy.layers import LayerSpec
-from limbfit.anatomy.meshing import MeshSettings
-from limbfit.anatomy.surfaces import Anatomy
+from limbfit.anatomy.meshing.layers import LayerSpec
+from limbfit.anatomy.meshing.meshing import MeshSettings
+from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.bench import bench_meshing
 from limbfit.bench.limbs import phantom_limb, random_sites
 from limbfit.errors import InputError

@@ -18,13 +18,13 @@ from limbfit.identify import (
     SiteResponse,
     calibrate,
     constrained,
-    multistart,
     random_starts,
     separate,
     shared,
     two_stages,
 )
-from limbfit.identify.multistart import describe
+from limbfit.identify.fit import multistart
+from limbfit.identify.fit.multistart import describe
 
 GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
 

@@ -11,7 +11,7 @@ from bars import TRUTH, coarsened, plain, simulate
 
 from limbfit.errors import CalibrationError
 from limbfit.identify import SiteResponse
-from limbfit.identify.correction import CoarseToFine
+from limbfit.identify.fit.correction import CoarseToFine
 
 FORCE = np.array([0.0, 1.0, 2.0, 1.0])
 NONE = np.zeros((4, 0))

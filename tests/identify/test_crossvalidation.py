@@ -10,7 +10,7 @@ from bars import PAPER, TRUTH, Bars
 
 from limbfit.errors import CalibrationError
 from limbfit.identify import Measured
-from limbfit.identify.crossvalidation import (
+from limbfit.identify.checks.crossvalidation import (
     choices_of,
     cross_validate,
     errors_by_site,

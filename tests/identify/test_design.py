@@ -10,7 +10,7 @@ from bars import PAPER, SITES, TRUTH
 
 from limbfit.errors import CalibrationError
 from limbfit.identify import SiteResponse, calibrate
-from limbfit.identify.design import (
+from limbfit.identify.checks.design import (
     Candidate,
     NoiseModel,
     candidate,
@@ -19,7 +19,7 @@ from limbfit.identify.design import (
     evaluate,
     prior_information,
 )
-from limbfit.identify.objective import Measured
+from limbfit.identify.fit.objective import Measured
 
 PRIOR = prior_information(PAPER)
 
@@ -84,7 +84,7 @@ def test_exchanges_reach_what_looking_at_all_choices_finds(criterion, monkeypatc
         every = random_candidates(9, 2, seed)
         best = choose(every, 4, np.eye(4), criterion)
         with monkeypatch.context() as patch:
-            patch.setattr("limbfit.identify.design.EXHAUSTIVE", 0)
+            patch.setattr("limbfit.identify.checks.design.EXHAUSTIVE", 0)
             found = choose(every, 4, np.eye(4), criterion)
         assert not found.exhaustive
         assert len({every[i].site for i in found.chosen}) == 4

@@ -16,9 +16,9 @@ from limbfit.identify import (
     estimate_uncertainty,
     separate,
 )
-from limbfit.identify.noise import SiteNoise
-from limbfit.identify.objective import curvature, residuals
-from limbfit.identify.parameters import Prior
+from limbfit.identify.fit.objective import curvature, residuals
+from limbfit.identify.fit.parameters import Prior
+from limbfit.identify.uncertainty.noise import SiteNoise
 
 DRAWS, SD = 200, 0.03
 NOISE = [SiteNoise(d.name, np.arange(60.0), SD**2 * np.eye(60), SD, 0.0) for d in records()]

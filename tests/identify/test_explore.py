@@ -7,12 +7,12 @@ import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records, simulate
 
 from limbfit.identify import SiteResponse, calibrate, estimate_uncertainty, separate
-from limbfit.identify.coverage import coverage_study
-from limbfit.identify.explore import ExploreSettings, explore
-from limbfit.identify.noise import curve_noise
-from limbfit.identify.parameters import search_space, shared
-from limbfit.identify.posterior import Posterior, principal_axes
-from limbfit.identify.sources import Gain
+from limbfit.identify.fit.parameters import search_space, shared
+from limbfit.identify.uncertainty.coverage import coverage_study
+from limbfit.identify.uncertainty.explore import ExploreSettings, explore
+from limbfit.identify.uncertainty.noise import curve_noise
+from limbfit.identify.uncertainty.posterior import Posterior, principal_axes
+from limbfit.identify.uncertainty.sources import Gain
 
 SPACE = search_space(PAPER, separate(NAMES))
 

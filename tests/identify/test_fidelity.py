@@ -10,7 +10,7 @@ import pytest
 from bars import PAPER, SITES, TRUTH, coarsened, plain, records, simulate
 
 from limbfit.identify import CalibrationSettings, SiteResponse, calibrate
-from limbfit.identify.fidelity import FidelitySettings, calibrate_corrected
+from limbfit.identify.fit.fidelity import FidelitySettings, calibrate_corrected
 
 TIGHT = FidelitySettings(rounds=4, tolerance_percent=0.02)
 

@@ -7,11 +7,11 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate
 
 from limbfit.identify import Measured, SiteResponse, calibrate, estimate_uncertainty, separate
-from limbfit.identify.coverage import coverage_study
-from limbfit.identify.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
-from limbfit.identify.noise import SiteNoise
-from limbfit.identify.parameters import Unknowns, search_space
-from limbfit.identify.uncertainty import LINEARISED, SAMPLED
+from limbfit.identify.fit.parameters import Unknowns, search_space
+from limbfit.identify.uncertainty.coverage import coverage_study
+from limbfit.identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
+from limbfit.identify.uncertainty.noise import SiteNoise
+from limbfit.identify.uncertainty.uncertainty import LINEARISED, SAMPLED
 
 # Forces tell log c + BEND (log m)^2 well and log m itself poorly: a valley that is bent.
 POINTS, ABOUT_N, BEND, SD_N = 40, 10.0, 1.0, 0.05

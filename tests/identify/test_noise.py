@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limbfit.autoregressive import block_covariance
-from limbfit.identify.noise import curve_noise, depth_slope, record_noise
+from limbfit.identify.uncertainty.noise import curve_noise, depth_slope, record_noise
 
 
 def drift(rng, n, lag):

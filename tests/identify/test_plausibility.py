@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limbfit.identify.plausibility import (
+from limbfit.identify.checks.plausibility import (
     UNITS,
     Flag,
     RecordFacts,

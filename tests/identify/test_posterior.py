@@ -7,13 +7,13 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate
 
 from limbfit.identify import Emulator, Measured, SiteResponse, estimate_uncertainty, separate, shared
-from limbfit.identify.discrepancy import ResidualModel
-from limbfit.identify.evidence import candidate, compare
-from limbfit.identify.likelihood import Likelihood
-from limbfit.identify.noise import SiteNoise
-from limbfit.identify.parameters import Unknowns, search_space
-from limbfit.identify.posterior import sample_posterior
-from limbfit.identify.profile import check_ends, profile
+from limbfit.identify.fit.parameters import Unknowns, search_space
+from limbfit.identify.uncertainty.discrepancy import ResidualModel
+from limbfit.identify.uncertainty.evidence import candidate, compare
+from limbfit.identify.uncertainty.likelihood import Likelihood
+from limbfit.identify.uncertainty.noise import SiteNoise
+from limbfit.identify.uncertainty.posterior import sample_posterior
+from limbfit.identify.uncertainty.profile import check_ends, profile
 
 # A model that is linear in the logarithms, with Gaussian noise: everything has a closed form.
 X = np.stack([np.ones(30), np.linspace(-1, 1, 30), np.linspace(-1, 1, 30) ** 2], axis=1)

@@ -9,8 +9,8 @@ import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records
 
 from limbfit.identify import calibrate
-from limbfit.identify.parameters import separate
-from limbfit.identify.regions import Region, fit_regions, mean_percent
+from limbfit.identify.fit.parameters import separate
+from limbfit.identify.fit.regions import Region, fit_regions, mean_percent
 
 SOFT = TRUTH * np.array([0.6, 1.0, 1.2, 1.0, 0.7, 1.0, 0.9, 1.1])
 

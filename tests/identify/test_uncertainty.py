@@ -21,8 +21,8 @@ from limbfit.identify import (
     separate,
     summarise,
 )
-from limbfit.identify.discrepancy import ResidualModel, _Rows, matern
-from limbfit.identify.noise import curve_noise
+from limbfit.identify.uncertainty.discrepancy import ResidualModel, _Rows, matern
+from limbfit.identify.uncertainty.noise import curve_noise
 
 
 def fitted(data, run=simulate):

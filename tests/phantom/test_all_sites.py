@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.anatomy.surfaces import save_anatomy
+from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import _ramp, _triple, true_parameters
 from limbfit.phantom.forces import MESHES, ForceJob, site_force
 from limbfit.phantom.geometry import make_limb

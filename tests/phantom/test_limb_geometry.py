@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from limbfit.anatomy.surfaces import check_closed
+from limbfit.anatomy.surfaces.surfaces import check_closed
 from limbfit.phantom.geometry import BONES, Limb, limb_shape, make_limb, rotation_about
 from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, true_sites
 from limbfit.phantom.surfaces import true_anatomy

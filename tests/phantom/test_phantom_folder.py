@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.anatomy.surfaces import load_anatomy
+from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError, SiteError
 from limbfit.phantom import make_limb, make_phantom, true_parameters
 from limbfit.phantom.forces import TrueForce

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from stored_results import write_results
 
+from limbfit.report.sections.uncertainty import _draw_profile, _profile_words, profile_figure
 from limbfit.report.store import load_store
-from limbfit.report.uncertainty import _draw_profile, _profile_words, profile_figure
 
 PROFILE = {
     "values": [1.0, 2.0, 3.0, 4.0, 6.0, 9.0],

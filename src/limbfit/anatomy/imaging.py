@@ -13,12 +13,13 @@ import SimpleITK as sitk  # noqa: N813
 
 from ..errors import ImageError, LabelError
 from .bounds import check_voxels
-from .dicom import Series, describe_series, list_series, read_series
-from .dicom_labels import find_dicom_labels, read_dicom_labels
-from .dicom_pixels import muted
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
-from .labelcheck import cleaned
-from .labelfiles import (
+from .images.dicom import Series, describe_series, list_series, read_series
+from .images.dicom_pixels import muted
+from .images.nifti import check_nifti
+from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
+from .labels.labelcheck import cleaned
+from .labels.labelfiles import (
     is_seg_nrrd,
     read_label_image,
     read_seg_nrrd,
@@ -26,8 +27,7 @@ from .labelfiles import (
     write_sidecar,
     wrong_file,
 )
-from .nifti import check_nifti
-from .placement import on_grid_of
+from .labels.placement import on_grid_of
 
 __all__ = [
     "BONES",

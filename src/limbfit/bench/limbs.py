@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.amputation import amputate
 from ..anatomy.grid import Grid
 from ..anatomy.imaging import read_volume
-from ..anatomy.segmentation import segment
-from ..anatomy.sites import indenter_axis
-from ..anatomy.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
-from ..anatomy.voxels import label_map
+from ..anatomy.segmentation.amputation import amputate
+from ..anatomy.segmentation.segmentation import segment
+from ..anatomy.segmentation.voxels import label_map
+from ..anatomy.sites.sites import indenter_axis
+from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
 from ..errors import InputError
 from ..phantom.geometry import BONES, make_limb
 from ..phantom.mri import make_grid

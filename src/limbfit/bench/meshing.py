@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.engines import ENGINES
-from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from ..anatomy.surfaces import Anatomy
+from ..anatomy.meshing.engines import ENGINES
+from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.surfaces.surfaces import Anatomy
 from ..errors import InputError, LimbfitError
 from .limbs import limbs, random_sites
 from .reference import Tell, find_reference

@@ -1,7 +1,7 @@
 """The force between steps: a spline over each phase, in the root of time where steps are dense at its start.
 
 After a turn steps are dense, for the force relaxes there; a spline in time through steps so uneven swings.
-Phases end in kinks, and so does contact: where it is lost, the spline of the steps before goes on to zero, and
+Phases end in kinks, and so does contact: where it is lost, the spline of the steps before goes on to zero;
 where it is found again, that of the steps after comes from there.
 """
 

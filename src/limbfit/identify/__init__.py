@@ -1,13 +1,10 @@
 """Identification: calibration, uncertainty and prediction on callables that are handed in."""
 
-from .calibration import Calibration, CalibrationSettings, Iterate, StageResult, State, calibrate
-from .discrepancy import ResidualModel, estimate_discrepancy
-from .emulator import Emulator
-from .fidelity import Corrected, FidelitySettings, calibrate_corrected
-from .multistart import Multistart, Started, multistart, random_starts
-from .noise import SiteNoise, curve_noise, record_noise
-from .objective import Measured, SiteResponse
-from .parameters import (
+from .fit.calibration import Calibration, CalibrationSettings, Iterate, StageResult, State, calibrate
+from .fit.fidelity import Corrected, FidelitySettings, calibrate_corrected
+from .fit.multistart import Multistart, Started, multistart, random_starts
+from .fit.objective import Measured, SiteResponse
+from .fit.parameters import (
     FIXED,
     Prior,
     Space,
@@ -18,8 +15,11 @@ from .parameters import (
     shared,
     two_stages,
 )
-from .prediction import Summary, error_percent, prediction_sd, summarise
-from .uncertainty import (
+from .fit.prediction import Summary, error_percent, prediction_sd, summarise
+from .uncertainty.discrepancy import ResidualModel, estimate_discrepancy
+from .uncertainty.emulator import Emulator
+from .uncertainty.noise import SiteNoise, curve_noise, record_noise
+from .uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
     UNDETERMINED,

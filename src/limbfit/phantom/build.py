@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.surfaces import save_anatomy
+from ..anatomy.surfaces.surfaces import save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
 from .forces import MESHES, ForceJob, TrueForce, site_force

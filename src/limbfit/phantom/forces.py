@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from ..anatomy.surfaces import Anatomy, load_anatomy
+from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
 from ..indentation import Parameters, SiteModel, build_problem

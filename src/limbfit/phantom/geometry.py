@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.layers import LayerSpec
+from ..anatomy.meshing.layers import LayerSpec
 
 Array = NDArray[np.floating]
 BONES = ("tibia", "fibula", "patella", "femur")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..anatomy.layers import LayerSpec
+from ..anatomy.meshing.layers import LayerSpec
 from .forces import PENALTY_PER_MM
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 

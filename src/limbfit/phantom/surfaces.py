@@ -9,8 +9,8 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
-from ..anatomy.surfaces import Anatomy, Surface
-from ..anatomy.triangles import bodies, from_pyvista, half_edges
+from ..anatomy.surfaces.surfaces import Anatomy, Surface
+from ..anatomy.surfaces.triangles import bodies, from_pyvista, half_edges
 from .geometry import BONES, PROXIMAL_CUT_MM, Limb, bone_field, skin_field
 
 Array = NDArray[np.floating]

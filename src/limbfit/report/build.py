@@ -6,8 +6,8 @@ from pathlib import Path
 
 from .files import write_files
 from .html import render
-from .methods import method_markdown
-from .sections import make_page
+from .sections.methods import method_markdown
+from .sections.sections import make_page
 from .store import load_store
 
 REPORT_NAME, METHODS_NAME = "report.html", "methods.md"

@@ -8,7 +8,7 @@ import json
 import re
 from pathlib import Path
 
-from .ink import standalone
+from .drawing.ink import standalone
 from .page import Block, Cell, Figure, Page, Row, Table
 
 _NUMBER = re.compile(r"[+-]?\d[\d ]*(\.\d+)?(e[+-]?\d+)?$")

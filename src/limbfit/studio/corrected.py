@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from ..anatomy.imaging import LabelMap, read_labels, write_labels
-from ..pipeline.store import file_digest
+from ..pipeline.shared.store import file_digest
 from ..study import Study
 from .editing import set_key
 from .folder import StudyFolder

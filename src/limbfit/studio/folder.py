@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..pipeline.acquire import FOLDER as ACQUIRED
-from ..pipeline.store import Store, read_json
+from ..pipeline.shared.store import Store, read_json
+from ..pipeline.verbs.acquire import FOLDER as ACQUIRED
 from ..study import Study, load_study
 
 

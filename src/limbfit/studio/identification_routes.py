@@ -10,7 +10,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
-from ..pipeline.simulations import newest_simulations
+from ..pipeline.shared.simulations import newest_simulations
 from ..pipeline.stages.traces import read_curves
 from ..study import PARAMETERS
 from .folder import StudyFolder

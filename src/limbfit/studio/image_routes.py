@@ -12,8 +12,8 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from ..anatomy.imaging import LabelMap, Volume
-from ..anatomy.labelfiles import colour_of
-from ..anatomy.surfaces import read_surface
+from ..anatomy.labels.labelfiles import colour_of
+from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
 from ..pipeline.stages.inputs import plain_image
 from ..study import Study

@@ -16,8 +16,8 @@ from ..acquire import Recording, follow_recording
 from ..acquire.events import PINS
 from ..acquire.phases import FINAL
 from ..errors import TraceError
-from ..pipeline.acquire import FOLDER as ACQUIRED
-from ..pipeline.acquire import RECORD, VERDICT
+from ..pipeline.verbs.acquire import FOLDER as ACQUIRED
+from ..pipeline.verbs.acquire import RECORD, VERDICT
 from .folder import StudyFolder, inside
 from .study_routes import Folder
 

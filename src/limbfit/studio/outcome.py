@@ -11,8 +11,8 @@ from typing import Any
 
 from ..errors import InputError, RunError
 from ..pipeline import export_study
+from ..pipeline.shared.store import write_json
 from ..pipeline.stages.traces import read_curves
-from ..pipeline.store import write_json
 from .folder import StudyFolder, stored
 from .study_routes import stages_of_folder
 

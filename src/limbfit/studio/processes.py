@@ -15,7 +15,7 @@ import psutil
 
 from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
-from ..pipeline.store import holder_of, is_held
+from ..pipeline.shared.store import holder_of, is_held
 from ..study import load_study
 from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.sites import project_to_skin
-from ..anatomy.surfaces import Anatomy, Surface, load_anatomy, read_surface
+from ..anatomy.sites.sites import project_to_skin
+from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
 from ..pipeline.stages.sites import place_site

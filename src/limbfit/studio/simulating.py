@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from ..pipeline.journal import discreet
+from ..pipeline.verbs.journal import discreet
 from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder
 from .processes import running

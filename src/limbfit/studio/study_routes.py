@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse
 
 from ..pipeline import study_status
-from ..pipeline.provenance import input_files
+from ..pipeline.shared.provenance import input_files
 from ..study import Study
 from .folder import StudyFolder, fingerprint
 from .processes import running

@@ -8,7 +8,7 @@ import numpy as np
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict
 
-from ..anatomy.surfaces import load_anatomy
+from ..anatomy.surfaces.surfaces import load_anatomy
 from ..errors import InputError
 from ..pipeline.stages.plausible import record_flags
 from ..pipeline.stages.traces import read_site_trace

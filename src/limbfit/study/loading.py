@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from ..anatomy.markups import read_markups
+from ..anatomy.sites.markups import read_markups
 from ..errors import StudyError
 from .vain import refuse_vain
 from .whole import Study

@@ -315,7 +315,7 @@ class CalibrationTable(Table):
     force_error_percent: Positive = 1.0
     starts: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
-    corrections: Annotated[int, Field(ge=1, le=10)] = 3
+    corrections: Annotated[int, Field(ge=1, le=10)] = 6
     correction_tolerance_percent: Positive = 0.1
 
     @model_validator(mode="after")

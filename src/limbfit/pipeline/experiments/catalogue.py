@@ -15,9 +15,9 @@ from typing import Any
 
 from ...errors import InputError
 from ...study import Study
-from ..context import Context
-from ..keys import Keys, Stage
-from ..store import Store, read_json
+from ..shared.context import Context
+from ..shared.keys import Keys, Stage
+from ..shared.store import Store, read_json
 from .crossvalidation import run_crossvalidate
 from .cube import COMPRESSION_PERCENT, run_cube
 from .design import run_design

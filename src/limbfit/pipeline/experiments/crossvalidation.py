@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import StudyError
-from ...identify.calibration import CalibrationSettings
-from ...identify.crossvalidation import (
+from ...identify.checks.crossvalidation import (
     Choice,
     Fold,
     choices_of,
@@ -27,17 +26,18 @@ from ...identify.crossvalidation import (
     standing,
     without_regions,
 )
-from ...identify.emulator import Emulator
-from ...identify.objective import SiteResponse
-from ...identify.parameters import Unknowns
-from ...identify.prediction import error_percent
-from ...identify.spread import spread_points
+from ...identify.checks.spread import spread_points
+from ...identify.fit.calibration import CalibrationSettings
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...identify.fit.prediction import error_percent
+from ...identify.uncertainty.emulator import Emulator
 from ...indentation import to_vector
-from ..context import Context
-from ..simulations import experiment_cache
+from ..shared.context import Context
+from ..shared.simulations import experiment_cache
+from ..shared.store import write_json
+from ..shared.tabular import write_table
 from ..stages.laboratory import Laboratory, unknowns
-from ..store import write_json
-from ..tabular import write_table
 
 Array = NDArray[np.float64]
 Runs = list[list[SiteResponse]]

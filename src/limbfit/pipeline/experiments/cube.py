@@ -21,8 +21,8 @@ from ...fe.laws import Laws
 from ...fe.observables import element_fields
 from ...indentation import KPA, materials
 from ...mesh import Mesh
-from ..context import Context
-from ..store import read_json, write_json
+from ..shared.context import Context
+from ..shared.store import read_json, write_json
 from .published import PUBLISHED
 
 Array = NDArray[np.float64]

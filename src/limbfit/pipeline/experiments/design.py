@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...anatomy.surfaces import load_anatomy
-from ...anatomy.under import tissue_under
+from ...anatomy.sites.under import tissue_under
+from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError, StudyError
-from ...identify.design import Candidate, Design, NoiseModel, candidate, choose, efficiency, evaluate
-from ...identify.design import prior_information as bounds_information
-from ...identify.objective import SiteResponse
+from ...identify.checks.design import Candidate, Design, NoiseModel, candidate, choose, efficiency, evaluate
+from ...identify.checks.design import prior_information as bounds_information
+from ...identify.fit.objective import SiteResponse
 from ...indentation import Parameters, SimulationJob, SiteModel, to_vector
 from ...study import Study
-from ..context import Context
-from ..simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
+from ..shared.context import Context
+from ..shared.simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
+from ..shared.store import write_json
+from ..shared.tabular import write_table
 from ..stages.laboratory import unknowns
-from ..store import write_json
-from ..tabular import write_table
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...identify.emulator import Emulator
-from ...identify.objective import SiteResponse
-from ..store import atomic
+from ...identify.fit.objective import SiteResponse
+from ...identify.uncertainty.emulator import Emulator
+from ..shared.store import atomic
 
 Array = NDArray[np.float64]
 EMULATOR = "emulator.npz"

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, StudyError
-from ...identify.calibration import Calibration
-from ...identify.objective import SiteResponse
-from ...identify.parameters import Unknowns
-from ...identify.regions import Region, RegionFit, fit_regions, mean_percent
+from ...identify.fit.calibration import Calibration
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...identify.fit.regions import Region, RegionFit, fit_regions, mean_percent
 from ...indentation import flat_names, to_parameters, to_vector
 from ...study import Site
-from ..context import Context
-from ..simulations import SimulationCache, experiment_cache
+from ..shared.context import Context
+from ..shared.simulations import SimulationCache, experiment_cache
+from ..shared.store import write_json
+from ..shared.tabular import write_table
 from ..stages.laboratory import Laboratory, groupings, unknowns
 from ..stages.traces import SiteRecord, as_response, site_record
-from ..store import write_json
-from ..tabular import write_table
 
 Array = NDArray[np.float64]
 CHOICES = ("all", "fitted")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from ...indentation import Parameters, flat_names, to_vector
 from ...study import IndenterTable
-from ..context import Context
-from ..simulations import experiment_cache
+from ..shared.context import Context
+from ..shared.simulations import experiment_cache
+from ..shared.store import write_json
+from ..shared.tabular import write_table
 from ..stages.traces import site_record
-from ..store import write_json
-from ..tabular import write_table
 from .variants import (
     ChosenSite,
     Variant,

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.correction import CoarseToFine
-from ...identify.discrepancy import ResidualModel
-from ...identify.evidence import Evidence, candidate, compare
-from ...identify.explore import Explored, ExploreSettings, explore
-from ...identify.likelihood import Likelihood
-from ...identify.objective import SiteResponse
-from ...identify.parameters import search_space, shared
-from ...identify.sources import Gain
+from ...identify.fit.correction import CoarseToFine
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import search_space, shared
+from ...identify.uncertainty.discrepancy import ResidualModel
+from ...identify.uncertainty.evidence import Evidence, candidate, compare
+from ...identify.uncertainty.explore import Explored, ExploreSettings, explore
+from ...identify.uncertainty.likelihood import Likelihood
+from ...identify.uncertainty.sources import Gain
 from ...indentation import Parameters, to_vector
-from ..context import Context
-from ..simulations import experiment_cache
+from ..shared.context import Context
+from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
 from ..stages.record_noise import site_noise
 from ..stages.traces import as_response, site_record

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ...identify.evidence import Evidence
-from ...identify.explore import Explored
-from ...identify.noise import SiteNoise
-from ...identify.objective import SiteResponse
-from ...identify.parameters import Unknowns
-from ...identify.posterior import principal_axes
-from ...identify.sources import Gain
-from ...identify.uncertainty import (
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...identify.uncertainty.evidence import Evidence
+from ...identify.uncertainty.explore import Explored
+from ...identify.uncertainty.noise import SiteNoise
+from ...identify.uncertainty.posterior import principal_axes
+from ...identify.uncertainty.sources import Gain
+from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
     UNDETERMINED,
@@ -26,9 +26,9 @@ from ...identify.uncertainty import (
     product_text,
     verdict_of,
 )
+from ..shared.store import write_json
+from ..shared.tabular import write_table
 from ..stages.traces import SiteRecord, write_curves
-from ..store import write_json
-from ..tabular import write_table
 from .emulator_file import EMULATOR, write_runs
 from .uncertainty_sources import Change
 

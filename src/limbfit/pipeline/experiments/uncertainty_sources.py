@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...anatomy.meshing import MeshSettings
-from ...anatomy.sites import indenter_axis, project_to_skin
-from ...anatomy.surfaces import load_anatomy
+from ...anatomy.meshing.meshing import MeshSettings
+from ...anatomy.sites.sites import indenter_axis, project_to_skin
+from ...anatomy.surfaces.surfaces import load_anatomy
 from ...fe import ORDER_IN_TIME
 from ...indentation import SimulationJob, SiteModel
 from ...study import SolverTable, Study, Vector
-from ..context import Context
-from ..extrapolation import MESH_ORDERS, error_of_coarser
-from ..simulations import SimulationCache
+from ..shared.context import Context
+from ..shared.extrapolation import MESH_ORDERS, error_of_coarser
+from ..shared.simulations import SimulationCache
 from ..stages.laboratory import error_of_own_mesh
 from ..stages.mesh import coarse_settings, mesh_settings
 from ..stages.remesh import meshed_models, scaled_edges

@@ -14,8 +14,8 @@ from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
 from ...mesh import read_vtu
 from ...study import Site
-from ..context import Context
-from ..simulations import CURVE_POINTS, SimulationCache, planned_model, recorded_model
+from ..shared.context import Context
+from ..shared.simulations import CURVE_POINTS, SimulationCache, planned_model, recorded_model
 from ..stages.traces import write_curves
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from ...fe.laws import Laws
 from ...fe.observables import element_fields
 from ...indentation import Simulation, SimulationJob, SiteModel, build_problem, steps_of, to_parameters
 from ...mesh import read_vtu
-from ..simulations import SimulationCache
+from ..shared.simulations import SimulationCache
 
 Array = NDArray[np.float64]
 NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from ...errors import StudyError
-from ...identify.calibration import Calibration
-from ...identify.fidelity import Round
-from ...identify.multistart import Multistart, describe, multistart
-from ...identify.parameters import Unknowns
-from ...identify.uncertainty import Uncertainty
+from ...identify.fit.calibration import Calibration
+from ...identify.fit.fidelity import Round
+from ...identify.fit.multistart import Multistart, describe, multistart
+from ...identify.fit.parameters import Unknowns
+from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters, flat_names, to_parameters
-from ..context import Context
-from ..simulations import SimulationCache
-from ..store import write_json
+from ..shared.context import Context
+from ..shared.simulations import SimulationCache
+from ..shared.store import write_json
 from .doubted import contact_record, doubts_record
 from .laboratory import Array, Laboratory, groupings, stage_titles, unknowns
 from .plausible import stored_flags

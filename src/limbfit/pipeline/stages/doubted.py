@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...fe import Doubt
-from ...identify.calibration import Calibration
-from ...identify.objective import SiteResponse
+from ...identify.fit.calibration import Calibration
+from ...identify.fit.objective import SiteResponse
 from ...indentation import Simulation
 
 

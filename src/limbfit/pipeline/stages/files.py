@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from ...study import Study
-from ..corrections import hand_labels
+from ..shared.corrections import hand_labels
 
 THICKNESS = "fat-depth.vtp"
 MARKED_SKIN = "skin-markers.stl"

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ...anatomy.contours import read_contours
 from ...anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
-from ...anatomy.one_limb import check_one_limb
-from ...anatomy.placement import on_grid_of
-from ...anatomy.segmentation import segment
+from ...anatomy.labels.contours import read_contours
+from ...anatomy.labels.placement import on_grid_of
+from ...anatomy.segmentation.one_limb import check_one_limb
+from ...anatomy.segmentation.segmentation import segment
 from ...study import Study
-from ..corrections import hand_labels
+from ..shared.corrections import hand_labels
 from .files import naming
 
 

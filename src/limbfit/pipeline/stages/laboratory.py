@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RunError
-from ...identify.calibration import Calibration, CalibrationSettings, State, calibrate
-from ...identify.correction import CoarseToFine
-from ...identify.fidelity import FidelitySettings, Round, calibrate_corrected
-from ...identify.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
-from ...identify.objective import Measured, SiteResponse
-from ...identify.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
-from ...identify.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
+from ...identify.fit.calibration import Calibration, CalibrationSettings, State, calibrate
+from ...identify.fit.correction import CoarseToFine
+from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
+from ...identify.fit.objective import Measured, SiteResponse
+from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
+from ...identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
+from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
 from ...study import Site, Study
 from ...study.meshing import MeshTable
-from ..context import Context
-from ..extrapolation import MESH_ORDERS, error_of_finer
-from ..simulations import SimulationCache
+from ..shared.context import Context
+from ..shared.extrapolation import MESH_ORDERS, error_of_finer
+from ..shared.simulations import SimulationCache
 from .doubted import Doubted
 from .mesh import mesh_settings
 from .record_noise import site_noise

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ...anatomy.imaging import LabelMap, Volume
-from ...anatomy.marked import marked_skin, without_markers
-from ...anatomy.registration import limb_motion
-from ...anatomy.surfaces import write_surface
+from ...anatomy.sites.marked import marked_skin, without_markers
+from ...anatomy.sites.registration import limb_motion
+from ...anatomy.surfaces.surfaces import write_surface
 from ...study import Study
 from .files import MARKED_SKIN, naming
 from .inputs import marked_image

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.layers import LayerSpec
-from ...anatomy.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from ...anatomy.surfaces import Anatomy, load_anatomy
-from ...anatomy.thickness import read_thickness
+from ...anatomy.meshing.layers import LayerSpec
+from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...anatomy.surfaces.thickness import read_thickness
 from ...mesh import write_vtu
 from ...study import Study
-from ..context import Context
-from ..store import COARSE, read_json, write_json
+from ..shared.context import Context
+from ..shared.store import COARSE, read_json, write_json
 from .files import THICKNESS
 
 

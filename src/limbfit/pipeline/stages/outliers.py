@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.correction import CoarseToFine
-from ...identify.objective import Measured, SiteResponse
-from ...identify.outliers import Exchange, FirstOrder, as_driven, find_outliers
-from ...identify.plausibility import explained
+from ...identify.checks.outliers import Exchange, FirstOrder, as_driven, find_outliers
+from ...identify.checks.plausibility import explained
+from ...identify.fit.correction import CoarseToFine
+from ...identify.fit.objective import Measured, SiteResponse
 from ...indentation import SimulationJob
-from ..context import Context
-from ..simulations import SimulationCache
+from ..shared.context import Context
+from ..shared.simulations import SimulationCache
 from .plausible import stored_flags
 from .traces import SiteRecord, as_response
 

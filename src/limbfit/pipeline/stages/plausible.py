@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites import indenter_axis
-from ...anatomy.surfaces import Anatomy, load_anatomy
-from ...anatomy.under import tissue_under
-from ...identify.plausibility import Flag, RecordFacts, implausible
+from ...anatomy.sites.sites import indenter_axis
+from ...anatomy.sites.under import tissue_under
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...identify.checks.plausibility import Flag, RecordFacts, implausible
 from ...indentation import read_indenter
 from ...study import Site, Study
-from ..context import Context
+from ..shared.context import Context
 from .traces import read_curves
 
 Placed = Mapping[str, Mapping[str, Any]]

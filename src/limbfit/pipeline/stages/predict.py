@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.correction import CoarseToFine
-from ...identify.objective import SiteResponse
-from ...identify.prediction import Known, error_percent, summarise
+from ...identify.fit.correction import CoarseToFine
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.prediction import Known, error_percent, summarise
 from ...indentation import (
     Parameters,
     Simulation,
@@ -23,9 +23,9 @@ from ...indentation import (
     to_parameters,
     to_vector,
 )
-from ..context import Context
-from ..simulations import SimulationCache
-from ..store import write_json
+from ..shared.context import Context
+from ..shared.simulations import SimulationCache
+from ..shared.store import write_json
 from .outliers import outlier_record
 from .traces import SiteRecord, as_response, site_record, write_curves
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.noise import SiteNoise, record_noise
+from ...identify.uncertainty.noise import SiteNoise, record_noise
 from ...study import Study
 from .traces import SiteRecord, read_site_trace
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ...anatomy.meshing import MeshSettings
+from ...anatomy.meshing.meshing import MeshSettings
 from ...indentation import SiteModel
-from ..context import Context
-from ..store import file_digest
+from ..shared.context import Context
+from ..shared.store import file_digest
 from .mesh import is_meshed, make_mesh, mesh_job
 
 

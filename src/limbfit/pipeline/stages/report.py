@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import report
-from ..context import Context
+from ..shared.context import Context
 
 
 def run_report(context: Context, folder: Path) -> dict[str, Any]:

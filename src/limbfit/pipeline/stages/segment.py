@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.contours import write_contours
 from ...anatomy.imaging import LabelMap, write_labels
-from ...anatomy.quality import assess
-from ...anatomy.sheet import draw_sheet
-from ..context import Context
-from ..corrections import DIGEST, LABELS
-from ..store import file_digest, write_json
+from ...anatomy.labels.contours import write_contours
+from ...anatomy.labels.quality import assess
+from ...report.drawing.sheet import draw_sheet
+from ..shared.context import Context
+from ..shared.corrections import DIGEST, LABELS
+from ..shared.store import file_digest, write_json
 from .inputs import automatic_labels, study_image, study_labels
 from .marked_images import second_skin, without_own_markers
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.markers import find_markers, match_markers
-from ...anatomy.sites import indenter_axis, project_to_skin
-from ...anatomy.surfaces import Anatomy, load_anatomy, read_surface
+from ...anatomy.sites.markers import find_markers, match_markers
+from ...anatomy.sites.sites import indenter_axis, project_to_skin
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ...errors import SiteError
 from ...study import Site, Study
-from ..context import Context
-from ..store import write_json
+from ..shared.context import Context
+from ..shared.store import write_json
 from .files import MARKED_SKIN
 
 

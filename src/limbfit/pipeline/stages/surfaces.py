@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.amputation import amputate
 from ...anatomy.imaging import LabelMap, read_labels
-from ...anatomy.mending import closed_anatomy
-from ...anatomy.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
-from ...anatomy.thickness import fat_depth, write_thickness
-from ...anatomy.voxels import amputated
+from ...anatomy.segmentation.amputation import amputate
+from ...anatomy.segmentation.voxels import amputated
+from ...anatomy.surfaces.mending import closed_anatomy
+from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
+from ...anatomy.surfaces.thickness import fat_depth, write_thickness
 from ...study import Study
-from ..context import Context
+from ..shared.context import Context
 from .files import THICKNESS, labelled_file, naming
 
 

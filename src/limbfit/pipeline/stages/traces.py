@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TraceError
-from ...identify.objective import Measured, SiteResponse
+from ...identify.fit.objective import Measured, SiteResponse
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...phases import Phase, in_words
 from ...study import Site, Study
 from ...traces import Regularised, TouchDown, Trace, read_trace, regularise, understand
-from ..context import Context
-from ..simulations import CURVE_POINTS, recorded_model
-from ..store import write_json
+from ..shared.context import Context
+from ..shared.simulations import CURVE_POINTS, recorded_model
+from ..shared.store import write_json
 
 Array = NDArray[np.float64]
 SMOOTHING = "{}-smoothing.npy"  # of a site's record, as a matrix

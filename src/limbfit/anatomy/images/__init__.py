@@ -1,0 +1,1 @@
+"""Images from DICOM series and NIfTI files: voxels, geometry, units."""

@@ -1,0 +1,1 @@
+"""Label maps: read, checked, named, placed on the grid of an image, judged."""

@@ -1,0 +1,176 @@
+"""Contours: closed polygons on the slices of an image, as masks, as label maps and as one CSV file.
+
+A voxel belongs to a structure where its centre lies inside an odd number of the structure's contours of that
+slice, so a contour inside another is a hole, as is the inner part of a keyhole contour (DICOM PS3.3,
+C.8.8.6).
+
+The file has one row for each point, with the header ``label,slice,contour,x_mm,y_mm,z_mm``: the name of the
+structure; the slice of the image, counted from 0; the number of the contour on that slice; the point in LPS
+mm. The last point of a contour is joined to its first. The points decide; the slice is for readers.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from contourpy import contour_generator
+from numpy.typing import NDArray
+
+from ...errors import LabelError
+from ..grid import SOFT_TISSUE, Grid, LabelMap, Volume
+from .naming import flatten, plain_name
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+COLUMNS = ("label", "slice", "contour", "x_mm", "y_mm", "z_mm")
+_OFF_SLICE = 0.1  # slices: farther off, a contour was not drawn on this image
+
+
+def rasterise(polygons: Sequence[Array], like: Grid) -> Mask:
+    """``[k, j, i]`` voxels whose centre lies inside, by even-odd; ``polygons`` (n, 3) each, LPS mm.
+
+    Raises
+    ------
+    LabelError
+        For polygons that do not lie on the grid's slices, lie outside it, or leave slices out.
+    """
+    slices: dict[int, list[Array]] = defaultdict(list)
+    for polygon in polygons:
+        index = like.point_to_index(polygon)
+        k = round(float(index[:, 2].mean()))
+        if np.abs(index[:, 2] - k).max() > _OFF_SLICE:
+            raise LabelError(
+                "contours that do not lie on the slices of the image",
+                remedy="give the image on which they were drawn",
+            )
+        slices[k].append(index[:, :2])
+    if not slices:
+        raise LabelError("no contours", remedy="draw at least one closed contour")
+    if min(slices) < 0 or max(slices) >= like.size[2]:
+        raise LabelError("contours outside the image", remedy="give the image on which they were drawn")
+    absent = max(slices) - min(slices) + 1 - len(slices)
+    if absent:
+        raise LabelError(
+            f"{absent} slices without a contour between others",
+            remedy="interpolate the contours in the program that drew them",
+        )
+    mask = np.zeros(like.array.shape, dtype=bool)
+    for k, found in slices.items():
+        mask[k] = even_odd(found, like.size[0], like.size[1])
+    return mask
+
+
+def even_odd(polygons: Sequence[Array], columns: int, rows: int) -> Mask:
+    """(rows, columns) pixels whose centre (i, j) lies inside an odd number of polygons (n, 2).
+
+    Each edge that passes a row's centre line toggles all pixels to its right; an edge takes its lower end and
+    not its upper one, so that a corner on the line counts once.
+    """
+    toggles = np.zeros((rows, columns + 1), dtype=np.int64)
+    for polygon in polygons:
+        for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0)):
+            low, high = min(y0, y1), max(y0, y1)
+            j = np.arange(max(int(np.ceil(low)), 0), min(int(np.ceil(high)), rows))
+            if len(j) == 0:
+                continue
+            crossing = x0 + (j - y0) * (x1 - x0) / (y1 - y0)
+            np.add.at(toggles, (j, np.clip(np.ceil(crossing), 0, columns).astype(np.int64)), 1)
+    return np.cumsum(toggles[:, :columns], axis=1) % 2 == 1
+
+
+def outlines(mask: Mask) -> list[Array]:
+    """Closed polygons (n, 2) of a slice's mask ``[j, i]`` as (i, j), half-way between pixel centres."""
+    if not mask.any():
+        return []
+    padded = np.pad(mask, 1).astype(float)
+    lines = contour_generator(z=padded).lines(0.5)
+    return [np.asarray(line)[:-1] - 1.0 for line in lines]
+
+
+def write_contours(path: str | Path, labels: LabelMap) -> None:
+    """Contours of a label map: of the whole limb, named ``soft tissue``, and of each other label.
+
+    Read again on the same grid they give the same label map: where structures overlap, the smaller wins.
+    """
+    masks = {SOFT_TISSUE: labels.limb}
+    masks |= {name: labels.mask(name) for name in labels.names.values() if name != SOFT_TISSUE}
+    with Path(path).open("w", encoding="utf-8", newline="") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(COLUMNS)
+        for name, mask in masks.items():
+            for k in np.flatnonzero(mask.any(axis=(1, 2))):
+                for n, line in enumerate(outlines(mask[k])):
+                    index = np.column_stack([line, np.full(len(line), k)])
+                    points = labels.index_to_point(index)
+                    rows.writerows([name, k, n, *(f"{x:.4f}" for x in point)] for point in points)
+
+
+def read_contours(path: str | Path, like: Volume) -> LabelMap:
+    """The label map of a contour file on the grid of the image on which the contours were drawn.
+
+    Raises
+    ------
+    LabelError
+        With the file and the line or the structure.
+    """
+    path = Path(path)
+    found: dict[str, dict[tuple[int, int], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
+    for line, row in _rows(path):
+        try:
+            name, key = plain_name(row["label"]), (int(row["slice"]), int(row["contour"]))
+            point = [float(row[axis]) for axis in COLUMNS[3:]]
+        except (TypeError, ValueError):
+            point = []
+        if not point or not np.all(np.isfinite(point)):
+            raise LabelError("not a point of a contour", file=path, place=f"line {line}", remedy=_FORMAT)
+        found[name][key].append(point)
+    for name, contours in found.items():
+        short = [key for key, points in contours.items() if len(points) < 3]
+        if short:
+            raise LabelError(
+                "a contour of fewer than 3 points", file=path, place=f"{name}, slice {short[0][0]}"
+            )
+    polygons = {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
+    return labels_of(polygons, like, path)
+
+
+def labels_of(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -> LabelMap:
+    """Contours, LPS mm, of each structure as a label map on the grid of ``like``; ``path`` is for the error.
+
+    Raises
+    ------
+    LabelError
+        With the file, and the structure that cannot be rasterised.
+    """
+    masks = []
+    for name, polygons in contours.items():
+        try:
+            masks.append(rasterise(polygons, like))
+        except LabelError as error:
+            raise LabelError(error.what, file=path, place=name, remedy=error.remedy) from None
+    try:
+        array, names = flatten(masks, list(contours))
+    except LabelError as error:
+        raise LabelError(error.what, file=path, remedy=error.remedy) from None
+    return LabelMap(array, like.spacing, like.origin, like.direction, names)
+
+
+_FORMAT = "give the columns " + ",".join(COLUMNS)
+
+
+def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of the file with the number of their line."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            rows = csv.DictReader(stream)
+            if rows.fieldnames is None or any(name not in rows.fieldnames for name in COLUMNS):
+                raise LabelError("not a file of contours", file=path, remedy=_FORMAT)
+            for row in rows:
+                yield rows.line_num, row
+    except (OSError, UnicodeDecodeError, csv.Error):
+        raise LabelError("the contours cannot be read", file=path, remedy=_FORMAT) from None

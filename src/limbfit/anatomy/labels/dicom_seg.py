@@ -1,0 +1,138 @@
+"""DICOM Segmentation objects: a frame for each slice and segment, as binary masks or as a label map.
+
+Frames may cover any part of the slices, in any order (DICOM PS3.3, A.51). They are put on a grid of their
+own, and from there on that of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pydicom
+from numpy.typing import NDArray
+from pydicom.dataset import Dataset, FileDataset
+
+from ...errors import LabelError
+from ..grid import Grid, LabelMap
+from ..images.dicom_headers import functional_group, quiet
+from .naming import flatten, plain_name
+
+Array = NDArray[np.float64]
+
+SEGMENTATION = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
+_ON_SLICE = 0.01  # of the slice spacing
+_TILT_MM = 0.01
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """``pixels`` (n, rows, columns); ``segments`` (n,) their numbers, 0 where the pixels are numbers."""
+
+    pixels: NDArray[np.uint16]
+    segments: NDArray[np.int64]
+    positions: Array
+    orientation: Array
+    pixel_spacing: Array
+    slice_spacings: tuple[float, ...]
+    names: dict[int, str]
+
+
+def read_dicom_seg(path: Path) -> LabelMap:
+    """The segments of a DICOM-SEG file by their labels, on the grid of its own frames.
+
+    Raises
+    ------
+    LabelError
+        For a fractional segmentation, frames without a place or out of a stack, or a damaged file.
+    """
+    try:
+        with quiet():
+            frames = _frames(pydicom.dcmread(path))
+        grid, index = _stack(frames)
+        masks = [_mask(frames, grid, index, number) for number in frames.names]
+        array, names = flatten(masks, list(frames.names.values()))
+    except LabelError as error:
+        raise LabelError(error.what, file=path, remedy=error.remedy) from None
+    except Exception:  # pydicom's texts quote values of tags
+        raise LabelError(
+            "the DICOM segmentation is damaged or cannot be decoded", file=path, remedy="export it again"
+        ) from None
+    return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
+
+
+def _frames(data: FileDataset) -> _Frames:
+    kind = str(data.get("SegmentationType", ""))
+    if kind not in ("BINARY", "LABELMAP"):
+        raise LabelError("a fractional segmentation", remedy="export a binary one")
+    groups = [
+        (group, data.SharedFunctionalGroupsSequence[0]) for group in data.PerFrameFunctionalGroupsSequence
+    ]
+    axes = np.array([_orientation(group) for group in groups])
+    if np.abs(axes - axes[0]).max() > 1e-4:
+        raise LabelError("frames of several orientations", remedy="export one for each orientation")
+    measures = functional_group(groups[0], "PixelMeasuresSequence")
+    stated = (measures.get("SpacingBetweenSlices"), measures.get("SliceThickness"))
+    return _Frames(
+        data.pixel_array.reshape(len(groups), data.Rows, data.Columns),
+        np.array([_segment(group) if kind == "BINARY" else 0 for group in groups]),
+        np.array([_position(group) for group in groups]),
+        axes[0],
+        np.array(measures.PixelSpacing, dtype=float),
+        tuple(float(s) for s in stated if s),
+        {int(segment.SegmentNumber): plain_name(segment.SegmentLabel) for segment in data.SegmentSequence},
+    )
+
+
+def _orientation(groups: tuple[Dataset, Dataset]) -> list[float]:
+    return [float(x) for x in functional_group(groups, "PlaneOrientationSequence").ImageOrientationPatient]
+
+
+def _position(groups: tuple[Dataset, Dataset]) -> list[float]:
+    return [float(x) for x in functional_group(groups, "PlanePositionSequence").ImagePositionPatient]
+
+
+def _segment(groups: tuple[Dataset, Dataset]) -> int:
+    return int(functional_group(groups, "SegmentIdentificationSequence").ReferencedSegmentNumber)
+
+
+def _stack(frames: _Frames) -> tuple[Grid, NDArray[np.int64]]:
+    """The smallest grid that holds all frames, and the slice (n,) of each."""
+    rows, columns = frames.orientation[:3], frames.orientation[3:]
+    normal = np.cross(rows, columns)
+    heights = frames.positions @ normal
+    first = frames.positions[np.argmin(heights)]
+    sideways = frames.positions - first - np.outer(heights - heights.min(), normal)
+    spacing = _slice_spacing(heights, frames.slice_spacings)
+    if np.abs(sideways).max() > _TILT_MM or spacing is None:
+        raise LabelError("frames that are no stack of slices", remedy="export it with the image as reference")
+    index = np.rint((heights - heights.min()) / spacing).astype(np.int64)
+    grid = Grid(
+        np.zeros((index.max() + 1, *frames.pixels.shape[1:]), np.uint8),
+        [frames.pixel_spacing[1], frames.pixel_spacing[0], spacing],  # type: ignore[arg-type]
+        first,
+        np.column_stack([rows, columns, normal]),
+    )
+    return grid, index
+
+
+def _slice_spacing(heights: Array, stated: tuple[float, ...]) -> float | None:
+    """A step of which all distances between frames are multiples: the header's, or the smallest gap."""
+    above = heights - heights.min()
+    gaps = np.diff(np.unique(above))
+    for step in (*stated, *gaps[gaps > 1e-3 * max(stated, default=1.0)][:1]):
+        off = np.abs(above / step - np.rint(above / step)).max()
+        if step > 0 and off <= _ON_SLICE:
+            return float(step)
+    return None
+
+
+def _mask(frames: _Frames, grid: Grid, index: NDArray[np.int64], number: int) -> NDArray[np.bool_]:
+    mask = np.zeros(grid.array.shape, dtype=bool)
+    for pixels, segment, k in zip(frames.pixels, frames.segments, index):
+        if segment == 0:
+            mask[k] |= pixels == number
+        elif segment == number:
+            mask[k] |= pixels > 0
+    return mask

@@ -1,0 +1,141 @@
+"""What is odd about a label map: volumes, pieces, holes, and slices that do not fit their neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import label as connected
+
+from ..ends import longest_axis
+from ..grid import SOFT_TISSUE, LabelMap
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LIMB = "limb"
+_OUTLIER = 6.0  # robust standard deviations (1.4826 times the median absolute deviation)
+_AREA, _JUMP = 0.08, 0.25  # smaller parts of a slice's area are never odd
+_CENTRE_MM = 1.5  # smaller distances of a slice's centroid are never odd
+_END_MM = 12.0  # a bone's end is round: its first and last slices may change quickly
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A slice (counted from 0 along ``axis``) in which a label looks wrong, and why."""
+
+    label: str
+    slice: int
+    what: str
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Measures of each label, and slices to look at; ``axis`` 0, 1, 2 (i, j, k) is the limb's."""
+
+    axis: int
+    labels: dict[str, dict[str, Any]]
+    suspects: tuple[Suspect, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "axis": "ijk"[self.axis],
+            "labels": self.labels,
+            "suspects": [asdict(suspect) for suspect in self.suspects],
+        }
+
+
+def assess(labels: LabelMap) -> Quality:
+    """Measure every label and the limb as a whole, and name the slices that do not fit their neighbours."""
+    axis = longest_axis(labels.limb, labels)
+    order = [*(n for n in range(3) if n != axis), axis]
+    turned = labels.turned(order)
+    masks = {LIMB: turned.limb} | {
+        name: turned.mask(name) for _, name in sorted(labels.names.items()) if turned.mask(name).any()
+    }
+    suspects: list[Suspect] = []
+    for name, mask in masks.items():
+        if name != SOFT_TISSUE:
+            suspects += _odd_slices(name, mask, turned.spacing)
+    facts = {name: _facts(mask, turned) for name, mask in masks.items()}
+    return Quality(axis, facts, tuple(sorted(suspects, key=lambda s: (s.slice, s.label))))
+
+
+def _facts(mask: Mask, labels: LabelMap) -> dict[str, Any]:
+    """Volume, pieces that share faces, closed holes, and the slices from first to last."""
+    parts, count = connected(mask)
+    sizes = np.bincount(parts.ravel())[1:]
+    holes = binary_fill_holes(mask) & ~mask
+    filled = np.flatnonzero(mask.any(axis=(1, 2)))
+    return {
+        "volume_cm3": round(float(mask.sum()) * labels.voxel_mm3 / 1000, 3),
+        "pieces": int(count),
+        "largest_piece": round(float(sizes.max() / sizes.sum()), 5),
+        "holes": int(connected(holes)[1]),
+        "holes_cm3": round(float(holes.sum()) * labels.voxel_mm3 / 1000, 4),
+        "slices": [int(filled[0]), int(filled[-1])],
+        "slices_without": int(filled[-1] - filled[0] + 1 - len(filled)),
+    }
+
+
+def _odd_slices(name: str, mask: Mask, spacing: Array) -> list[Suspect]:
+    areas = mask.sum(axis=(1, 2)) * float(spacing[0] * spacing[1])
+    filled = np.flatnonzero(areas)
+    first, last = int(filled[0]), int(filled[-1])
+    empty = [Suspect(name, k, "missing between others") for k in range(first, last) if areas[k] == 0]
+    if empty or last - first < 6:
+        return empty
+    area, centre = areas[first : last + 1], _centroids(mask[first : last + 1], spacing)
+    reach = max(1, round(_END_MM / spacing[2]))
+    low = reach if first > 0 else 1
+    high = len(area) - (reach if last < len(areas) - 1 else 1)
+    inner = np.zeros(len(area), dtype=bool)
+    inner[low:high] = True
+    found = _outliers(name, area, centre, inner)
+    known = {s.slice + step for s in found for step in (-1, 0, 1)}
+    found += [jump for jump in _jumps(name, area, inner) if jump.slice not in known]
+    return [Suspect(s.label, s.slice + first, s.what) for s in found]
+
+
+def _centroids(mask: Mask, spacing: Array) -> Array:
+    """Centroid (n, 2) of each slice, mm."""
+    count = mask.sum(axis=(1, 2))
+    j, i = np.arange(mask.shape[1]), np.arange(mask.shape[2])
+    x = (mask.sum(axis=1) @ i) / count * spacing[0]
+    y = (mask.sum(axis=2) @ j) / count * spacing[1]
+    return np.column_stack([x, y])
+
+
+def _outliers(name: str, area: Array, centre: Array, inner: NDArray[np.bool_]) -> list[Suspect]:
+    """Slices off the mean of the slice before and the slice after."""
+    expected = (area[:-2] + area[2:]) / 2
+    off = np.pad((area[1:-1] - expected) / expected, 1)
+    aside = np.pad(np.linalg.norm(centre[1:-1] - (centre[:-2] + centre[2:]) / 2, axis=1), 1)
+    found = []
+    for k in _peaks(np.abs(off), np.maximum(_AREA, _OUTLIER * _spread(off[inner])), inner):
+        found.append(Suspect(name, k, f"area {off[k]:+.0%} of what its neighbours have"))
+    for k in _peaks(aside, max(_CENTRE_MM, _OUTLIER * _spread(aside[inner])), inner):
+        found.append(Suspect(name, k, f"{aside[k]:.1f} mm beside its neighbours"))
+    return found
+
+
+def _jumps(name: str, area: Array, inner: NDArray[np.bool_]) -> list[Suspect]:
+    """Slices at which the area changes for good."""
+    change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
+    limit = max(_JUMP, _OUTLIER * _spread(change[inner]))
+    return [Suspect(name, k, f"area jumps by {change[k]:+.0%}") for k in _peaks(np.abs(change), limit, inner)]
+
+
+def _spread(values: Array) -> float:
+    """Standard deviation of the bulk of the values."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+
+
+def _peaks(values: Array, limit: float, inner: NDArray[np.bool_]) -> list[int]:
+    """Where values pass the limit and are the largest of their neighbours'."""
+    padded = np.pad(values, 1)
+    highest = (values >= padded[:-2]) & (values >= padded[2:])
+    return [int(k) for k in np.flatnonzero(inner & highest & (values > limit))]

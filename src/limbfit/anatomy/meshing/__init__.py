@@ -1,0 +1,1 @@
+"""Surfaces to one graded mesh for each site."""

@@ -1,0 +1,114 @@
+"""Tetrahedral meshers behind one interface; each runs in a process of its own under a time limit.
+
+An engine is a function ``(VolumeTask, time_limit_s) -> VolumeMesh`` that raises ``MeshingError``, registered
+in ``ENGINES``.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import MeshingError
+
+MMG_WORKER = Path(__file__).with_name("_mmg_worker.py")
+NETGEN_WORKER = Path(__file__).with_name("_netgen_worker.py")
+
+
+@dataclass(frozen=True)
+class VolumeTask:
+    """A tetrahedral mesh to be adapted to a size.
+
+    Attributes
+    ----------
+    points, tets : (n, 3) mm and (m, 4).
+    triangles, triangle_refs : boundary triangles (k, 3), outward, and the surface (k,) that each lies on.
+    size : (n,) wanted edge length at the points, mm.
+    hausdorff_mm : how far the new surface may stray from the old one.
+    """
+
+    points: NDArray[np.float64]
+    tets: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    triangle_refs: NDArray[np.int64]
+    size: NDArray[np.float64]
+    hausdorff_mm: float
+
+
+@dataclass(frozen=True)
+class VolumeMesh:
+    """What an engine returns: points (n, 3), tets (m, 4), triangles (k, 3) and their surfaces (k,)."""
+
+    points: NDArray[np.float64]
+    tets: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    triangle_refs: NDArray[np.int64]
+
+
+def mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+    """Adapt with MMG (Dapogny, Dobrzynski, Frey 2014, J Comput Phys 262, 358-378).
+
+    Raises
+    ------
+    MeshingError
+        When MMG crashes, gives nothing or exceeds the time limit.
+    """
+    return _in_worker(MMG_WORKER, "MMG", task, time_limit_s)
+
+
+def netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+    """Remesh the surface with MMG and fill it with Netgen (Schoeberl 1997, Comput Visual Sci 1, 41-52).
+
+    Raises
+    ------
+    MeshingError
+        When Netgen is not installed, crashes, gives nothing or exceeds the time limit.
+    """
+    if find_spec("netgen") is None:
+        raise MeshingError(
+            "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "
+            'or choose mesh.engine = "mmg"'
+        )
+    return _in_worker(NETGEN_WORKER, "Netgen", task, time_limit_s)
+
+
+def _in_worker(worker: Path, name: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+    with tempfile.TemporaryDirectory(prefix="limbfit-mesh-") as folder:
+        source, target = Path(folder, "task.npz"), Path(folder, "mesh.npz")
+        np.savez(source, **{name: getattr(task, name) for name in task.__dataclass_fields__})
+        run_worker([sys.executable, str(worker), str(source), str(target)], time_limit_s)
+        if not target.is_file():
+            raise MeshingError(f"the mesher {name} gave no mesh; choose larger edges or thicker layers")
+        with np.load(target) as stored:
+            return VolumeMesh(**{name: stored[name] for name in VolumeMesh.__dataclass_fields__})
+
+
+def run_worker(command: list[str], time_limit_s: float) -> None:
+    """Run a mesher's process; its output is kept for the error message only."""
+    threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(
+            command, timeout=time_limit_s, capture_output=True, check=False, env={**os.environ, **threads}
+        )
+    except subprocess.TimeoutExpired:
+        raise MeshingError(
+            f"the mesher did not end in {time_limit_s:g} s; raise mesh.time_limit_s or choose larger edges"
+        ) from None
+    if done.returncode:
+        last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no message"])[-1]
+        raise MeshingError(
+            f"the mesher stopped with code {done.returncode} ({last}); "
+            "check the surfaces for self-intersections or choose other edge lengths"
+        )
+
+
+ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {"mmg": mmg, "netgen": netgen}

@@ -1,0 +1,125 @@
+"""The layers of skin and adipose tissue extruded from the core, sets of the whole mesh, curved surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...mesh import Mesh, boundary_faces
+from .background import BONE, LAYER
+from .columns import Columns, columns, even_steps
+from .engines import VolumeMesh
+from .layers import Level, LimbFields
+from .projection import projected
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+RIM_LAYERS = 3.0  # depth below the cut plane, in thicknesses, over which the extrusion turns sideways
+MOST_STEPS = 8  # elements across one layer
+
+
+def core_mesh(points: Array, tets: Ints) -> Mesh:
+    """The tetrahedra under the layers as a mesh of one region."""
+    return Mesh(points, tets, "tet4", np.zeros(len(tets), np.int64), ("core",))
+
+
+def same_faces(faces: Ints, chosen: Ints, count: int) -> NDArray[np.bool_]:
+    """Which faces (m, 3) are among the chosen (k, 3), in any order of nodes; ``count`` nodes in all."""
+    packed = [np.sort(part, axis=1) @ [count * count, count, 1] for part in (faces, chosen)]
+    return np.isin(packed[0], packed[1])
+
+
+def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) -> tuple[Mesh, Columns]:
+    """The tet4 mesh of core and extruded layers with its sets, and the columns of the layers' nodes.
+
+    ``regions`` names the layers, outermost first, and the core.
+    """
+    count = len(core.points)
+    faces = boundary_faces(core_mesh(core.points, core.tets))
+    interface = faces[same_faces(faces, core.triangles[core.triangle_refs == LAYER], count)]
+    base = np.unique(interface)
+    low = core.points[base]
+    # Near the cut plane nodes go out sideways, or those below it could overtake those on it.
+    high = projected(fields.depth, low, np.minimum(-low[:, 2] / (RIM_LAYERS * fields.floor(low)), 1.0))
+    depths = fields.layer_depths(high)
+    across = _steps(np.searchsorted(base, interface), low, depths)
+    stack = columns(base, across, count)
+    shares = (depths[-1] - np.vstack([depths[::-1], np.zeros(len(base))])) / depths[-1]
+    tets, layer = stack.tets(interface)
+    outermost = len(regions) - 2
+    mesh = Mesh(
+        points=np.vstack([core.points, stack.placed(low, high, shares)]),
+        cells=np.vstack([tets, core.tets]),
+        cell_type="tet4",
+        regions=np.concatenate([outermost - layer, np.full(len(core.tets), outermost + 1)]),
+        region_names=regions,
+    )
+    return _with_sets(mesh, core, stack), stack
+
+
+def _steps(interface: Ints, low: Array, depths: Array) -> Ints:
+    """Elements (layers, b) across each layer in each column, innermost layer first."""
+    ends = np.sort(np.vstack([interface[:, [0, 1]], interface[:, [1, 2]], interface[:, [2, 0]]]), axis=1)
+    edges = np.unique(ends, axis=0)
+    length = np.linalg.norm(low[edges[:, 0]] - low[edges[:, 1]], axis=1)
+    degree = np.bincount(edges.ravel(), minlength=len(low))
+    mean = np.bincount(edges.ravel(), np.repeat(length, 2), minlength=len(low)) / degree
+    thickness = np.diff(np.vstack([np.zeros(len(low)), depths]), axis=0)[::-1]
+    return np.array([even_steps(part, mean, edges, MOST_STEPS) for part in thickness])
+
+
+def _with_sets(mesh: Mesh, core: VolumeMesh, stack: Columns) -> Mesh:
+    """Node and face sets by the surface that each boundary face lies on."""
+    faces = boundary_faces(mesh)
+    on_plane = (mesh.points[faces, 2] == 0.0).all(axis=1)
+    outermost = (faces >= stack.top[0]) & (faces <= stack.top[-1])
+    on_skin = outermost.all(axis=1) & ~on_plane
+    on_bone = same_faces(faces, core.triangles[core.triangle_refs == BONE], len(mesh.points)) & ~on_plane
+    rest = ~(on_plane | on_skin | on_bone)
+    sets = {"fixed_bone": on_bone, "fixed_proximal": on_plane}
+    if rest.any():
+        sets["fixed_truncation"] = rest
+    node_sets = {name: np.unique(faces[chosen]) for name, chosen in sets.items()}
+    return replace(mesh, node_sets=node_sets, face_sets={"skin": faces[on_skin]})
+
+
+def curved_target(mesh: Mesh, fields: LimbFields) -> Array:
+    """Where the mid-edge nodes of skin, the layers' inner face and bone would lie on the smooth surfaces."""
+    target = mesh.points.copy()
+    free = np.where(mesh.points[:, 2] == 0.0, 0.0, 1.0)
+    for nodes, level in _smooth_mid_nodes(mesh, fields):
+        target[nodes] = projected(level, target[nodes], free[nodes])
+    return target
+
+
+def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callable[[Array], Level]]]:
+    corners = mesh.cells[:, :4].max() + 1
+    faces = boundary_faces(mesh)
+    on_plane = (mesh.points[faces[:, :3], 2] == 0.0).all(axis=1)
+    bone = faces[~on_plane & np.isin(faces[:, :3], mesh.node_sets["fixed_bone"]).all(axis=1)]
+    return [
+        (_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
+        (_mid_nodes(inner_faces(mesh, len(mesh.region_names) - 2), corners), fields.layer),
+        (_mid_nodes(bone, corners), fields.void),
+    ]
+
+
+def _mid_nodes(faces: Ints, corners: int) -> Ints:
+    nodes = np.unique(faces)
+    return nodes[nodes >= corners]
+
+
+def inner_faces(mesh: Mesh, layer: int) -> Ints:
+    """Faces between a layer (counted from the skin) and what lies under it, outward from the latter."""
+    under = mesh.regions > layer
+    above = np.unique(mesh.corners[mesh.regions == layer])
+    part = replace(mesh, cells=mesh.cells[under], regions=mesh.regions[under], node_sets={}, face_sets={})
+    faces = boundary_faces(part)
+    outer = boundary_faces(mesh)
+    return faces[
+        np.isin(faces[:, :3], above).all(axis=1) & ~same_faces(faces[:, :3], outer[:, :3], len(mesh.points))
+    ]

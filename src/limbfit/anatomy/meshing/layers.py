@@ -1,0 +1,295 @@
+"""Implicit fields of a limb: depth below the skin, distance to the bones, the layers and trimmed bone.
+
+Vocabulary
+----------
+limb frame  the proximal cut is the plane z = 0 and the limb lies at z <= 0; millimetres.
+depth       distance to the *smooth* skin surface, positive inside the limb.
+floor       depth of the innermost layer's inner face: of one value, or a function on the skin that a point
+            takes from its nearest skin point.
+layer       the level set ``depth = floor``: layers of skin and adipose tissue above it, the core below.
+void        signed distance to the bones, negative inside, after the policy: bone that is shallower than
+            floor + clearance is given to the core.
+
+Both kinds of surface are prolonged straight beyond the proximal cut before distances are taken: otherwise
+the flat cap would count as skin and be offset too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import SurfaceError
+from ..frame import Frame, limb_frame
+from ..surfaces.surfaces import Anatomy
+from ..surfaces.thickness import SLOPE, carried, sloped
+from ..surfaces.triangles import Surface, from_pyvista
+
+Array = NDArray[np.float64]
+Level = tuple[Array, Array]  # a signed function at points and its gradient there
+
+PROLONGATION_MM = 40.0
+SEAM_MM = 3.0  # below the cut, where surfaces are prolonged from
+END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
+NORMAL_WITHIN_MM = 1e-3  # of a surface, where its normal stands for the gradient of the distance
+TRIM_SAMPLES = 60_000
+THINNEST = 1 / 3  # of the layers' thickness, below which ``thin-skin`` trims bone instead
+
+BonePolicy = Literal["trim-bone", "thin-skin"]
+
+
+@dataclass(frozen=True)
+class LayerSpec:
+    """A layer of tissue: thickness in mm, or None where it reaches down to the segmented fat's inner face."""
+
+    name: str
+    thickness_mm: float | None
+    min_thickness_mm: float = 1.0
+
+
+@dataclass(frozen=True)
+class ThinnedSkin:
+    """What ``thin-skin`` took from the layers: volume (mm3) and the least thickness that is left (mm)."""
+
+    volume_mm3: float
+    thinnest_mm: float
+
+
+@dataclass(frozen=True)
+class TrimmedBone:
+    """What was taken from one bone to keep it below the layers: volume (mm3) and greatest depth (mm)."""
+
+    volume_mm3: float
+    depth_mm: float
+
+
+@dataclass(frozen=True)
+class LimbFields:
+    """Fields of a limb in its frame; build it with :func:`limb_fields`.
+
+    ``skin`` and ``bones`` are prolonged beyond the cut, in limb coordinates. ``depths`` (layers, n) are those
+    of the layers' inner faces at the skin's n vertices, outermost first, mm; (layers, 1) where uniform.
+    """
+
+    frame: Frame
+    skin: Surface
+    bones: Mapping[str, Surface]
+    depths: Array
+    bone_clearance_mm: float
+    thinned: ThinnedSkin | None = None
+
+    @property
+    def uniform(self) -> bool:
+        return self.depths.shape[1] == 1
+
+    @property
+    def floor_range_mm(self) -> float:
+        """How much the floor varies: by so much more than the distance between points their levels differ."""
+        return float(np.ptp(self.depths[-1]))
+
+    def depth(self, points: Array) -> Level:
+        """Depth (n,) of points (n, 3) below the skin, positive inside, and its gradient (n, 3)."""
+        distance, slope = signed_distance(self.skin, points)
+        return -distance, -slope
+
+    def layer_depths(self, points: Array) -> Array:
+        """Depths (layers, n) of the layers' inner faces below the skin points nearest to points (n, 3)."""
+        if self.uniform:
+            return np.repeat(self.depths, len(points), axis=1)
+        return carried(self.skin, self.depths, points)
+
+    def floor(self, points: Array) -> Array:
+        """Depth (n,) of the innermost layer's inner face at points (n, 3)."""
+        return self.layer_depths(points)[-1]
+
+    def layer(self, points: Array) -> Level:
+        """Level (n,) of the layers' inner face, positive in the core, and the gradient (n, 3) of depth.
+
+        Along that gradient a point keeps its nearest skin point, and so its floor.
+        """
+        depth, slope = self.depth(points)
+        return depth - self.floor(points), slope
+
+    def void(self, points: Array) -> Level:
+        """Signed function (n,) of the bones that stay at least clearance below the layers, negative inside.
+
+        Where bone was trimmed it is the depth that is missing; the gradient (n, 3) belongs to the part that
+        counts.
+        """
+        level, slope = self.layer(points)
+        value, gradient = self.bone_clearance_mm - level, -slope
+        bone, bone_slope = self._bone(points)
+        own = bone > value
+        return np.where(own, bone, value), np.where(own[:, None], bone_slope, gradient)
+
+    def _bone(self, points: Array) -> Level:
+        """Signed distance (n,) to the nearest bone as segmented, and its gradient."""
+        value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
+        for bone in self.bones.values():
+            candidates = np.flatnonzero(_box_distance(bone, points) < value)
+            distance, slope = signed_distance(bone, points[candidates])
+            nearer = distance < value[candidates]
+            value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
+        return value, gradient
+
+    def trimmed(self) -> dict[str, TrimmedBone]:
+        """What trimming took from each bone."""
+        return {name: self._trimmed(bone) for name, bone in self.bones.items()}
+
+    def _trimmed(self, bone: Surface) -> TrimmedBone:
+        below = bone.points[bone.points[:, 2] <= 0.0]
+        excess = self.bone_clearance_mm - self.layer(below)[0] if len(below) else np.zeros(0)
+        shallow = below[excess > 0]
+        if not len(shallow):
+            return TrimmedBone(0.0, 0.0)
+        # A bone's shallow part spans at most its own edge length beyond its shallow vertices.
+        pad = _longest_edge(bone)
+        low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
+        high[2] = min(high[2], 0.0)
+        spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
+        samples = _box_samples(low, high, spacing)
+        inside = signed_distance(bone, samples)[0] < 0
+        cut = self.layer(samples[inside])[0] < self.bone_clearance_mm
+        return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
+
+
+def limb_fields(
+    anatomy: Anatomy,
+    layers: tuple[LayerSpec, ...],
+    bone_clearance_mm: float,
+    policy: BonePolicy = "trim-bone",
+    fat_depth_mm: Array | None = None,
+) -> LimbFields:
+    """The fields of an anatomy.
+
+    Parameters
+    ----------
+    anatomy : closed skin and bones.
+    layers : outermost first.
+    bone_clearance_mm : least distance of bone below the layers.
+    policy : what gives way where bone is shallower, the bone or the layers.
+    fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
+        without a thickness of its own.
+
+    Raises
+    ------
+    SurfaceError
+        When the skin does not reach the cut plane, or the fat's depth is needed and not given.
+    """
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
+    bones = {name: Surface(frame.to_limb(bone.points), bone.faces) for name, bone in anatomy.bones.items()}
+    top = skin.points[:, 2].max()
+    if top < -END_TOLERANCE_MM:
+        raise SurfaceError(
+            f"the skin ends {-top:.1f} mm below the proximal cut plane",
+            remedy="move the plane or check its normal",
+        )
+    ends_at_cut = {
+        name: -END_TOLERANCE_MM < bone.points[:, 2].max() < SEAM_MM for name, bone in bones.items()
+    }
+    bones = {name: prolonged(bone) if ends_at_cut[name] else bone for name, bone in bones.items()}
+    long = prolonged(skin)
+    depths = _layer_depths(layers, skin, long, fat_depth_mm)
+    fields = LimbFields(frame, long, bones, depths, bone_clearance_mm)
+    return _thinned(fields) if policy == "thin-skin" else fields
+
+
+def _layer_depths(
+    layers: tuple[LayerSpec, ...], skin: Surface, long: Surface, fat_depth_mm: Array | None
+) -> Array:
+    """Depths (layers, n) of the layers' inner faces at the vertices of the prolonged skin, or (layers, 1)."""
+    fat = np.zeros(1)
+    if any(layer.thickness_mm is None for layer in layers):
+        if fat_depth_mm is None:
+            raise SurfaceError("a layer follows the fat, but fat_depth_mm is not given")
+        inside = np.minimum(long.points, [np.inf, np.inf, -SEAM_MM])
+        fat = carried(skin, fat_depth_mm[None], inside)[0]
+    depth, depths = np.zeros_like(fat), []
+    for layer in layers:
+        if layer.thickness_mm is None:
+            depth = np.maximum(fat, depth + layer.min_thickness_mm)
+        else:
+            depth = depth + layer.thickness_mm
+        depths.append(depth)
+    return np.array(depths)
+
+
+def _thinned(fields: LimbFields) -> LimbFields:
+    """Layers thinned in proportion where bone comes nearer to the skin than they and the clearance do."""
+    skin = fields.skin
+    depths = np.repeat(fields.depths, len(skin.points), axis=1) if fields.uniform else fields.depths
+    whole = depths[-1]
+    room = np.maximum(fields._bone(skin.points)[0] - fields.bone_clearance_mm, THINNEST * whole)
+    left = np.minimum(whole, sloped(skin, np.minimum(whole, room), SLOPE))
+    if (left == whole).all():
+        return replace(fields, thinned=ThinnedSkin(0.0, float(whole.min())))
+    below = skin.points[:, 2] <= 0.0
+    lost = np.where(below, whole - left, 0.0)[skin.faces].mean(axis=1)
+    thinned = ThinnedSkin(float(lost @ skin.face_areas), float(left[below].min()))
+    return replace(fields, depths=depths * (left / whole), thinned=thinned)
+
+
+def signed_distance(surface: Surface, points: Array) -> Level:
+    """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside, and gradient."""
+    if not len(points):
+        return np.zeros(0), np.zeros((0, 3))
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    query = np.ascontiguousarray(points, dtype=float)
+    distance, face, nearest, _ = igl.signed_distance(query, surface.points, surface.faces, kind)
+    close = np.abs(distance) < NORMAL_WITHIN_MM
+    gradient = (query - nearest) / np.where(close, 1.0, distance)[:, None]
+    a, b, c = np.moveaxis(surface.triangles[face[close]], 1, 0)
+    normal = np.cross(b - a, c - a)
+    gradient[close] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return distance, gradient
+
+
+def prolonged(surface: Surface) -> Surface:
+    """The surface below z = -SEAM_MM with its section there drawn out along z, far beyond the cut.
+
+    Cutting below the plane makes it immaterial how exactly the surface's own cap lies on the plane and
+    whether its rim is rounded.
+    """
+    clipped = surface.to_pyvista().clip_closed_surface(normal=(0, 0, -1), origin=(0, 0, -SEAM_MM))
+    body = from_pyvista(clipped.triangulate().clean())
+    cap = (np.abs(body.points[:, 2] + SEAM_MM) < 1e-6)[body.faces].all(axis=1)
+    moved = np.unique(body.faces[cap])
+    top = np.full(len(body.points), -1)
+    top[moved] = len(body.points) + np.arange(len(moved))
+    points = np.vstack([body.points, body.points[moved] + [0.0, 0.0, PROLONGATION_MM]])
+    a, b = _rim(body.faces[cap]).T
+    walls = np.vstack([np.stack([a, b, top[b]], axis=1), np.stack([a, top[b], top[a]], axis=1)])
+    return Surface(points, np.vstack([body.faces[~cap], top[body.faces[cap]], walls]))
+
+
+def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Directed edges (k, 2) of a patch of faces that no other face of the patch shares."""
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edges[counts[inverse.ravel()] == 1]
+
+
+def _box_distance(surface: Surface, points: Array) -> Array:
+    """Distance (n,) to the surface's bounding box, a lower bound of that to the surface; -inf inside."""
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    outside = np.maximum(np.maximum(low - points, points - high), 0.0)
+    distance = np.linalg.norm(outside, axis=1)
+    return np.where(distance > 0, distance, -np.inf)
+
+
+def _longest_edge(surface: Surface) -> float:
+    corners = surface.points[surface.faces]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+
+
+def _box_samples(low: Array, high: Array, spacing: float) -> Array:
+    """Cell centres of a regular grid over a box."""
+    counts = np.maximum(1, np.round((high - low) / spacing)).astype(int)
+    axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low, high, counts)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,0 +1,264 @@
+"""Per-site tetrahedral meshes of a limb: skin layer and muscle, bones as voids, graded by distance.
+
+The recipe
+----------
+1. A base mesh of the muscle, once per anatomy: a tetrahedral grid under the proximal cut plane, cut along the
+   layer (level set of depth at the skin's thickness) and along the bones.
+2. Per site, a mesher adapts the base to the site's size field.
+3. Nodes of the layer and the bones are put on their smooth surfaces; the skin layer is extruded from the
+   interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
+4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ...errors import MeshingError, ProblemError
+from ...mesh import Mesh, boundary_faces, check, to_tet10
+from ..surfaces.surfaces import Anatomy
+from . import background
+from .background import BONE, FAR, LAYER, PLANE, TetGrid
+from .curving import curved, with_diagonals
+from .engines import ENGINES, VolumeMesh, VolumeTask
+from .layered import core_mesh, curved_target, with_layers
+from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
+from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
+from .projection import guarded, projected
+from .smoothing import polished
+from .untangling import inverted, repaired, unrepaired
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SURFACES = (PLANE, LAYER, BONE, FAR)
+HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
+LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
+SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
+DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How a site is meshed; lengths in mm.
+
+    The edge length is ``edge_near_mm`` within ``near_radius_mm`` of the site and grows from there by
+    ``growth`` mm per mm up to ``edge_far_mm``. ``curved`` puts mid-edge nodes on the smooth surfaces.
+    With ``local_radius_mm`` only the limb within that distance of the site is meshed, and the nodes where it
+    was cut off are fixed (node set ``fixed_truncation``); that stiffens the answer. ``flatness`` is how much
+    flatter than by default elements may be away from the site: fewer nodes, smaller angles.
+    """
+
+    element: Literal["tet4", "tet10"] = "tet10"
+    edge_near_mm: float = 3.5
+    edge_far_mm: float = 12.0
+    near_radius_mm: float = 16.0
+    growth: float = 0.35
+    layers: tuple[LayerSpec, ...] = (LayerSpec("skin", 3.0),)
+    core: str = "muscle"
+    bone_policy: BonePolicy = "trim-bone"
+    bone_clearance_mm: float = 1.5
+    time_limit_s: float = 600.0
+    curved: bool = True
+    local_radius_mm: float | None = None
+    flatness: float = 1.0
+    engine: str = "mmg"
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """The mesh's regions: the layers, outermost first, and the core."""
+        return (*(layer.name for layer in self.layers), self.core)
+
+    @property
+    def base_spacing_mm(self) -> float:
+        """Edge of the base grid: fine enough for the layer, no finer than the far mesh needs."""
+        return float(np.clip(self.edge_far_mm / 3.0, 3.0, 6.0 * np.sqrt(self.flatness)))
+
+    @property
+    def hausdorff_mm(self) -> float:
+        """How far the faceted surfaces may stray from the smooth ones."""
+        return float(np.clip(self.edge_far_mm**2 / HAUSDORFF_RADIUS_MM, 0.1, 2.5)) * self.flatness**2
+
+
+@dataclass(frozen=True)
+class BaseMesh:
+    """The muscle of an anatomy as an ungraded grid, in the limb frame; shared by all its sites.
+
+    ``size_limit`` (n,) is the edge length that layer and bones allow at the grid's points, mm.
+    """
+
+    fields: LimbFields
+    grid: TetGrid
+    size_limit: Array
+    trimmed: Mapping[str, TrimmedBone]
+    enclosed_mm3: float
+
+
+def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | None = None) -> BaseMesh:
+    """The part of meshing that does not depend on the site.
+
+    Parameters
+    ----------
+    anatomy, settings : as for :func:`mesh_site`.
+    fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
+        without a thickness of its own (:func:`limbfit.anatomy.surfaces.thickness.fat_depth`).
+
+    Raises
+    ------
+    SurfaceError
+        When the skin does not reach the cut plane, or the fat's depth is needed and not given.
+    MeshingError
+        When nothing is left between layer, bones and cut.
+    """
+    fields = limb_fields(
+        anatomy, settings.layers, settings.bone_clearance_mm, settings.bone_policy, fat_depth_mm
+    )
+    spacing = settings.base_spacing_mm
+    low = fields.skin.points.min(axis=0) - spacing
+    high = fields.skin.points.max(axis=0) + spacing
+    grid = background.box_grid(low, np.array([*high[:2], 0.0]), spacing)
+    for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
+        grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
+        grid = grid.kept(positive)
+        if not len(grid.tets):
+            raise MeshingError(f"no {settings.core} is left under the layers; choose thinner layers")
+    trimmed = fields.trimmed()
+    limit = size_limit(fields, grid, settings)
+    return BaseMesh(fields, grid, limit, trimmed, enclosed_volume(anatomy, fields, trimmed))
+
+
+def mesh_site(
+    anatomy: Anatomy,
+    position: Array,
+    axis: Array,
+    settings: MeshSettings,
+    base: BaseMesh | None = None,
+) -> tuple[Mesh, MeshReport]:
+    """A conforming two-region mesh graded about an indentation site.
+
+    Parameters
+    ----------
+    anatomy : closed skin and bones, LPS mm.
+    position : the site (3,) on the skin, LPS mm.
+    axis : unit vector (3,) into the limb.
+    settings : edge lengths, layers, element.
+    base : of the same anatomy and settings, from :func:`base_mesh`; made here when not given.
+
+    Returns
+    -------
+    mesh : regions ``skin`` and ``muscle``; node sets ``fixed_bone`` (on bones) and ``fixed_proximal`` (on the
+        cut plane) and, with ``local_radius_mm``, ``fixed_truncation``; face set ``skin`` (outward, without
+        the cut plane).
+    report : quality and what was trimmed.
+
+    Raises
+    ------
+    MeshingError
+        When the mesher fails, or its mesh has inverted elements that cannot be mended: where and why.
+    """
+    start = time.perf_counter()
+    base = base or base_mesh(anatomy, settings)
+    fields, frame = base.fields, base.fields.frame
+    site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
+    grid, limit = base.grid, base.size_limit
+    if settings.local_radius_mm is not None:
+        grid = _near(grid, site, settings.local_radius_mm)
+        limit = size_limit(fields, grid, settings)
+    task = _task(grid, site_size(grid.points, limit, site, inward, settings), settings)
+    core = _snapped(ENGINES[settings.engine](task, settings.time_limit_s), fields)
+    mesh, stack = with_layers(core, fields, settings.regions)
+    mesh = polished(mesh, fields, stack)
+    mesh, repairs = repaired(mesh, fields, stack)
+    if settings.element == "tet10" and not inverted(mesh).any():
+        mesh = to_tet10(mesh)
+        if settings.curved:
+            mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack))
+    _check_usable(mesh, fields)
+    enclosed = base.enclosed_mm3 if settings.local_radius_mm is None else None
+    seconds = time.perf_counter() - start
+    report = mesh_report(mesh, fields, base.trimmed, enclosed, seconds, settings.engine)
+    report = replace(report, repairs=repairs)
+    return mesh.with_points(frame.to_patient(mesh.points)), report
+
+
+def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
+    if inverted(mesh).any():
+        raise MeshingError(f"{unrepaired(mesh, fields)}; smooth the surface there, or choose smaller edges")
+    try:
+        check(mesh)
+    except ProblemError as error:
+        raise MeshingError(f"the mesh cannot be used: {error.what}; choose other edges") from None
+
+
+def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:
+    """Wanted edge length (n,) at points (n, 3), at most ``limit`` (n,); everything in the limb frame."""
+    offset = points - site
+    axial = offset @ axis
+    lateral = np.linalg.norm(offset - axial[:, None] * axis, axis=1)
+    distance = np.hypot(lateral, DEPTH_RATIO * axial)
+    beyond = np.maximum(distance - settings.near_radius_mm, 0.0)
+    size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
+    return np.minimum(size, limit)
+
+
+def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
+    """Edge length (n,) at which layers and sheets of core over bone stay as thick as elements need."""
+    far, points, slack = settings.edge_far_mm, grid.points, fields.floor_range_mm
+    under_layers = np.maximum(background.banded(fields.layer, points, far, grid.spacing, slack), 0.0)
+    sheet = np.abs(background.banded(fields.void, points, far, grid.spacing, slack)) + under_layers
+    smallest = min(settings.edge_near_mm, settings.bone_clearance_mm)
+    over_bone = np.maximum(SHEET_RATIO * settings.flatness * sheet, smallest)
+    depths = fields.layer_depths(points)
+    thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
+    return np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
+
+
+def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
+    triangles = boundary_faces(core_mesh(grid.points, grid.tets))
+    common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
+    surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
+    return VolumeTask(grid.points, grid.tets, triangles, surfaces, size, settings.hausdorff_mm)
+
+
+def _near(grid: TetGrid, site: Array, radius: float) -> TetGrid:
+    """The connected part of a grid within a distance of a site."""
+
+    def ball(points: Array) -> tuple[Array, Array]:
+        offset = points - site
+        distance = np.linalg.norm(offset, axis=1)
+        return radius - distance, -offset / np.maximum(distance, 1e-12)[:, None]
+
+    grid, inside = background.cut(grid, ball, FAR)
+    grid = grid.kept(inside)
+    rows = grid.tets[:, [0, 1, 2]].ravel(), grid.tets[:, [1, 2, 3]].ravel()
+    links = coo_array((np.ones(len(rows[0])), rows), shape=(len(grid.points),) * 2)
+    label = connected_components(links, directed=False)[1][grid.tets[:, 0]]
+    return grid.kept(label == np.bincount(label).argmax())
+
+
+def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
+    """Boundary nodes put on cut plane, layer and bone as far as their elements allow."""
+    in_plane = _nodes_on(core, PLANE)
+    target = core.points.copy()
+    target[in_plane, 2] = 0.0
+    free = np.where(in_plane, 0.0, 1.0)
+    for surface, level in ((BONE, fields.void), (LAYER, fields.layer)):
+        nodes = np.flatnonzero(_nodes_on(core, surface))
+        target[nodes] = projected(level, target[nodes], free[nodes])
+    points = guarded(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
+    points[in_plane, 2] = 0.0
+    return replace(core, points=points)
+
+
+def _nodes_on(core: VolumeMesh, surface: int) -> NDArray[np.bool_]:
+    chosen = np.zeros(len(core.points), dtype=bool)
+    chosen[core.triangles[core.triangle_refs == surface]] = True
+    return chosen

@@ -1,0 +1,151 @@
+"""What a site mesh is like: counts, angles, layers, volumes, and what was trimmed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from ...mesh import Mesh, Quality, quality
+from ..surfaces.surfaces import Anatomy, Surface
+from .layered import inner_faces
+from .layers import LimbFields, ThinnedSkin, TrimmedBone
+from .untangling import Repair
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+GOOD_DIHEDRAL_DEG = 8.0
+GOOD_VOLUME = 0.005
+
+
+@dataclass(frozen=True)
+class MeshReport:
+    """What a mesh is like: counts, angles (degrees), volumes (mm3), lengths (mm), time (s).
+
+    ``volume_error`` is relative to the volume that the surfaces enclose (None with ``local_radius_mm``).
+    ``layer_mean_mm`` and ``layer_std_mm`` are the thickness of all layers together, measured from points all
+    over their meshed inner face to the meshed skin; ``layer_thickness_mm`` gives mean, deviation, least and
+    greatest of each. ``interface_error_mm`` is how far that inner face is from where it was asked for.
+    ``repairs`` made inverted cells sound.
+    """
+
+    nodes: int
+    cells: int
+    region_cells: Mapping[str, int]
+    min_dihedral_deg: float
+    dihedral_percentiles_deg: Mapping[str, float]
+    min_scaled_jacobian: float
+    volume_mm3: float
+    region_volumes_mm3: Mapping[str, float]
+    volume_error: float | None
+    layer_mean_mm: float
+    layer_std_mm: float
+    layer_thickness_mm: Mapping[str, Mapping[str, float]]
+    interface_error_mm: Mapping[str, float]
+    trimmed_bone: Mapping[str, TrimmedBone]
+    thinned_skin: ThinnedSkin | None
+    seconds: float
+    engine: str
+    warnings: tuple[str, ...] = field(default_factory=tuple)
+    repairs: tuple[Repair, ...] = field(default_factory=tuple)
+
+
+def mesh_report(
+    mesh: Mesh,
+    fields: LimbFields,
+    trimmed: Mapping[str, TrimmedBone],
+    enclosed_mm3: float | None,
+    seconds: float,
+    engine: str,
+) -> MeshReport:
+    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have, if known."""
+    found = quality(mesh)
+    volume_error = None if enclosed_mm3 is None else found.volume_mm3 / enclosed_mm3 - 1.0
+    layers = len(mesh.region_names) - 1
+    faces = [_facets(mesh.face_sets["skin"]), *(_facets(inner_faces(mesh, i)) for i in range(layers))]
+    whole = _thickness(mesh, faces[-1], faces[0])
+    each = {
+        name: _summary(_thickness(mesh, faces[i + 1], faces[i]))
+        for i, name in enumerate(mesh.region_names[:-1])
+    }
+    error = np.abs(fields.layer(mesh.points[faces[-1]].mean(axis=1))[0])
+    return MeshReport(
+        nodes=len(mesh.points),
+        cells=len(mesh.cells),
+        region_cells={name: int((mesh.regions == i).sum()) for i, name in enumerate(mesh.region_names)},
+        min_dihedral_deg=found.min_dihedral_deg,
+        dihedral_percentiles_deg=found.dihedral_percentiles_deg,
+        min_scaled_jacobian=found.min_scaled_jacobian,
+        volume_mm3=found.volume_mm3,
+        region_volumes_mm3=found.region_volumes_mm3,
+        volume_error=volume_error,
+        layer_mean_mm=float(whole.mean()),
+        layer_std_mm=float(whole.std()),
+        layer_thickness_mm=each,
+        interface_error_mm={"mean": float(error.mean()), "max": float(error.max())},
+        trimmed_bone=trimmed,
+        thinned_skin=fields.thinned,
+        seconds=seconds,
+        engine=engine,
+        warnings=_warnings(found, volume_error or 0.0),
+    )
+
+
+def _warnings(found: Quality, volume_error: float) -> tuple[str, ...]:
+    warnings = []
+    if found.min_dihedral_deg < GOOD_DIHEDRAL_DEG:
+        warnings.append(f"smallest dihedral angle {found.min_dihedral_deg:.1f} degrees; choose smaller edges")
+    if abs(volume_error) > GOOD_VOLUME:
+        warnings.append(
+            f"volume differs by {100 * volume_error:.1f} % from the surfaces'; choose smaller edges"
+        )
+    return tuple(warnings)
+
+
+def _thickness(mesh: Mesh, inner: Ints, outer: Ints) -> Array:
+    """Distance (n,) from the middles of inner facets to the surface of outer ones, mm."""
+    squared = igl.point_mesh_squared_distance(mesh.points[inner].mean(axis=1), mesh.points, outer)[0]
+    return np.asarray(np.sqrt(squared))
+
+
+def _summary(values: Array) -> dict[str, float]:
+    parts = {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
+    return {name: float(value) for name, value in parts.items()}
+
+
+def _facets(faces: Ints) -> Ints:
+    """Flat triangles of 3-node faces (themselves) or 6-node faces (four each)."""
+    if faces.shape[1] == 3:
+        return faces
+    return faces[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
+
+
+def enclosed_volume(anatomy: Anatomy, fields: LimbFields, trimmed: Mapping[str, TrimmedBone]) -> float:
+    """Volume (mm3) below the cut that the skin encloses, less the bones as trimmed."""
+    parts = [
+        Surface(fields.frame.to_limb(part.points), part.faces)
+        for part in (anatomy.skin, *anatomy.bones.values())
+    ]
+    skin, *bones = [volume_below_cut(part) for part in parts]
+    return skin - sum(bones) + sum(part.volume_mm3 for part in trimmed.values())
+
+
+def volume_below_cut(surface: Surface) -> float:
+    """Volume (mm3) of a closed surface below z = 0, by the divergence theorem with (0, 0, min(z, 0))."""
+    corners = surface.points[surface.faces]
+    normal_z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2.0
+    low, middle, high = np.sort(corners[..., 2], axis=1).T
+    return float(normal_z @ _mean_negative_part(low, middle, high))
+
+
+def _mean_negative_part(low: Array, middle: Array, high: Array) -> Array:
+    """Mean of min(z, 0) over triangles whose corners have sorted heights low, middle, high."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tip_below = low**3 / ((low - middle) * (low - high)) / 3.0
+        tip_above = high**3 / ((high - low) * (high - middle)) / 3.0
+    mean = (low + middle + high) / 3.0
+    return np.select([low >= 0, high <= 0, middle >= 0], [0.0 * mean, mean, tip_below], mean - tip_above)

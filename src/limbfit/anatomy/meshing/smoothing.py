@@ -1,0 +1,109 @@
+"""The few worst tetrahedra of a mesh made better by moving their nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...mesh import Mesh, dihedral_angles
+from .background import volumes
+from .columns import Columns
+from .layers import LimbFields
+from .projection import guarded, projected
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+GOOD_DEG = 9.0
+WORKED_BELOW_DEG = 11.0
+SWEEPS = 6
+STEPS = (0.3, 0.15, 0.05)  # of the shortest edge at the node
+DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+DIRECTIONS = DIRECTIONS[np.any(DIRECTIONS != 0, axis=1)]
+
+
+def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
+    """A tet4 mesh with its poor elements improved and its boundary nodes put back on the smooth surfaces.
+
+    Inner nodes move freely, those of the layers along the skin, those on bone or cut along these, nodes on
+    two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
+    """
+    normals, movable = held(mesh, fields, stack)
+    points = improved(mesh.points, mesh.cells, WORKED_BELOW_DEG, normals, movable)
+    return mesh.with_points(put_back(points, mesh, fields, stack))
+
+
+def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
+    """Moved points (n, 3) of a mesh, those of bone and layers put on their surfaces as far as cells allow."""
+    on_plane, in_layers, on_bone = _places(mesh, stack)
+    target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
+    bone = np.flatnonzero(on_bone & (on_plane.astype(int) + in_layers + on_bone < 2))
+    for nodes, level in ((bone, fields.void), (stack.base, fields.layer), (stack.top, fields.depth)):
+        target[nodes] = projected(level, target[nodes], free[nodes])
+    return guarded(points, target, mesh.cells, GOOD_DEG)
+
+
+def held(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray[np.bool_]]:
+    """Unit normals (n, 3) of the surface that a node moves on, zero for inner ones; which may move (n,)."""
+    points = mesh.points
+    on_plane, in_layers, on_bone = _places(mesh, stack)
+    normals = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(points), 3)))
+    for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void)):
+        normals[chosen] = level(points[chosen])[1]
+    return normals, on_plane.astype(int) + in_layers + on_bone < 2
+
+
+def _places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
+    """Which nodes lie on the cut plane, in the layers, on bone (3, n)."""
+    on_plane, in_layers, on_bone = np.zeros((3, len(mesh.points)), dtype=bool)
+    on_plane[:] = mesh.points[:, 2] == 0.0
+    in_layers[stack.base], in_layers[stack.top[0] :] = True, True
+    on_bone[mesh.node_sets["fixed_bone"]] = True
+    return np.stack([on_plane, in_layers, on_bone])
+
+
+def improved(points: Array, tets: Ints, goal_deg: float, normals: Array, movable: NDArray[np.bool_]) -> Array:
+    """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
+
+    Parameters
+    ----------
+    points, tets : the mesh.
+    goal_deg : tetrahedra below it are worked on.
+    normals : (n, 3) unit normals of the surface that a node moves on; zero where it moves freely.
+    movable : (n,) nodes that may move.
+    """
+    points = points.copy()
+    order = np.argsort(tets, axis=None, kind="stable")
+    starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
+    worst = _worst_angle(points[tets])
+    for _ in range(SWEEPS):
+        before = points.copy()
+        nodes = np.unique(tets[worst < goal_deg])
+        for node in nodes[movable[nodes]]:
+            star = order[starts[node] : starts[node + 1]] // 4
+            points[node] = _best_place(points, tets[star], node, normals[node])
+            worst[star] = _worst_angle(points[tets[star]])
+        if np.array_equal(before, points):
+            break
+    return points
+
+
+def _best_place(points: Array, star: Ints, node: int, normal: Array) -> Array:
+    """Where the smallest angle of the star about a node is greatest, among a pattern of places."""
+    here, corners, mine = points[node], points[star], star == node
+    reach = np.linalg.norm(corners - here, axis=2)[~mine].min()
+    moves = np.concatenate([np.zeros((1, 3)), *(step * reach * DIRECTIONS for step in STEPS)])
+    places = here + moves - (moves @ normal)[:, None] * normal
+    trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
+    angle = _worst_angle(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
+    return np.asarray(places[int(np.argmax(angle))])
+
+
+def _worst_angle(corners: Array) -> Array:
+    """Smallest dihedral angle (m,) of tetrahedra (m, 4, 3), degrees; -1 where inverted."""
+    flat = corners.reshape(-1, 3)
+    tets = np.arange(len(flat)).reshape(-1, 4)
+    sound = volumes(flat, tets) > 1e-12
+    angle = np.full(len(tets), -1.0)
+    angle[sound] = dihedral_angles(flat, tets[sound]).min(axis=1)
+    return angle

@@ -1,0 +1,184 @@
+"""Inverted tetrahedra of a site mesh made sound again, by the least change that does it, and told.
+
+Tried in turn, each about the inverted cells alone: nodes moved along the surfaces that they lie on; layers
+made thinner from below, where their columns cross; nodes moved off their surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...mesh import Mesh, node_jacobians
+from ..frame import Frame
+from .background import volumes
+from .columns import Columns
+from .layers import LimbFields
+from .smoothing import DIRECTIONS, held, put_back
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SOUND = 0.03  # volume over that of a regular tetrahedron of the same edges; worked on below it
+SWEEPS = 12
+FARTHEST = 1.0  # that a node goes, over the mean edge at it
+STEPS = (0.6, 0.3, 0.15, 0.05)  # of the mean edge at the node
+THINNER = 0.5  # what a layer keeps of its thickness at first, and again the second time
+_REGULAR = 6.0 * np.sqrt(2.0)  # cube of the edge over volume
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What made inverted cells sound: how many, by what, where (LPS mm), moving nodes how far (mm)."""
+
+    cells: int
+    what: str
+    place_mm: tuple[float, float, float]
+    moved_mm: float
+
+    @property
+    def text(self) -> str:
+        place = ", ".join(f"{x:.1f}" for x in self.place_mm)
+        return (
+            f"{self.cells} inverted cells at ({place}) mm mended: {self.what} by up to {self.moved_mm:.2f} mm"
+        )
+
+
+def repaired(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tuple[Repair, ...]]:
+    """A tet4 mesh in the limb frame with its inverted cells mended as far as they can be, and the repairs."""
+    normals, movable = held(mesh, fields, stack)
+    on_plane = mesh.points[:, 2] == 0.0
+    free = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(mesh.points), 3)))
+    attempts: tuple[tuple[str, Callable[[Array], Array]], ...] = (
+        (
+            "nodes moved along their surfaces",
+            lambda p: put_back(untangled(p, mesh.cells, normals, movable), mesh, fields, stack),
+        ),
+        ("layers thinned", lambda p: thinned(p, mesh, stack, normals, movable)),
+        ("nodes moved off their surfaces", lambda p: untangled(p, mesh.cells, free, movable | ~on_plane)),
+    )
+    repairs = []
+    points, bad = mesh.points, inverted(mesh)
+    for what, attempt in attempts:
+        if not bad.any():
+            break
+        tried = attempt(points)
+        left = volumes(tried, mesh.cells) <= 0.0
+        if left.sum() < bad.sum():
+            repairs.append(
+                _repair(what, points, tried, mesh.cells[bad], int(bad.sum() - left.sum()), fields.frame)
+            )
+            points, bad = tried, left
+    return mesh.with_points(points), tuple(repairs)
+
+
+def inverted(mesh: Mesh) -> Bools:
+    """Cells (m,) that have no positive Jacobian at one of their nodes."""
+    return np.asarray(node_jacobians(mesh).min(axis=1) <= 0.0)
+
+
+def _repair(what: str, before: Array, after: Array, cells: Ints, count: int, frame: Frame) -> Repair:
+    place = frame.to_patient(before[cells].reshape(-1, 3).mean(axis=0))
+    moved = float(np.linalg.norm(after - before, axis=1).max())
+    return Repair(count, what, (float(place[0]), float(place[1]), float(place[2])), moved)
+
+
+def untangled(points: Array, tets: Ints, normals: Array, movable: Bools) -> Array:
+    """Points (n, 3) with nodes of inverted tetrahedra, and of nearly flat ones beside them, where the worst
+    about each is best.
+
+    Parameters
+    ----------
+    points, tets : the mesh.
+    normals : (n, 3) unit normals of the surface that a node moves on; zero where it moves freely.
+    movable : (n,) nodes that may move.
+    """
+    before, points = points, points.copy()
+    order = np.argsort(tets, axis=None, kind="stable")
+    starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
+    about = tets[np.isin(tets, tets[volumes(points, tets) <= 0.0]).any(axis=1)]
+    for _ in range(SWEEPS):
+        poor = _roundness(points[about]) < SOUND
+        if not poor.any():
+            break
+        nodes = np.unique(about[poor])
+        for node in nodes[movable[nodes]]:
+            star = tets[order[starts[node] : starts[node + 1]] // 4]
+            points[node] = _best_place(points, star, node, normals[node], before)
+    return points
+
+
+def _best_place(points: Array, star: Ints, node: int, normal: Array, before: Array) -> Array:
+    """Where the worst of the cells about a node is best: here, among a pattern, or amidst its neighbours.
+
+    No farther from where it was at first than its neighbours were: a node would run from hopeless cells.
+    """
+    here, corners, mine = points[node], points[star], star == node
+    around = corners[~mine]
+    reach = np.linalg.norm(before[star[~mine]] - before[node], axis=1).mean()
+    moves = np.vstack(
+        [np.zeros(3), around.mean(axis=0) - here, *(step * reach * DIRECTIONS for step in STEPS)]
+    )
+    places = here + moves - (moves @ normal)[:, None] * normal
+    places = places[(np.linalg.norm(places - before[node], axis=1) <= FARTHEST * reach) | ~moves.any(axis=1)]
+    trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
+    worst = _roundness(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
+    return np.asarray(places[int(np.argmax(worst))])
+
+
+def _roundness(corners: Array) -> Array:
+    """Signed volume (m,) of tetrahedra (m, 4, 3) over that of a regular one of the same mean edge."""
+    flat = corners.reshape(-1, 3)
+    volume = volumes(flat, np.arange(len(flat)).reshape(-1, 4))
+    edges = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]
+    return np.asarray(_REGULAR * volume / np.maximum((edges**2).sum(axis=2).mean(axis=1) ** 1.5, 1e-30))
+
+
+def thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Bools) -> Array:
+    """Layers thinner from below where their cells are inverted: columns that cross do so at their feet."""
+    points = points.copy()
+    own = stack.top[0] + np.arange(len(stack.owner))
+    for _ in range(2):
+        bad = volumes(points, mesh.cells) <= 0.0
+        chosen = np.isin(stack.base, mesh.cells[bad]) | np.isin(stack.top, mesh.cells[bad])
+        if not chosen.any():
+            break
+        head = points[stack.top]
+        feet, between = stack.base[chosen], chosen[stack.owner]
+        points[feet] = head[chosen] + THINNER * (points[feet] - head[chosen])
+        points[own[between]] = head[stack.owner[between]] + THINNER * (
+            points[own[between]] - head[stack.owner[between]]
+        )
+        inner = movable.copy()
+        inner[feet] = False
+        points = untangled(points, mesh.cells, normals, inner)
+    return points
+
+
+def unrepaired(mesh: Mesh, fields: LimbFields) -> str:
+    """Where the inverted cells of a mesh in the limb frame are (LPS mm), next to what, and why."""
+    bad = inverted(mesh)
+    where = mesh.points[mesh.corners[bad]].mean(axis=1)[:1]
+    place = ", ".join(f"{x:.1f}" for x in fields.frame.to_patient(where[0]))
+    region = mesh.region_names[int(mesh.regions[bad][0])]
+    near = {
+        "the skin": abs(fields.depth(where)[0][0]),
+        "the layers' inner face": abs(fields.layer(where)[0][0]),
+        "bone": abs(fields.void(where)[0][0]),
+        "the proximal cut": abs(where[0, 2]),
+    }
+    surface = min(near, key=lambda name: near[name])
+    core = mesh.region_names[-1]
+    why = (
+        f"there is too little {core} for its elements"
+        if region == core
+        else "the skin is folded, or bent more sharply than its layers are thick"
+    )
+    return (
+        f"{int(bad.sum())} of {len(mesh.cells)} cells are inverted, the first in {region} at ({place}) mm, "
+        f"{near[surface]:.1f} mm from {surface}: {why}"
+    )

@@ -1,0 +1,205 @@
+"""Virtual amputation: an intact leg as a transtibial residuum.
+
+Bones end at the plane. Soft tissue covers them as a surgeon's flap does: the limb's cross-section at the
+plane is carried on distally and rounded off, so that the limb ends ``pad_mm`` beyond the bones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.ndimage import label as connected
+
+from ...errors import LabelError
+from ..ends import proximal_end
+from ..grid import LabelMap
+from ..surfaces.extraction import signed_distance_to
+
+Array = NDArray[np.float64]
+
+_STEP_MM = 0.5  # of the cross-section
+_SMOOTH_MM = 1.0  # of its outline
+_THICKEST_MM = 1.5  # of a slice; thicker ones would make steps of the rounded end
+_MOST_OBLIQUE_DEG = 60.0  # of the plane's normal to the limb
+_ROUNDING = 2.0  # the end is flat only further from the outline than this many pads
+
+
+def amputate(
+    labels: LabelMap, plane_point: ArrayLike, plane_normal: ArrayLike, pad_mm: float = 15.0
+) -> LabelMap:
+    """The leg cut at a plane, with a rounded pad of soft tissue over the cut bones.
+
+    Parameters
+    ----------
+    labels : an intact leg.
+    plane_point, plane_normal : LPS mm; the normal points proximally, to what is kept.
+    pad_mm : soft tissue distal of the bones, on the limb's middle; towards the outline it thins as a
+        quarter ellipse.
+
+    Returns
+    -------
+    LabelMap
+        Bones and soft tissue distal of the pad are gone. Slices thicker than 1.5 mm are divided evenly, with
+        the shape of each label interpolated, so that the end is round and not a stair.
+
+    Raises
+    ------
+    LabelError
+        For a plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too
+        short for the pad.
+    """
+    point, normal = _unit_plane(plane_point, plane_normal)
+    if pad_mm <= 0:
+        raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
+    _check_direction(labels, normal)
+    labels = _divided(labels)
+    height = labels.heights(point, normal)
+    section = _section(labels, point, normal)
+    _check_bones(labels, height)
+    array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
+    near = np.nonzero((height < 0) & (height > -pad_mm))
+    depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
+    end = pad_mm * _quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
+    kept = -height[near] < end
+    array[tuple(axis[kept] for axis in near)] = labels.soft_value
+    _check(labels, array, section, height, pad_mm)
+    return labels.with_array(array)
+
+
+def _divided(labels: LabelMap) -> LabelMap:
+    """Thick slices divided, the shape of each label interpolated (Raya and Udupa 1990)."""
+    for axis in range(3):
+        parts = int(np.ceil(labels.spacing[axis] / _THICKEST_MM))
+        if parts > 1:
+            labels = _divided_along(labels, axis, parts)
+    return labels
+
+
+def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
+    count = labels.size[axis]
+    place = (np.arange(count * parts) + 0.5) / parts - 0.5
+    spacing, start = labels.spacing.copy(), np.zeros(3)
+    spacing[axis] /= parts
+    start[axis] = place[0]
+    present = set(np.unique(labels.array).tolist()) - {0, labels.soft_value}
+    bones = {labels.value(name) for name in labels.bone_names}
+    order = sorted(present, key=lambda value: (value in bones, value))  # where they overlap bone stays whole
+    masks = {0: labels.limb} | {value: labels.array == value for value in order}
+    inside = {
+        value: _interpolated(signed_distance_to(mask, labels), place, 2 - axis) > 0
+        for value, mask in masks.items()
+    }
+    array = np.where(inside.pop(0), labels.soft_value, 0).astype(np.uint8)
+    for value, mask in inside.items():
+        array[mask] = value
+    return LabelMap(array, spacing, labels.index_to_point(start), labels.direction, labels.names)
+
+
+def _interpolated(field: NDArray[np.float32], place: Array, axis: int) -> NDArray[np.float32]:
+    """Linear interpolation along one array axis, constant beyond the ends."""
+    last = field.shape[axis] - 1
+    place = np.clip(place, 0, last)
+    low = np.minimum(place.astype(int), max(last - 1, 0))
+    part = np.expand_dims((place - low).astype(np.float32), tuple(n for n in range(3) if n != axis))
+    below, above = np.take(field, low, axis), np.take(field, np.minimum(low + 1, last), axis)
+    return below + part * (above - below)
+
+
+def _unit_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+    vector = np.asarray(normal, dtype=float)
+    length = float(np.linalg.norm(vector))
+    if not length > 0:
+        raise LabelError("the normal of the amputation plane is zero", remedy="give a proximal direction")
+    return np.asarray(point, dtype=float), vector / length
+
+
+def _check_direction(labels: LabelMap, normal: Array) -> None:
+    """Refuse a normal that points distally, or that is not along the limb at all."""
+    along = float(proximal_end(labels.limb, labels).direction(labels) @ normal)
+    angle = float(np.degrees(np.arccos(np.clip(along, -1, 1))))
+    if angle > 180 - _MOST_OBLIQUE_DEG:
+        raise LabelError(
+            "the normal of the amputation plane points distally",
+            remedy="turn it round: it points to what is kept",
+        )
+    if angle > _MOST_OBLIQUE_DEG:
+        raise LabelError(
+            f"the amputation plane does not cross the limb: its normal is {angle:.0f} degrees off the limb",
+            remedy="give a normal that points proximally along the limb",
+        )
+
+
+def _check_bones(labels: LabelMap, height: Array) -> None:
+    """Refuse a plane that has all bones on one side."""
+    bones = height[np.isin(labels.array, [labels.value(name) for name in labels.bone_names])]
+    if not (bones > 0).any():
+        raise LabelError("no bone is left proximal of the amputation plane", remedy="move the plane distally")
+    if not (bones < 0).any():
+        raise LabelError(
+            "the amputation plane cuts nothing off: no bone lies distal of it",
+            remedy="move the plane proximally",
+        )
+
+
+def _quarter_ellipse(t: Array) -> Array:
+    """0 at the outline (t = 0) with an upright tangent, 1 from t = 1 inward."""
+    return np.sqrt(1 - (1 - np.clip(t, 0, 1)) ** 2)
+
+
+@dataclass(frozen=True)
+class _Section:
+    """The limb's cross-section: depth below its outline (mm, 0 outside) on a raster of the plane."""
+
+    corner: Array
+    axes: Array
+    depth: Array
+    whole: bool
+
+    @property
+    def largest_depth(self) -> float:
+        return float(self.depth.max())
+
+    def depth_at(self, points: Array) -> Array:
+        """Depth of points (n, 3) projected onto the plane."""
+        place = (points - self.corner) @ self.axes / _STEP_MM
+        return map_coordinates(self.depth, place.T, order=1, mode="constant", cval=0.0)
+
+
+def _section(labels: LabelMap, point: Array, normal: Array) -> _Section:
+    """Where the plane cuts the limb; of several pieces the largest."""
+    axes = np.linalg.svd(normal[None])[2][1:].T
+    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * (np.array(labels.size) - 1)
+    flat = (labels.index_to_point(corners) - point) @ axes
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    u, v = (np.arange(a, b + _STEP_MM, _STEP_MM) for a, b in zip(low, high))
+    points = point + u[:, None, None] * axes[:, 0] + v[None, :, None] * axes[:, 1]
+    index = labels.point_to_index(points)[..., ::-1]
+    cover = map_coordinates(
+        labels.limb.astype(np.float32), np.moveaxis(index, -1, 0), order=1, mode="constant", cval=0.0
+    )
+    inside = gaussian_filter(cover, _SMOOTH_MM / _STEP_MM) > 0.5
+    parts, count = connected(inside)
+    if count == 0:
+        raise LabelError("the amputation plane misses the limb", remedy="move its point into the limb")
+    inside = parts == int(np.argmax(np.bincount(parts.ravel())[1:])) + 1
+    image = np.all((index > -0.5) & (index < np.array(labels.array.shape) - 0.5), axis=-1)
+    rim = inside & (distance_transform_edt(image) <= 1.0)
+    return _Section(point + axes @ low, axes, distance_transform_edt(inside) * _STEP_MM, not rim.any())
+
+
+def _check(labels: LabelMap, array: NDArray[np.uint8], section: _Section, height: Array, pad: float) -> None:
+    if not section.whole:
+        raise LabelError(
+            "the image ends within the limb's cross-section at the amputation plane",
+            remedy="move the plane proximally",
+        )
+    border = np.ones(array.shape, dtype=bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    if np.any(border & (array > 0) & (height < 0)):
+        raise LabelError(
+            f"the image ends less than {pad:g} mm distal of the amputation plane",
+            remedy="move the plane proximally, or make amputation_pad_mm smaller",
+        )

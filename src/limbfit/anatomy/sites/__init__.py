@@ -1,0 +1,1 @@
+"""Where the limb is indented: given positions, skin markers, registration of two scans."""

@@ -1,0 +1,173 @@
+"""The skin of an image with markers on it, and the same image without them.
+
+The outline with markers is a contour of the grey values, not of a mask: a marker is a few voxels wide, and
+its place follows from how much of each voxel it fills. Without a second image the skin under a marker is what
+the skin around it suggests: quadratic patches, fitted to the outline so that what stands out does not pull.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, grey_dilation
+from scipy.spatial import cKDTree
+
+from ..grid import Volume
+from ..segmentation.body import ball, check_contrast, limb_mask, smoothed
+from ..surfaces.triangles import Surface, bodies, from_pyvista
+from .markers import Bump, bumps, cap_faces, near_cap
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
+_SPACING_MM = 3.0  # of the places where patches are fitted
+_NEIGHBOURS = 160  # of such places under a patch: some 20 mm around
+_REJECT_MM = 0.7  # what stands out of a patch by more does not pull it
+_ROUNDS = 8
+_AROUND_MM = 2.5  # a marker's foot beyond what stands out
+_PATCH_MM = 14.0  # of skin around a foot that tells how the skin under it runs
+_ABOVE_MM = 15.0  # no marker is higher
+
+
+def marked_skin(volume: Volume) -> tuple[Surface, Mask]:
+    """The skin of an image with the markers on it, LPS mm, and the limb's mask ``[k, j, i]``.
+
+    Where the image ends, the skin is closed by a flat cap.
+    """
+    check_contrast(volume)
+    smooth = smoothed(volume)
+    limb = limb_mask(volume, smooth)
+    near = ball(_RIM_MM, volume.spacing)
+    core = binary_erosion(limb, near, border_value=1)
+    size = 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 1
+    half = gaussian_filter(0.5 * grey_dilation(smooth, size=tuple(size)), 1.0)
+    level = np.clip(smooth / np.maximum(half, 1e-6) - 1, -1, 1)
+    level[core] = 1.0
+    level[~binary_dilation(limb, near)] = -1.0
+    padded = np.pad(level, 1, constant_values=-1.0)
+    data = pv.ImageData(dimensions=padded.shape[::-1])
+    data.point_data["level"] = padded.ravel()
+    found = from_pyvista(data.contour([0.0], scalars="level", method="flying_edges", compute_normals=False))
+    skin = bodies(Surface(volume.index_to_point(found.points - 1), found.faces))[0]
+    return (skin if skin.volume > 0 else skin.flipped), limb
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """A quadratic height function over a tangent plane; rows of ``frame``: two tangents and the normal."""
+
+    origin: Array
+    frame: Array
+    coefficients: Array
+
+    def local(self, points: Array) -> tuple[Array, Array]:
+        """Distance from the axis (n,) and height above the patch (n,) of points (n, 3), mm."""
+        u, v, h = self.frame @ (points - self.origin).T
+        return np.hypot(u, v), h - _basis(u, v) @ self.coefficients
+
+
+def without_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
+    """The image with the markers on its skin turned into air, and how many there were.
+
+    Parameters
+    ----------
+    volume : an image with markers on.
+    skin : its outline (:func:`marked_skin`).
+    """
+    found = bumps(skin, outline_height(skin))
+    marked = np.zeros(len(skin.points), bool)
+    for bump in found:
+        marked[bump.feet] = True
+    array = volume.array.copy()
+    air = float(np.median(array[array < 0.2 * np.percentile(array, 99)]))
+    normals = skin.vertex_normals
+    for bump in found:
+        _clear(array, volume, *_patch_under(skin, normals, marked, bump), air)
+    return volume.with_array(array), len(found)
+
+
+def outline_height(skin: Surface) -> Array:
+    """How far each vertex (n,) stands out of the patch of skin around it, mm; 0 near the cap."""
+    normals = skin.vertex_normals
+    cells = np.floor(skin.points / _SPACING_MM).astype(np.int64)
+    places = np.unique(cells, axis=0, return_index=True)[1]
+    cap = near_cap(skin, cap_faces(skin), skin.points)
+    places = places[~cap[places]]
+    points = skin.points[places]
+    tree = cKDTree(points)
+    around = tree.query(points, k=min(_NEIGHBOURS, len(points)))[1]
+    frames = _frames(normals[places][around].mean(axis=1))
+    offsets = np.einsum("nab,nkb->nka", frames, points[around] - points[:, None])
+    facing = np.einsum("nkb,nb->nk", normals[places][around], frames[:, 2]) > 0.3
+    coefficients = _fitted(offsets, facing)
+    nearest = tree.query(skin.points)[1]
+    u, v, h = np.einsum("nab,nb->an", frames[nearest], skin.points - points[nearest])
+    height = h - (_basis(u, v) * coefficients[nearest]).sum(axis=1)
+    height[cap] = 0.0
+    return height
+
+
+def _basis(u: Array, v: Array) -> Array:
+    """Quadratic polynomials (..., 6) over a tangent plane, of the order of one 10 mm away."""
+    u, v = u / 10, v / 10
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
+def _frames(normals: Array) -> Array:
+    """Two tangents and the normal (n, 3, 3), rows, of normals (n, 3) of any length."""
+    normal = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    other = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    first = np.cross(normal, other)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normal, first), normal], axis=1)
+
+
+def _fitted(offsets: Array, usable: Mask) -> Array:
+    """Coefficients (n, 6) of patches over local points (n, k, 3), with Geman and McClure's weights.
+
+    The width of the weights shrinks from round to round, so that no start has to be right.
+    """
+    design = _basis(offsets[..., 0], offsets[..., 1])
+    weight = usable.astype(float)
+    coefficients = np.zeros((len(offsets), 6))
+    for width in np.geomspace(8 * _REJECT_MM, _REJECT_MM, _ROUNDS):
+        weighted = design * weight[..., None]
+        matrix = np.einsum("nka,nkb->nab", weighted, design) + 1e-6 * np.eye(6)
+        right = np.einsum("nka,nk->na", weighted, offsets[..., 2])
+        coefficients = np.linalg.solve(matrix, right[..., None])[..., 0]
+        residual = offsets[..., 2] - np.einsum("nka,na->nk", design, coefficients)
+        weight = usable / (1 + (residual / width) ** 2) ** 2
+    return coefficients
+
+
+def _patch_under(skin: Surface, normals: Array, marked: Mask, bump: Bump) -> tuple[_Patch, float]:
+    """The skin under a marker, from the skin around its foot, and the radius of the foot, mm."""
+    centre = skin.points[bump.feet].mean(axis=0)
+    distance = np.linalg.norm(skin.points - centre, axis=1)
+    foot = float(distance[bump.feet].max()) + _AROUND_MM
+    near = (distance < foot + _PATCH_MM) & (distance > foot) & ~marked
+    (frame,) = _frames(normals[near].mean(axis=0)[None])
+    near &= normals @ frame[2] > 0.3
+    offsets = (skin.points[near] - centre) @ frame.T
+    (coefficients,) = _fitted(offsets[None], np.ones((1, len(offsets)), bool))
+    return _Patch(centre, frame, coefficients), foot
+
+
+def _clear(array: NDArray[np.float32], volume: Volume, patch: _Patch, radius: float, air: float) -> None:
+    """Turn what is above a patch into air, in place; voxels that the patch cuts keep their share."""
+    reach = np.ceil((radius + _ABOVE_MM) / volume.spacing).astype(int) + 1
+    middle = np.rint(volume.point_to_index(patch.origin)).astype(int)
+    low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, volume.size)
+    box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+    index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), axis=-1)
+    index = index.transpose(2, 0, 1, 3)  # [k, j, i]
+    aside, height = patch.local(volume.index_to_point(index).reshape(-1, 3))
+    width = float(np.abs(volume.direction.T @ patch.frame[2]) @ volume.spacing)
+    share = np.clip(0.5 - height / width, 0, 1)
+    share[(aside > radius) | (height > _ABOVE_MM)] = 1.0
+    share = share.reshape(index.shape[:3])
+    array[box] = np.where(share < 1, np.minimum(array[box], air + (array[box] - air) * share), array[box])

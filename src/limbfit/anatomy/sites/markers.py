@@ -1,0 +1,241 @@
+"""Skin markers from two surfaces of the same limb, with and without them (paper, section 2.1.1, figure 1).
+
+What stands out of the skin by more than a threshold is clustered; each cluster that is high and small enough
+is a marker. The flat proximal cap is no skin and takes no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ...errors import SiteError
+from ..surfaces.triangles import Surface, half_edges
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+CAP_MARGIN_MM = 6.0
+MIN_HEIGHT_MM, MAX_AREA_MM2 = 2.0, 500.0
+NORMAL_RADIUS_MM = 8.0
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A bump on the skin: ``position`` and unit outward ``direction`` (LPS mm) on the skin without markers.
+
+    ``height`` is its greatest height in mm, ``area`` the surface of its upper half in mm2.
+    """
+
+    position: Array
+    height: float
+    area: float
+    direction: Array
+
+
+@dataclass(frozen=True)
+class Bump:
+    """Vertices of a surface that stand out together: all of them, and those of the upper half."""
+
+    feet: Indices
+    upper: Indices
+    height: float
+    area: float
+
+
+def find_markers(
+    skin_with: Surface,
+    skin_without: Surface,
+    *,
+    min_height_mm: float = MIN_HEIGHT_MM,
+    max_area_mm2: float = MAX_AREA_MM2,
+) -> tuple[Marker, ...]:
+    """Markers on a limb, from the distance between its surfaces with and without them.
+
+    Parameters
+    ----------
+    skin_with, skin_without : closed outward surfaces of the limb in one place (``registration`` lays the
+        images of two scans onto each other).
+    min_height_mm : the least height of a marker; half of it is where bumps are told apart.
+    max_area_mm2 : what is larger is no marker (a cushion, a fold, a bandage).
+
+    Returns
+    -------
+    tuple[Marker, ...]
+        Highest first; empty where nothing stands out.
+    """
+    base = _Skin(skin_without)
+    height = base.height(skin_with.points)
+    height[base.near_cap(skin_with.points)] = 0.0
+    areas = _vertex_areas(skin_with)
+    found = []
+    for bump in bumps(skin_with, height, min_height_mm=min_height_mm, max_area_mm2=max_area_mm2):
+        weights = areas[bump.upper] * height[bump.upper]
+        position, direction = base.foot(skin_with.points[bump.upper], weights)
+        found.append(Marker(position, bump.height, bump.area, direction))
+    return tuple(sorted(found, key=lambda marker: -marker.height))
+
+
+def bumps(
+    surface: Surface,
+    height: Array,
+    *,
+    min_height_mm: float = MIN_HEIGHT_MM,
+    max_area_mm2: float = MAX_AREA_MM2,
+) -> list[Bump]:
+    """What stands out high and small enough for a marker; ``height`` (n,) of each vertex, mm."""
+    labels = _clusters(height > min_height_mm / 2, surface.faces)
+    areas = _vertex_areas(surface)
+    found = []
+    for label in range(labels.max(initial=-1) + 1):
+        feet = np.flatnonzero(labels == label)
+        tallest = float(height[feet].max())
+        upper = feet[height[feet] > tallest / 2]  # terraces of the skin may touch a marker's foot
+        area = float(areas[upper].sum())
+        if tallest >= min_height_mm and area <= max_area_mm2:
+            found.append(Bump(feet, upper, tallest, area))
+    return found
+
+
+def match_markers(
+    markers: Sequence[Marker], hints: Mapping[str, Array], *, max_distance_mm: float = 15.0
+) -> dict[str, Marker]:
+    """Give each named place its marker, one to one, with the least total distance.
+
+    Markers that no place asks for are left over: a limb may carry more markers than the study has sites.
+
+    Parameters
+    ----------
+    hints : rough position (3,) in LPS mm by site name.
+    max_distance_mm : how far a marker may lie from its hint.
+
+    Raises
+    ------
+    SiteError
+        When a place has no marker within reach, or more than one; it names them all.
+    """
+    if not hints:
+        return {}
+    names = list(hints)
+    distance = _distances(markers, np.array([np.asarray(hints[name], float) for name in names]))
+    # A pair beyond reach costs more than any choice of pairs within it, so reach goes before nearness.
+    cost = np.where(distance <= max_distance_mm, distance, 1e3 * (1 + max_distance_mm) * len(names))
+    rows, columns = linear_sum_assignment(cost)
+    pairs = {r: c for r, c in zip(rows, columns, strict=True) if distance[r, c] <= max_distance_mm}
+    faults = [check(names, pairs, distance, max_distance_mm) for check in (_missing, _doubled)]
+    if any(faults):
+        raise SiteError(
+            "; ".join(filter(None, faults)),
+            place="sites",
+            remedy="correct 'near', or give the site's 'position' on the skin",
+        )
+    return {names[r]: markers[c] for r, c in pairs.items()}
+
+
+def _distances(markers: Sequence[Marker], hints: Array) -> Array:
+    if not markers:
+        return np.empty((len(hints), 0))
+    positions = np.array([marker.position for marker in markers])
+    return np.linalg.norm(hints[:, None] - positions, axis=-1)
+
+
+def _missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+    """What to say of places without a marker; empty where there are none."""
+    missing = [r for r in range(len(names)) if r not in pairs]
+    told = [
+        f"{names[r]} (nearest at {distance[r].min():.1f} mm)" if distance.shape[1] else names[r]
+        for r in missing
+    ]
+    return f"no marker of its own within {reach:g} mm for {', '.join(told)}" if told else ""
+
+
+def _doubled(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+    """What to say of places with a spare marker near them; empty where there are none."""
+    spare = np.setdiff1d(np.arange(distance.shape[1]), list(pairs.values()))
+    doubled = [names[r] for r in pairs if (distance[r, spare] <= reach).any()]
+    return f"more than one marker within {reach:g} mm of {', '.join(doubled)}" if doubled else ""
+
+
+class _Skin:
+    """The skin without markers, asked for heights, closest points and normals; its cap set apart."""
+
+    def __init__(self, surface: Surface) -> None:
+        self.surface = surface
+        self.points, self.faces = np.ascontiguousarray(surface.points), np.ascontiguousarray(surface.faces)
+        self.normals, self.areas = surface.face_normals, surface.face_areas
+        self.centres = surface.triangles.mean(axis=1)
+        self.cap = cap_faces(surface)
+        self.open_faces = np.ascontiguousarray(self.faces[~self.cap])
+
+    def height(self, points: Array) -> Array:
+        """Signed distance (n,), positive outside."""
+        sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+        return igl.signed_distance(np.ascontiguousarray(points), self.points, self.faces, sign)[0]
+
+    def near_cap(self, points: Array) -> NDArray[np.bool_]:
+        """Which points (n,) lie beyond the cap's plane or just under it."""
+        return near_cap(self.surface, self.cap, points)
+
+    def foot(self, points: Array, weights: Array) -> tuple[Array, Array]:
+        """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
+        centre = np.average(points, axis=0, weights=weights)[None]
+        (foot,) = igl.point_mesh_squared_distance(centre, self.points, self.open_faces)[2]
+        near = ~self.cap & (np.linalg.norm(self.centres - foot, axis=1) < NORMAL_RADIUS_MM)
+        if not near.any():
+            near = np.arange(len(self.faces)) == np.linalg.norm(self.centres - foot, axis=1).argmin()
+        normal = (self.normals[near] * self.areas[near, None]).sum(axis=0)
+        return foot, normal / np.linalg.norm(normal)
+
+
+def cap_faces(surface: Surface) -> NDArray[np.bool_]:
+    """Faces of the one plane that holds more than 3 % of a surface: the cut; skin has no such plane."""
+    normals, areas, centres = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
+    levels = (normals * centres).sum(axis=1)
+    keys = np.rint(np.column_stack([50 * normals, levels])).astype(np.int64)
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.ravel()
+    share = np.bincount(group, weights=areas) / areas.sum()
+    if share.max() < 0.03:
+        return np.zeros(len(normals), bool)
+    members = group == share.argmax()
+    normal = np.average(normals[members], axis=0, weights=areas[members])
+    normal /= np.linalg.norm(normal)
+    level = np.average(centres[members] @ normal, weights=areas[members])
+    return (normals @ normal > 0.98) & (np.abs(centres @ normal - level) < 1.0)
+
+
+def near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
+    """Which points (n,) lie beyond the plane of a surface's cap (faces of it) or just under it."""
+    if not cap.any():
+        return np.zeros(len(points), bool)
+    areas = surface.face_areas[cap]
+    normal = np.average(surface.face_normals[cap], axis=0, weights=areas)
+    normal /= np.linalg.norm(normal)
+    level = np.average(surface.triangles[cap].mean(axis=1) @ normal, weights=areas)
+    return points @ normal > level - CAP_MARGIN_MM
+
+
+def _clusters(raised: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cluster number (n,) of raised vertices that share edges; -1 elsewhere."""
+    edges = half_edges(faces)
+    edges = edges[raised[edges].all(axis=1)]
+    n = len(raised)
+    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    _, component = connected_components(graph, directed=False)
+    labels = np.full(n, -1, np.int64)
+    if raised.any():
+        labels[raised] = np.unique(component[raised], return_inverse=True)[1]
+    return labels
+
+
+def _vertex_areas(surface: Surface) -> Array:
+    areas = np.zeros(len(surface.points))
+    np.add.at(areas, surface.faces, surface.face_areas[:, None] / 3)
+    return areas

@@ -1,0 +1,125 @@
+"""Indentation sites on the skin: the nearest skin point and the direction of the indenter."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import SiteError
+from ..surfaces.surfaces import Anatomy
+from ..surfaces.triangles import Surface
+
+Array = NDArray[np.float64]
+
+FARTHEST_MM = 5.0
+SAMPLE_EDGE_MM = 1.0
+AXIS_STEPS = 4
+_ON_CUT_MM = 0.01
+
+
+def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = None) -> tuple[Array, float]:
+    """The skin point (3,) nearest to a position (3,), LPS mm, and its distance in mm.
+
+    Raises
+    ------
+    SiteError
+        When the position lies more than 5 mm off the skin; ``name`` says which site.
+    """
+    query = np.asarray(position, dtype=float)
+    if query.shape != (3,) or not np.isfinite(query).all():
+        raise SiteError("a position has three finite coordinates", place=name, remedy="give LPS millimetres")
+    skin = anatomy.skin
+    squared, _, nearest = igl.point_mesh_squared_distance(query[None], skin.points, skin.faces)
+    distance = float(np.sqrt(squared[0]))
+    if distance > FARTHEST_MM:
+        raise SiteError(
+            f"lies {distance:.1f} mm off the skin",
+            place=name,
+            remedy="give the position in LPS millimetres of the image (3D Slicer shows RAS: negate x and y)",
+        )
+    return np.asarray(nearest[0], dtype=float), distance
+
+
+def thinnest_tissue(anatomy: Anatomy, bone: str) -> tuple[float, Array]:
+    """Least distance (mm) from a bone to the skin, and where it is on the bone (3,); the cut is no skin."""
+    skin, points = anatomy.skin, anatomy.bones[bone].points
+    open_faces = skin.faces[(np.abs(anatomy.height(skin.points)) > _ON_CUT_MM)[skin.faces].any(axis=1)]
+    inner = np.ascontiguousarray(points[anatomy.height(points) < 0])
+    squared = igl.point_mesh_squared_distance(inner, skin.points, np.ascontiguousarray(open_faces))[0]
+    least = int(np.argmin(squared))
+    return float(np.sqrt(squared[least])), inner[least]
+
+
+def indenter_axis(skin: Surface, position: ArrayLike, width: float, edge: ArrayLike | None = None) -> Array:
+    """The unit inward axis (3,): the area-weighted mean inward normal of the skin under a square footprint.
+
+    Parameters
+    ----------
+    skin : closed, outward.
+    position : (3,) the footprint's centre, on the skin.
+    width : side of the square, mm.
+    edge : (3,) an edge direction of the square; the cross product of axis and z (or x) when not given.
+
+    Raises
+    ------
+    SiteError
+        When no skin lies under the footprint.
+    """
+    centre = np.asarray(position, dtype=float)
+    points, normals = _samples(skin, centre, width)
+    face = igl.point_mesh_squared_distance(centre[None], skin.points, skin.faces)[1]
+    axis = _unit(-_area_vectors(skin.points[skin.faces[face]])[0])
+    for _ in range(AXIS_STEPS):
+        across = square_edges(axis, edge) @ (points - centre).T
+        under = (np.abs(across) <= width / 2).all(axis=0) & (normals @ axis < 0)
+        if not under.any():
+            raise SiteError("no skin lies under the indenter", remedy="check the site's position")
+        axis = _unit(-normals[under].sum(axis=0))
+    return axis
+
+
+def square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
+    """The two unit edge directions (2, 3) of a square indenter, both normal to its axis.
+
+    Without ``edge``, the first is the cross product of axis and z, or of axis and x where axis is z.
+    """
+    along_z = abs(axis[2]) > 0.999
+    first = (
+        np.cross(axis, [1.0, 0, 0] if along_z else [0, 0, 1.0]) if edge is None else np.asarray(edge, float)
+    )
+    first = first - (first @ axis) * axis
+    if np.linalg.norm(first) < 1e-6:
+        raise SiteError(
+            "edge is parallel to the axis", remedy="give a direction along one edge of the square"
+        )
+    first = _unit(first)
+    return np.array([first, np.cross(axis, first)])
+
+
+def _samples(skin: Surface, centre: Array, width: float) -> tuple[Array, Array]:
+    """Centroids and area vectors of small pieces of the faces near a footprint."""
+    corners, fine = skin.points[skin.faces], []
+    while len(corners):
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        close = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - edges < width
+        fine.append(corners[close & (edges <= SAMPLE_EDGE_MM)])
+        corners = _quartered(corners[close & (edges > SAMPLE_EDGE_MM)])
+    corners = np.concatenate(fine)
+    near = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < width
+    return corners[near].mean(axis=1), _area_vectors(corners[near])
+
+
+def _quartered(corners: Array) -> Array:
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])
+
+
+def _area_vectors(corners: Array) -> Array:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+
+
+def _unit(vector: Array) -> Array:
+    return vector / np.linalg.norm(vector)

@@ -1,0 +1,1 @@
+"""Triangle surfaces: extracted from voxels, read, mended, their distances."""

@@ -1,0 +1,188 @@
+"""From a mask of voxels to a smooth closed surface with even triangles.
+
+The signed distance to the mask, rather than the mask itself, is smoothed: between thick slices it
+interpolates the *shape*, so that a sloping surface shows no terraces (Raya and Udupa 1990, shape-based
+interpolation). The level of the contour, and last a shift along the normals, keep the volume of the mask,
+which smoothing and coarse triangles would otherwise shrink where the surface is curved.
+"""
+
+from __future__ import annotations
+
+import gpytoolbox
+import numpy as np
+import pyvista as pv
+import SimpleITK as sitk  # noqa: N813
+from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter
+from scipy.ndimage import label as connected
+
+from ...errors import LabelError
+from ..grid import Grid, LabelMap, Volume
+from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
+
+Mask = NDArray[np.bool_]
+Field = NDArray[np.float32]
+
+_SIGMA_VOXELS = 0.7
+# Passes and pass band of Taubin's filter, which takes out terraces wider than the Gaussian; skin has no
+# edges to lose, bones have.
+_TAUBIN_SKIN, _TAUBIN_BONE = (80, 0.008), (40, 0.03)
+_MARGIN_MM = 4.0
+_REMESH_PASSES = 8
+_MOST_RELAXED = 20
+
+
+def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -> Surface:
+    """The closed surface of one label, or of the whole limb.
+
+    Parameters
+    ----------
+    labels : the label map.
+    which : a label's name; None for the limb with all that is in it.
+    edge_mm : edge length of the triangles.
+
+    Returns
+    -------
+    Surface
+        LPS mm, outward, watertight, of the mask's volume; only the largest body of the mask.
+
+    Raises
+    ------
+    LabelError
+        Where there is nothing to extract.
+    """
+    fine = fine_surface(labels, which, edge_mm)
+    return untangled(keep_volume(untangled(remesh(fine, edge_mm)), fine.volume))
+
+
+def fine_surface(labels: LabelMap, which: str | None, edge_mm: float) -> Surface:
+    """The same surface with the many uneven triangles of marching cubes, for cutting and remeshing."""
+    mask = labels.limb if which is None else labels.mask(which)
+    body, crop = _body(mask, labels, which or "limb")
+    field, level = smooth_field(body, crop, edge_mm)
+    fine = _smooth(_contour(field, level), *(_TAUBIN_SKIN if which is None else _TAUBIN_BONE))
+    return keep_volume(fine, float(body.sum()) * crop.voxel_mm3)
+
+
+def _body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
+    """The largest connected body without inner holes, cropped with a margin of empty voxels."""
+    parts, count = connected(mask)
+    if count == 0:
+        raise LabelError(f"no voxel is labelled {name!r}")
+    sizes = np.bincount(parts.ravel())[1:]
+    best = int(np.argmax(sizes)) + 1
+    box = find_objects(parts)[best - 1]
+    body = binary_fill_holes(parts[box] == best)
+    pad = np.ceil(_MARGIN_MM / grid.spacing).astype(int) + 2
+    padded = np.pad(body, [(p, p) for p in pad[::-1]])
+    start = np.array([part.start for part in box])[::-1] - pad
+    crop = Grid(padded, grid.spacing, grid.index_to_point(start), grid.direction)
+    return padded, crop
+
+
+def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]:
+    """Smoothed signed distance (mm, positive inside) on cubic voxels, and the level that keeps the volume."""
+    distance = signed_distance_to(body, grid)
+    smooth = Volume(
+        gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), grid.spacing, grid.origin, grid.direction
+    )
+    cubic = _cubic(smooth, edge_mm)
+    wanted = round(float(body.sum()) * grid.voxel_mm3 / cubic.voxel_mm3)
+    values = cubic.array.ravel()
+    place = len(values) - min(wanted, len(values) - 1)
+    return cubic, float(np.partition(values, place)[place])
+
+
+def signed_distance_to(body: Mask, grid: Grid) -> Field:
+    """Distance of each voxel to the nearest one on the other side, mm, positive inside, clamped."""
+    reach = 3 * grid.spacing.max()
+
+    def outside(mask: Mask) -> Field:
+        image = sitk.GetImageFromArray(mask.astype(np.uint8))
+        image.SetSpacing(grid.spacing.tolist())
+        distance = sitk.SignedMaurerDistanceMap(image, squaredDistance=False, useImageSpacing=True)
+        return np.clip(sitk.GetArrayFromImage(distance), 0, reach)
+
+    return outside(~body) - outside(body)
+
+
+def _cubic(field: Volume, edge_mm: float) -> Volume:
+    """The field on cubic voxels fine enough for triangles of ``edge_mm``."""
+    h = edge_mm / 2.5
+    size = np.floor((np.array(field.size) - 1) * field.spacing / h).astype(int) + 1
+    resampled = sitk.Resample(
+        field.to_sitk(),
+        size.tolist(),
+        sitk.Transform(),
+        sitk.sitkBSpline3,
+        field.origin.tolist(),
+        [h, h, h],
+        field.direction.ravel().tolist(),
+        float(field.array.min()),
+        sitk.sitkFloat32,
+    )
+    return Volume.from_sitk(resampled)
+
+
+def _contour(field: Volume, level: float) -> Surface:
+    """The isosurface in LPS mm, outward; its largest body."""
+    image = pv.ImageData(dimensions=field.size)
+    image.point_data["distance"] = field.array.ravel()
+    found = from_pyvista(
+        image.contour([level], scalars="distance", method="flying_edges", compute_normals=False)
+    )
+    surface = bodies(Surface(field.index_to_point(found.points), found.faces))[0]
+    return surface if surface.volume > 0 else surface.flipped
+
+
+def _smooth(surface: Surface, passes: int, band: float) -> Surface:
+    """Without short waves (Taubin 1995: windowed sinc)."""
+    poly = surface.to_pyvista().smooth_taubin(n_iter=passes, pass_band=band, normalize_coordinates=True)
+    return from_pyvista(poly)
+
+
+def remesh(
+    surface: Surface, edge_mm: float, creases: NDArray[np.int64] | None = None, passes: int = _REMESH_PASSES
+) -> Surface:
+    """Even triangles of ``edge_mm`` on the same shape (Botsch and Kobbelt 2004).
+
+    ``creases`` (n, 2) are edges to keep sharp.
+    """
+    points, faces = gpytoolbox.remesh_botsch(
+        surface.points,
+        surface.faces.astype(np.int32),
+        i=passes,
+        h=edge_mm,
+        project=True,
+        feature_edges=None if creases is None else creases.astype(np.int32),
+    )
+    return Surface(points, faces)
+
+
+def untangled(surface: Surface) -> Surface:
+    """Without faces that cross: their points go half-way to the mean of their neighbours, until none do.
+
+    Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at a patella's rim.
+    What still crosses after that is left to the check of the anatomy.
+    """
+    edges = half_edges(surface.faces)
+    for _ in range(_MOST_RELAXED):
+        crossing = self_intersections(surface)
+        if not len(crossing):
+            break
+        moved = np.unique(surface.faces[np.unique(crossing)])
+        means = np.zeros_like(surface.points)
+        np.add.at(means, edges[:, 0], surface.points[edges[:, 1]])
+        means /= np.bincount(edges[:, 0], minlength=len(means))[:, None]
+        points = surface.points.copy()
+        points[moved] = 0.5 * (points[moved] + means[moved])
+        surface = Surface(points, surface.faces)
+    return surface
+
+
+def keep_volume(surface: Surface, volume: float) -> Surface:
+    """Shifted along its normals until it encloses ``volume`` (mm3): chords cut the corners of a curve."""
+    for _ in range(3):
+        shift = (volume - surface.volume) / surface.area
+        surface = Surface(surface.points + shift * surface.vertex_normals, surface.faces)
+    return surface

@@ -1,0 +1,266 @@
+"""Given surfaces closed as scans and atlases need it: one open end capped, small holes filled, each told.
+
+Vocabulary
+----------
+loop   a closed line of edges that have a face on one side only.
+cap    the flat end of a surface that was open: the surface is cut by the plane that fits the loop, moved
+       inward to the loop's lowest point, and closed there, so that the cap cannot cross what it closes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import SurfaceError
+from .extraction import untangled
+from .surfaces import Anatomy, check_anatomy
+from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SMALL_MM = 10.0  # a hole that is no wider is filled
+FEW_EDGES, FEW_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
+LOOSE_SHARE = 0.01  # of the faces: open pieces that hold less are left out
+MOST_CROSSING, MOST_SMOOTHED_MM = 200, 4.0  # pairs of faces that are smoothed until they do not cross
+END_SHARE = 0.03  # of the skin's area: a smaller opening is a hole in its side and not its proximal end
+WIDENED = 2.0  # a cap so much larger than the opening cuts through the body
+INSIDE_MM = 0.5  # of the loop's lowest point, where the cap lies
+JOIN_MM = 1e-6
+BELOW_MM = 2.0  # the lowest cap of the proximal end, where the default cut is
+PROXIMAL_MM = 25.0  # of the skin's cap: a bone that ends farther below it ends within the limb
+
+
+@dataclass(frozen=True)
+class Cap:
+    """Where an open end was closed: the cap's outline (n, 3), LPS mm, and its outward unit normal."""
+
+    outline: Array
+    normal: Array
+
+
+@dataclass(frozen=True)
+class Mended:
+    """A surface after mending, the cap of its open end if it had one, and what was done, in words."""
+
+    surface: Surface
+    cap: Cap | None
+    notes: tuple[str, ...]
+
+
+def mended(surface: Surface, name: str, file: Path | None = None) -> Mended:
+    """A surface without loose pieces and small holes, its one open end capped, few crossing faces smoothed.
+
+    Whatever else keeps it from bounding a body is left for `triangles.check_closed`.
+
+    Raises
+    ------
+    SurfaceError
+        For more than one open loop of notable size, or one whose outline crosses itself.
+    """
+    surface, notes = _without_loose(surface, name)
+    loops = open_loops(surface)
+    small = [loop for loop in loops if _is_small(surface, loop)]
+    large = [loop for loop in loops if not _is_small(surface, loop)]
+    if len(large) > 1:
+        places = " and ".join(_place(surface.points[loop].mean(axis=0)) for loop in large[:3])
+        raise SurfaceError(
+            f"{name}: {len(large)} open ends or large holes, at {places}",
+            file=file,
+            remedy="close all but the proximal end",
+        )
+    for loop in small:
+        surface, area = _filled(surface, loop)
+        where = _place(surface.points[loop].mean(axis=0))
+        notes += (f"{name}: a hole of {len(loop)} edges at {where} filled, {area:.1f} mm2",)
+    surface, crossing = _uncrossed(surface, name)
+    notes += crossing
+    if not large:
+        return Mended(surface, None, notes)
+    rim = surface.points[large[0]]
+    surface, cap, area = _capped(surface, rim, name, file)
+    note = (
+        f"{name}: open at one end, cut flat {np.ptp(rim @ cap.normal) + INSIDE_MM:.1f} mm below its highest "
+        f"edge and closed by a cap at {_place(cap.outline.mean(axis=0))}, {area:.0f} mm2"
+    )
+    return Mended(surface, cap, (*notes, note))
+
+
+def closed_anatomy(
+    skin: Surface,
+    bones: Mapping[str, Surface],
+    cut: tuple[ArrayLike, ArrayLike] | None = None,
+    files: Mapping[str, Path] | None = None,
+) -> tuple[Anatomy, tuple[str, ...]]:
+    """The checked anatomy of given surfaces, mended, and what was mended, in words.
+
+    Parameters
+    ----------
+    skin, bones : LPS mm.
+    cut : point and proximal normal of the proximal cut; by default just inside the caps of skin and bones,
+        across the skin's, or the highest (z) of a skin that is closed.
+    files : by the surfaces' names, for the text of errors.
+
+    Raises
+    ------
+    SurfaceError
+        For a surface that cannot be mended, or an anatomy that :func:`check_anatomy` refuses.
+    """
+    files = files or {}
+    outer = mended(skin, "skin", files.get("skin"))
+    inner = {name: mended(bone, name, files.get(name)) for name, bone in bones.items()}
+    if cut is None:
+        cut = _default_cut(outer, list(inner.values()))
+    closed = {name: part.surface for name, part in inner.items()}
+    anatomy = Anatomy(outer.surface, closed, np.asarray(cut[0]), np.asarray(cut[1]))
+    check_anatomy(anatomy, files)
+    return anatomy, tuple(note for part in (outer, *inner.values()) for note in part.notes)
+
+
+def _default_cut(skin: Mended, bones: Sequence[Mended]) -> tuple[Array, Array]:
+    """Below all caps at the proximal end, so that bones stick out of it; point and normal."""
+    if skin.cap is None or _area(skin.cap.outline) < END_SHARE * skin.surface.area:
+        return np.array([0.0, 0.0, skin.surface.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
+    normal, middle = skin.cap.normal, skin.cap.outline.mean(axis=0)
+    caps = [bone.cap for bone in bones if bone.cap is not None and bone.cap.normal @ normal > 0]
+    heights = [((cap.outline - middle) @ normal).min() for cap in (skin.cap, *caps)]
+    return middle + (min(h for h in heights if h > -PROXIMAL_MM) - BELOW_MM) * normal, normal
+
+
+def _place(point: Array) -> str:
+    return "(" + ", ".join(f"{x:.1f}" for x in point) + ") mm"
+
+
+def _without_loose(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
+    """Without small open pieces beside the largest body; a small closed one may be meant and stays."""
+    main, *others = bodies(surface)
+    few = LOOSE_SHARE * len(surface.faces)
+    loose = [part for part in others if len(part.faces) < few and len(open_edges(part))]
+    if not loose:
+        return surface, ()
+    kept = [main, *(part for part in others if not any(part is piece for piece in loose))]
+    starts = np.cumsum([0, *(len(part.points) for part in kept)])
+    faces = np.concatenate([part.faces + start for part, start in zip(kept, starts)])
+    count, where = sum(len(part.faces) for part in loose), _place(loose[0].points.mean(axis=0))
+    note = f"{name}: {len(loose)} loose pieces of {count} triangles left out, the first at {where}"
+    return Surface(np.concatenate([part.points for part in kept]), faces), (note,)
+
+
+def open_edges(surface: Surface) -> Ints:
+    """(k, 2) directed edges of the faces that no other face shares."""
+    edges = half_edges(surface.faces)
+    _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edges[counts[inverse.ravel()] == 1]
+
+
+def open_loops(surface: Surface) -> list[Ints]:
+    """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
+    following: dict[int, list[int]] = {}
+    for start, end in open_edges(surface).tolist():
+        following.setdefault(start, []).append(end)
+    loops = []
+    while following:
+        way = [next(iter(following))]
+        while following.get(way[-1]):
+            here = following[way[-1]].pop()
+            if not following[way[-1]]:
+                del following[way[-1]]
+            if here in way:
+                at = way.index(here)
+                loops.append(np.array(way[at:]))
+                way = way[: at + 1]
+            else:
+                way.append(here)
+        following.pop(way[-1], None)
+    return loops
+
+
+def _is_small(surface: Surface, loop: Ints) -> bool:
+    points = surface.points[loop]
+    if np.linalg.norm(np.ptp(points, axis=0)) <= SMALL_MM:
+        return True
+    return len(loop) <= FEW_EDGES and _area(points) < FEW_SHARE * surface.area
+
+
+def _area_vector(loop: Array) -> Array:
+    """Of what a loop (n, 3) spans, mm2, against the sense of its faces: it points out of the body."""
+    spokes = loop - loop.mean(axis=0)
+    return np.asarray(-0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0))
+
+
+def _area(loop: Array) -> float:
+    """What a loop (n, 3) spans, mm2."""
+    return float(np.linalg.norm(_area_vector(loop)))
+
+
+def _filled(surface: Surface, loop: Ints) -> tuple[Surface, float]:
+    """A small hole closed, by one triangle or a fan about its middle; the area of the fan (mm2)."""
+    points, back = surface.points, loop[::-1]
+    if len(loop) == 3:
+        fan = back[None]
+    else:
+        points = np.vstack([points, points[loop].mean(axis=0)])
+        middle = np.full(len(loop), len(points) - 1)
+        fan = np.column_stack([back, np.roll(back, -1), middle])
+    area = Surface(points, fan).area
+    return Surface(points, np.vstack([surface.faces, fan])), area
+
+
+def _capped(surface: Surface, rim: Array, name: str, file: Path | None) -> tuple[Surface, Cap, float]:
+    """Cut off just inside an open end with the points ``rim`` and closed there; the area of the cap (mm2)."""
+    vector = _area_vector(rim)
+    normal = vector / np.linalg.norm(vector)
+    point = rim.mean(axis=0)
+    point = point + (((rim - point) @ normal).min() - INSIDE_MM) * normal
+    cut = surface.to_pyvista().clip(normal=normal, origin=point).extract_surface(algorithm="dataset_surface")
+    body = bodies(from_pyvista(cut.triangulate().clean(tolerance=JOIN_MM, absolute=True).triangulate()))[0]
+    loops = open_loops(body)
+    flat = _triangulated(body.points[loops[0]][::-1], normal) if len(loops) == 1 else None
+    if flat is None or Surface(body.points, loops[0][::-1][flat]).area > WIDENED * _area(rim):
+        raise SurfaceError(
+            f"{name}: its open end at {_place(rim.mean(axis=0))} cannot be closed by a plane",
+            file=file,
+            remedy="cut the end off straight, or close it",
+        )
+    faces = loops[0][::-1][flat]
+    area = Surface(body.points, faces).area
+    cap = Cap(body.points[loops[0]], normal)
+    return Surface(body.points, np.vstack([body.faces, faces])), cap, area
+
+
+def _triangulated(polygon: Array, normal: Array) -> Ints | None:
+    """Triangles (n - 2, 3) that fill a flat polygon (n, 3), seen from ``normal``; None where none do."""
+    size = len(polygon)
+    outline = pv.PolyData(polygon, faces=np.array([size, *range(size)]))
+    faces = outline.triangulate().regular_faces.astype(np.int64)
+    if len(faces) != size - 2:
+        return None
+    flat = Surface(polygon, faces)
+    if flat.face_normals.sum(axis=0) @ normal < 0:
+        flat = flat.flipped
+    # Of a simple outline the triangles' areas add up to that of the outline.
+    if not np.isclose(flat.area, np.linalg.norm(_area_vector(polygon)), rtol=1e-6):
+        return None
+    return flat.faces
+
+
+def _uncrossed(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
+    """A few crossing faces smoothed apart; a surface that crosses itself more is left as it is."""
+    crossing = self_intersections(surface)
+    if not 0 < len(crossing) <= MOST_CROSSING:
+        return surface, ()
+    smooth = untangled(surface)
+    moved = np.linalg.norm(smooth.points - surface.points, axis=1).max()
+    if moved > MOST_SMOOTHED_MM:
+        return surface, ()
+    where = _place(surface.triangles[crossing[0, 0]].mean(axis=0))
+    note = (
+        f"{name}: {len(crossing)} pairs of crossing faces, the first at {where}, smoothed by {moved:.1f} mm"
+    )
+    return smooth, (note,)

@@ -1,0 +1,118 @@
+"""Surface files in and out: STL, PLY, VTP, OBJ, in LPS or RAS, in millimetres or a stated unit."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import meshio
+import numpy as np
+import pyvista as pv
+from vtkmodules.util.numpy_support import vtk_to_numpy
+
+from ...errors import SurfaceError
+from ...mesh import silent_vtk
+from ..bounds import check_items
+from .triangles import Surface, compacted, from_pyvista
+
+SUFFIXES = (".stl", ".ply", ".vtp", ".obj")
+UNITS_MM: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+_HEAD = 4096  # bytes in which a file may state its space
+
+
+def read_surface(
+    path: str | Path, coordinates: Literal["LPS", "RAS"] | None = None, unit: str = "mm"
+) -> Surface:
+    """A surface from .stl, .ply, .vtp or .obj, in LPS mm; coincident points are merged.
+
+    Parameters
+    ----------
+    path : the file.
+    coordinates : what the file holds; by default what it says itself, as those of 3D Slicer do, else LPS.
+    unit : of the file: mm, cm, m or inch.
+
+    Raises
+    ------
+    SurfaceError
+        For a file that cannot be read, holds no triangles, or says that it is in other coordinates.
+        Closedness and size are for :func:`~limbfit.anatomy.surfaces.triangles.check_closed`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SurfaceError("no such surface", file=path)
+    _check_suffix(path)
+    poly = _read_poly(path)
+    surface = from_pyvista(poly.triangulate())
+    if not np.all(np.isfinite(surface.points)):
+        raise SurfaceError("points that are not numbers", file=path, remedy="export the surface again")
+    stated = _stated_space(path, poly)
+    if coordinates and stated and coordinates != stated:
+        raise SurfaceError(
+            f"the file says that it is in {stated}, the study says {coordinates}",
+            file=path,
+            remedy="correct surfaces.coordinates, or export the surface again",
+        )
+    sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
+    return _merged(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
+
+
+def _stated_space(path: Path, poly: pv.PolyData) -> str | None:
+    """``LPS`` or ``RAS`` where the file says so as 3D Slicer does: SPACE in its header or field data."""
+    if "SPACE" in poly.field_data:
+        text = str(poly.field_data["SPACE"][0])
+        return text if text in ("LPS", "RAS") else None
+    with path.open("rb") as stream:
+        found = re.search(rb"SPACE=(LPS|RAS)", stream.read(_HEAD))
+    return found[1].decode() if found else None
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in SUFFIXES:
+        raise SurfaceError(
+            f"unknown kind of surface {path.suffix!r}", file=path, remedy="use one of " + " ".join(SUFFIXES)
+        )
+
+
+def _read_poly(path: Path) -> pv.PolyData:
+    if path.suffix.lower() == ".vtp":
+        check_items(path)
+    try:
+        with silent_vtk(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
+    except Exception:  # readers raise many kinds; all mean the same to the user
+        raise SurfaceError(
+            "the surface cannot be read", file=path, remedy="export the surface again"
+        ) from None
+    if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
+        raise SurfaceError("the file holds no triangles", file=path, remedy="export the surface again")
+    corners = vtk_to_numpy(poly.GetPolys().GetConnectivityArray())
+    if len(corners) and not 0 <= corners.min() <= corners.max() < poly.n_points:  # VTK would take any memory
+        raise SurfaceError("faces of points that are not there", file=path, remedy="export the surface again")
+    return poly
+
+
+def _read_ply(path: Path) -> pv.PolyData:
+    """By meshio: VTK's reader takes the whole process down with it when the file is cut short."""
+    found = meshio.read(path, "ply")
+    faces = [np.insert(block.data, 0, block.data.shape[1], axis=1).ravel() for block in found.cells]
+    return pv.PolyData(found.points.astype(float), np.concatenate(faces))
+
+
+def _merged(surface: Surface) -> Surface:
+    """One point where several coincide exactly (STL repeats them), without faces that collapse."""
+    points, inverse = np.unique(surface.points, axis=0, return_inverse=True)
+    faces = inverse.ravel()[surface.faces]
+    a, b, c = faces.T
+    return compacted(Surface(points, faces[(a != b) & (b != c) & (c != a)]))
+
+
+def write_surface(path: str | Path, surface: Surface) -> None:
+    """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
+    path = Path(path)
+    _check_suffix(path)
+    with silent_vtk():
+        surface.to_pyvista().save(str(path), recompute_normals=False)

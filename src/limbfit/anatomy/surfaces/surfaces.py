@@ -1,0 +1,301 @@
+"""The limb as closed surfaces: skin with a flat proximal cap, and bones.
+
+Bones that reach the proximal cut stick out of the skin's cap by a few millimetres, so that the void they
+leave in the soft tissue is open there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import igl
+import numpy as np
+import pyvista as pv
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import LabelError, SurfaceError
+from ..ends import ProximalEnd, layer, proximal_end
+from ..grid import LabelMap
+from .extraction import extract_surface, fine_surface, remesh
+from .surfacefiles import read_surface, write_surface
+from .triangles import (
+    Surface,
+    bodies,
+    check_closed,
+    from_pyvista,
+    half_edges,
+    self_intersections,
+)
+
+__all__ = [
+    "Anatomy",
+    "Surface",
+    "bodies",
+    "build_anatomy",
+    "check_anatomy",
+    "check_closed",
+    "extract_surface",
+    "load_anatomy",
+    "read_surface",
+    "save_anatomy",
+    "self_intersections",
+    "write_surface",
+]
+
+Array = NDArray[np.float64]
+
+_CUT_INSIDE_MM = 2.0  # of the image's proximal end
+_STICK_OUT_MM = 6.0  # of the bones beyond the cut
+_SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
+_JOIN_MM = 1e-3
+# Passes of remeshing before and after the cap is cut: the rim gets better triangles from even ones, and its
+# shortest edges need more passes than a smooth surface.
+_PASSES_BEFORE, _PASSES_AFTER = 3, 15
+_STUMP_MM3 = 200.0  # what is left of a bone distal of the cut, below which it is dropped
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Closed surfaces of a limb, LPS mm.
+
+    Attributes
+    ----------
+    skin : closed, flat where the limb was cut proximally.
+    bones : closed, by name; they may stick out of the skin beyond the cut plane, nowhere else.
+    cut_point, cut_normal : (3,) the plane of the proximal cut; the unit normal points out, proximally.
+    """
+
+    skin: Surface
+    bones: Mapping[str, Surface]
+    cut_point: Array
+    cut_normal: Array
+
+    def __post_init__(self) -> None:
+        point, normal = _plane(self.cut_point, self.cut_normal)
+        object.__setattr__(self, "cut_normal", normal)
+        object.__setattr__(self, "cut_point", point)
+
+    def height(self, points: ArrayLike) -> Array:
+        """(...) distance of points beyond the cut plane, mm; negative inside the limb."""
+        return (np.asarray(points, dtype=float) - self.cut_point) @ self.cut_normal
+
+
+def build_anatomy(
+    labels: LabelMap,
+    edge_mm: float = 3.0,
+    proximal_cut: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Anatomy:
+    """Smooth closed surfaces of a label map.
+
+    Parameters
+    ----------
+    labels : the limb and its bones; the limb ends at one border of the image or within it.
+    edge_mm : edge length of the triangles.
+    proximal_cut : point and proximal normal (LPS mm) of the cut; by default 2 mm inside the limb's proximal
+        end, across the image axis along which it is longest.
+
+    Raises
+    ------
+    LabelError
+        For a map without a limb, or a limb that the image's side cuts off.
+    SurfaceError
+        For a cut that misses the limb.
+    """
+    labels = labels.nearest_lps()
+    if proximal_cut is None:
+        end = proximal_end(labels.limb, labels)
+        point, normal = _default_cut(labels, end)
+    else:
+        point, normal = _plane(*proximal_cut)  # a short limb may be wider than long: the cut tells its axis
+        end = proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
+    own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
+    own_normal = np.round(labels.direction.T @ normal, 6)
+    built = _built(labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal))
+    bones = {name: _placed(bone, labels) for name, bone in built.bones.items()}
+    return Anatomy(
+        _placed(built.skin, labels),
+        bones,
+        labels.direction @ built.cut_point + labels.origin,
+        labels.direction @ built.cut_normal,
+    )
+
+
+def _placed(surface: Surface, grid: LabelMap) -> Surface:
+    """A surface in the own frame of a right-handed grid, in patient space."""
+    return Surface(surface.points @ grid.direction.T + grid.origin, surface.faces)
+
+
+def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array) -> Anatomy:
+    extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
+    _check_sides(labels, end, point, normal)
+    skin = _capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)
+    reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
+    bones = {}
+    for name in labels.bone_names:
+        if _distal_volume(labels, name, point, normal) >= _STUMP_MM3:
+            bones[name] = extract_surface(reach, name, edge_mm)
+    return Anatomy(skin, bones, point, normal)
+
+
+def _default_cut(labels: LabelMap, end: ProximalEnd) -> tuple[Array, Array]:
+    """A little inside the outer face of the last layer."""
+    index = (np.array(labels.size) - 1) / 2
+    index[end.axis] = end.layer + end.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[end.axis])
+    return labels.index_to_point(index), end.direction(labels)
+
+
+def _extended(labels: LabelMap, end: ProximalEnd, length_mm: float) -> LabelMap:
+    """The map with the layer at the end repeated outward, as if the limb went on."""
+    count = int(np.ceil(length_mm / labels.spacing[end.axis]))
+    keep = slice(end.layer, None) if end.side < 0 else slice(None, end.layer + 1)
+    kept = labels.array[tuple(keep if n == 2 - end.axis else slice(None) for n in range(3))]
+    pad = [(0, 0)] * 3
+    pad[2 - end.axis] = (count, 0) if end.side < 0 else (0, count)
+    start = np.zeros(3)
+    start[end.axis] = end.layer - count if end.side < 0 else 0
+    return replace(labels, array=np.pad(kept, pad, mode="edge"), origin=labels.index_to_point(start))
+
+
+def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+    vector = np.asarray(normal, dtype=float)
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        raise SurfaceError("the normal of the proximal cut is zero", remedy="give a direction")
+    return np.asarray(point, dtype=float), vector / length
+
+
+def _check_sides(labels: LabelMap, end: ProximalEnd, point: Array, normal: Array) -> None:
+    """Refuse a limb that a side of the image cuts off distal of the cut."""
+    limb = labels.limb & (labels.heights(point, normal) < 0)
+    for axis in range(3):
+        if axis == end.axis:
+            continue
+        for index in (0, labels.size[axis] - 1):
+            if layer(limb, axis, index).sum() > 20:
+                raise LabelError(
+                    "the limb runs out of the side of the image",
+                    remedy="take an image that holds the whole limb, or move the proximal cut",
+                )
+
+
+def _within(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
+    """Only what lies distal of a plane."""
+    return labels.with_array(np.where(labels.heights(point, normal) <= 0, labels.array, 0))
+
+
+def _distal_volume(labels: LabelMap, name: str, point: Array, normal: Array) -> float:
+    inside = labels.mask(name) & (labels.heights(point, normal) < 0)
+    return float(inside.sum()) * labels.voxel_mm3
+
+
+def _capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
+    """The part distal of the plane, closed by a flat cap with a sharp rim, in even triangles."""
+    heights = (surface.points - point) @ normal
+    if heights.min() >= 0 or heights.max() <= 0:
+        raise SurfaceError("the proximal cut misses the limb", remedy="move its point into the limb (LPS mm)")
+    even = remesh(surface, edge_mm, passes=_PASSES_BEFORE)
+    cut = even.to_pyvista().clip_closed_surface(normal=-normal, origin=point, tolerance=1e-6)
+    joined = pv.PolyData(cut).triangulate().clean(tolerance=_JOIN_MM, absolute=True).triangulate()
+    whole = bodies(from_pyvista(joined))[0]
+    return remesh(whole, edge_mm, _rim(whole, point, normal), _PASSES_AFTER)
+
+
+def _rim(surface: Surface, point: Array, normal: Array) -> NDArray[np.int64]:
+    """(n, 2) edges between the flat cap and the rest."""
+    on_plane = np.abs((surface.points - point) @ normal) < _JOIN_MM
+    in_cap = np.tile(on_plane[surface.faces].all(axis=1), 3)
+    edges = np.sort(half_edges(surface.faces), axis=1)
+    both, counts = np.unique(
+        np.concatenate([np.unique(edges[in_cap], axis=0), np.unique(edges[~in_cap], axis=0)]),
+        axis=0,
+        return_counts=True,
+    )
+    return both[counts == 2]
+
+
+def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> None:
+    """Refuse an anatomy that cannot be meshed.
+
+    Raises
+    ------
+    SurfaceError
+        For a surface that :func:`check_closed` refuses, a bone outside the skin (beyond the cut is allowed),
+        or bones that overlap.
+    """
+    files = files or {}
+    check_closed(anatomy.skin, "skin", files.get("skin"))
+    for name, bone in anatomy.bones.items():
+        check_closed(bone, name, files.get(name))
+        _check_inside(anatomy, name, files.get(name))
+
+
+def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
+    points = anatomy.bones[name].points
+    inner = points[anatomy.height(points) < -_SKIN_TOLERANCE_MM]
+    if len(inner) == 0:
+        raise SurfaceError(
+            f"{name} lies wholly beyond the proximal cut", file=file, remedy="leave it out or move the cut"
+        )
+    distance = signed_distance(anatomy.skin, inner)
+    outside = distance > _SKIN_TOLERANCE_MM
+    if outside.any():
+        raise SurfaceError(
+            f"{name} lies outside the skin: {int(outside.sum())} of its {len(points)} points,"
+            f" by up to {distance.max():.1f} mm",
+            file=file,
+            remedy="check that skin and bone are in the same coordinates (LPS or RAS, mm)",
+        )
+
+
+def signed_distance(surface: Surface, points: ArrayLike) -> Array:
+    """(n,) distance of points to a closed surface, mm, negative inside (fast winding number)."""
+    query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    distance = igl.signed_distance(
+        query, surface.points, surface.faces, sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    )[0]
+    return np.asarray(distance).ravel()
+
+
+def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()) -> None:
+    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas, notes) into a folder."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_surface(folder / "skin.stl", anatomy.skin)
+    for name, bone in anatomy.bones.items():
+        write_surface(folder / f"bone-{name}.stl", bone)
+    summary = {
+        "coordinates": "LPS",
+        "unit": "mm",
+        "cut_point": anatomy.cut_point.tolist(),
+        "cut_normal": anatomy.cut_normal.tolist(),
+        "skin": _measures(anatomy.skin),
+        "bones": {name: _measures(bone) for name, bone in anatomy.bones.items()},
+        "notes": list(notes),
+    }
+    (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _measures(surface: Surface) -> dict[str, float | int]:
+    return {
+        "faces": len(surface.faces),
+        "volume_mm3": round(surface.volume, 1),
+        "area_mm2": round(surface.area, 1),
+    }
+
+
+def load_anatomy(folder: str | Path) -> Anatomy:
+    """What :func:`save_anatomy` wrote."""
+    folder = Path(folder)
+    try:
+        summary = json.loads((folder / "surfaces.json").read_text(encoding="utf-8"))
+        names, point, normal = list(summary["bones"]), summary["cut_point"], summary["cut_normal"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise SurfaceError(
+            "surfaces.json is missing or unreadable", file=folder, remedy="run the surfaces stage again"
+        ) from None
+    skin = read_surface(folder / "skin.stl")
+    bones = {name: read_surface(folder / f"bone-{name}.stl") for name in names}
+    return Anatomy(skin, bones, point, normal)

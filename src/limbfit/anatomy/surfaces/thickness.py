@@ -1,0 +1,157 @@
+"""Thickness as a function on the skin: measured from the segmented fat, smoothed, carried to points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import igl
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import label as connected
+from scipy.sparse import coo_array, diags_array
+from scipy.spatial import KDTree
+
+from ...errors import LabelError, SurfaceError
+from ..grid import LabelMap
+from .extraction import extract_surface
+from .surfaces import Anatomy, signed_distance
+from .triangles import Surface, half_edges
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+FAT = "fat"
+FAT_DEPTH = "fat_depth_mm"
+SHELL_MM = 1.5  # half the thickness of the dark skin outside the fat, which is not taken for the core
+SMOOTH_MM = 4.0  # how far along the skin the measured depth is smoothed
+SLOPE = 0.5  # greatest change of thickness along the skin, mm per mm
+OBLIQUE = 1.25  # greatest depth along the normal, of the nearest distance
+CUT_MM = 3.0  # below the proximal cut, from where depth is measured
+MARCHES = 30
+
+
+def fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array:
+    """Depth (n,) of the fat's inner face below the vertices of an anatomy's skin, mm.
+
+    Measured along the skin's inward normal to the smooth surface of all that the fat encloses; islands of fat
+    between muscles do not count, nor does the skin outside the fat. Zero where muscle or bone lies directly
+    under the skin.
+
+    Parameters
+    ----------
+    labels : the limb with a label ``fat``.
+    anatomy : made from the same labels.
+    edge_mm : edge length of the surface under the fat.
+
+    Raises
+    ------
+    LabelError
+        When the map has no fat, or nothing but fat.
+    """
+    if FAT not in labels.names.values() or not labels.mask(FAT).any():
+        raise LabelError(
+            "no voxel is labelled 'fat', which a layer's thickness map needs",
+            remedy="label the fat, or give the layer a thickness_mm",
+        )
+    core = _core(labels)
+    inner = extract_surface(core, None, edge_mm)
+    skin = anatomy.skin
+    depth = _along_normals(skin, inner)
+    near_cut = anatomy.height(skin.points) > -CUT_MM
+    if near_cut.all():
+        raise SurfaceError(f"the limb is not {CUT_MM:g} mm long distal of the proximal cut")
+    below = np.flatnonzero(~near_cut)
+    lowered = skin.points[near_cut] - CUT_MM * anatomy.cut_normal
+    depth[near_cut] = depth[below[KDTree(skin.points[below]).query(lowered)[1]]]
+    return sloped(skin, smoothed_along(skin, depth, SMOOTH_MM), SLOPE)
+
+
+def _core(labels: LabelMap) -> LabelMap:
+    """What the subcutaneous fat encloses, as a label map of one label."""
+    inside = labels.limb & ~labels.mask(FAT)
+    spacing = labels.spacing[::-1]
+    # Opened by a ball: a thin shell of skin outside the fat goes.
+    eroded = distance_transform_edt(np.pad(inside, 1, mode="edge"), sampling=spacing) > SHELL_MM
+    if not eroded.any():
+        raise LabelError("nothing but fat lies under the skin", remedy="correct the label 'fat'")
+    opened = distance_transform_edt(~eroded, sampling=spacing) <= SHELL_MM
+    opened = opened[1:-1, 1:-1, 1:-1] & inside
+    parts = connected(opened)[0]
+    largest = parts == np.bincount(parts[opened]).argmax()
+    return labels.with_array(largest.astype(np.uint8), {1: "core"})
+
+
+def _along_normals(skin: Surface, inner: Surface) -> Array:
+    """Distance (n,) from the skin's vertices along their inward normals to an inner surface, mm."""
+    inward, origin = -skin.vertex_normals, skin.points
+    nearest = np.maximum(signed_distance(inner, origin), 0.0)
+    along = nearest.copy()
+    for _ in range(MARCHES):  # steps that cannot cross the surface
+        along += signed_distance(inner, origin + along[:, None] * inward)
+    return np.clip(along, 0.0, OBLIQUE * nearest)
+
+
+def smoothed_along(surface: Surface, values: Array, length_mm: float) -> Array:
+    """Values (n,) at vertices averaged over their neighbours along the surface, about ``length_mm`` far."""
+    a, b = edges_of(surface).T
+    count = len(surface.points)
+    links = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(count, count)).tocsr()
+    mean = diags_array(1.0 / links.sum(axis=1)) @ links
+    edge = float(np.median(np.linalg.norm(surface.points[a] - surface.points[b], axis=1)))
+    for _ in range(max(1, round((length_mm / edge) ** 2))):  # a random walk's spread
+        values = 0.5 * values + 0.5 * (mean @ values)
+    return np.asarray(values)
+
+
+def sloped(surface: Surface, values: Array, slope: float) -> Array:
+    """Values (n,) at vertices lowered so that along no edge they change by more than ``slope`` per mm."""
+    a, b = edges_of(surface).T
+    rise = slope * np.linalg.norm(surface.points[a] - surface.points[b], axis=1)
+    values = values.copy()
+    while True:
+        before = values.copy()
+        np.minimum.at(values, a, before[b] + rise)
+        np.minimum.at(values, b, before[a] + rise)
+        if np.array_equal(values, before):
+            return values
+
+
+def carried(surface: Surface, values: Array, points: Array) -> Array:
+    """Values (k, n) at a surface's vertices, interpolated at the surface points nearest to points (m, 3)."""
+    query = np.ascontiguousarray(points, dtype=float)
+    _, face, nearest = igl.point_mesh_squared_distance(query, surface.points, surface.faces)
+    a, b, c = np.moveaxis(surface.triangles[face], 1, 0)
+    normal = np.cross(b - a, c - a)
+    parts = [np.cross(c - b, nearest - b), np.cross(a - c, nearest - c), np.cross(b - a, nearest - a)]
+    share = np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
+    share = np.maximum(share, np.finfo(float).tiny)
+    share /= share.sum(axis=1, keepdims=True)
+    return np.asarray(np.einsum("kmi,mi->km", values[:, surface.faces[face]], share))
+
+
+def edges_of(surface: Surface) -> Ints:
+    """Edges (e, 2) of a closed surface, each once."""
+    edges = half_edges(surface.faces)
+    return edges[edges[:, 0] < edges[:, 1]]
+
+
+def write_thickness(path: str | Path, skin: Surface, depth_mm: Array) -> None:
+    """The skin with the depth (n,) of the fat's inner face at its vertices, as VTP."""
+    poly = skin.to_pyvista()
+    poly.point_data[FAT_DEPTH] = depth_mm
+    poly.save(path)
+
+
+def read_thickness(path: str | Path, skin: Surface) -> Array:
+    """Depth (n,) at the vertices of a skin from a VTP file that :func:`write_thickness` wrote.
+
+    The vertices need not be numbered alike: a surface that went through STL numbers them anew.
+    """
+    if not Path(path).is_file():
+        raise SurfaceError("no such thickness map", file=Path(path), remedy="run the surfaces stage again")
+    poly = pv.read(path)
+    faces = np.asarray(poly.faces).reshape(-1, 4)[:, 1:]
+    stored = Surface(np.asarray(poly.points), faces)
+    return carried(stored, np.asarray(poly.point_data[FAT_DEPTH], dtype=float)[None], skin.points)[0]

@@ -1,0 +1,257 @@
+"""Closed triangle surfaces: the type, and whether one may bound a body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ...errors import SurfaceError
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+
+# Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
+# not. What is left of a bone after a virtual amputation may be small.
+_SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
+_SMALLEST_OTHER_MM = 15.0
+_LARGEST_MM = 3000.0
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles in LPS mm: ``points`` (n, 3), ``faces`` (m, 3), counter-clockwise seen from outside."""
+
+    points: Array
+    faces: Faces
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", np.asarray(self.points, dtype=np.float64))
+        object.__setattr__(self, "faces", np.asarray(self.faces, dtype=np.int64))
+
+    @property
+    def triangles(self) -> Array:
+        """(m, 3, 3) corner points of each face."""
+        return self.points[self.faces]
+
+    @property
+    def face_areas(self) -> Array:
+        """(m,) mm2."""
+        return np.linalg.norm(self._face_vectors, axis=1) / 2
+
+    @property
+    def face_normals(self) -> Array:
+        """(m, 3) unit outward normals; zero for a degenerate face."""
+        vectors = self._face_vectors
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+        return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+    @property
+    def _face_vectors(self) -> Array:
+        a, b, c = np.moveaxis(self.triangles, 1, 0)
+        return np.cross(b - a, c - a)
+
+    @property
+    def area(self) -> float:
+        """mm2."""
+        return float(self.face_areas.sum())
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume in mm3 by the divergence theorem; negative if the faces look inward."""
+        triangles = self.triangles - self.points.mean(axis=0)
+        return float(np.linalg.det(triangles).sum() / 6)
+
+    @property
+    def vertex_normals(self) -> Array:
+        """(n, 3) unit normals, the faces around a vertex weighted by area."""
+        normals = np.zeros_like(self.points)
+        for corner in range(3):
+            np.add.at(normals, self.faces[:, corner], self._face_vectors)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+
+    @property
+    def flipped(self) -> Surface:
+        """The same surface seen from the other side."""
+        return replace(self, faces=self.faces[:, ::-1])
+
+    def to_pyvista(self) -> pv.PolyData:
+        faces: Any = self.faces  # pyvista's stubs know no int64
+        return pv.PolyData.from_regular_faces(self.points, faces)
+
+
+def from_pyvista(poly: pv.PolyData) -> Surface:
+    """A surface from triangulated poly-data; points that no face uses are dropped."""
+    return compacted(Surface(np.asarray(poly.points), np.asarray(poly.regular_faces, dtype=np.int64)))
+
+
+def compacted(surface: Surface) -> Surface:
+    """Without the points that no face uses."""
+    used, inverse = np.unique(surface.faces, return_inverse=True)
+    return Surface(surface.points[used], inverse.reshape(surface.faces.shape))
+
+
+def bodies(surface: Surface) -> list[Surface]:
+    """The connected bodies of a surface, the one with most faces first."""
+    labels = _body_of_point(surface)[surface.faces[:, 0]]
+    values, counts = np.unique(labels, return_counts=True)
+    order = values[np.argsort(-counts)]
+    return [compacted(replace(surface, faces=surface.faces[labels == value])) for value in order]
+
+
+def _body_of_point(surface: Surface) -> NDArray[np.int64]:
+    edges = half_edges(surface.faces)
+    n = len(surface.points)
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def half_edges(faces: Faces) -> Faces:
+    """(3 m, 2) directed edges of the faces."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def check_closed(surface: Surface, name: str = "skin", file: str | Path | None = None) -> None:
+    """Refuse a surface that does not bound a body.
+
+    Parameters
+    ----------
+    surface : LPS mm.
+    name : ``skin`` or the bone's; a skin is expected to be as large as a limb.
+    file : for the error's text.
+
+    Raises
+    ------
+    SurfaceError
+        Open, non-manifold, inconsistently or inwardly oriented, several bodies, of a size that only another
+        unit explains, or crossing itself.
+    """
+    _check_size(surface, name, file)
+    _check_edges(surface, name, file)
+    parts = len(bodies(surface))
+    if parts > 1:
+        raise SurfaceError(
+            f"{name}: {parts} separate bodies in one surface",
+            file=file,
+            remedy="keep one closed body in each file",
+        )
+    if surface.volume <= 0:
+        raise SurfaceError(
+            f"{name}: the surface is inverted, its faces look inward",
+            file=file,
+            remedy="flip the normals so that they point outward",
+        )
+    crossing = len(self_intersections(surface))
+    if crossing:
+        raise SurfaceError(
+            f"{name}: the surface crosses itself ({crossing} pairs of faces)",
+            file=file,
+            remedy="remesh or repair it",
+        )
+
+
+def _check_size(surface: Surface, name: str, file: str | Path | None) -> None:
+    if len(surface.faces) < 4:
+        raise SurfaceError(f"{name}: only {len(surface.faces)} faces", file=file)
+    diagonal = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
+    smallest = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
+    if diagonal < smallest or diagonal > _LARGEST_MM:
+        units = "metres, centimetres or inches" if diagonal < smallest else "another unit"
+        raise SurfaceError(
+            f"{name}: {diagonal:.3g} mm from end to end",
+            file=file,
+            remedy=f"if it is in {units}, say so (surfaces.unit in study.toml) or scale it to millimetres",
+        )
+
+
+def _check_edges(surface: Surface, name: str, file: str | Path | None) -> None:
+    edges = half_edges(surface.faces)
+    counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
+    open_edges = int((counts == 1).sum())
+    if open_edges:
+        raise SurfaceError(
+            f"{name}: the surface is open, {open_edges} edges have a face on one side only",
+            file=file,
+            remedy="close its holes",
+        )
+    if counts.max() > 2:
+        raise SurfaceError(
+            f"{name}: {int((counts > 2).sum())} edges join more than two faces",
+            file=file,
+            remedy="remove inner walls and doubled faces",
+        )
+    if len(np.unique(edges, axis=0)) < len(edges):
+        raise SurfaceError(
+            f"{name}: neighbouring faces are oriented against each other",
+            file=file,
+            remedy="orient the normals consistently outward",
+        )
+
+
+def self_intersections(surface: Surface) -> NDArray[np.int64]:
+    """(p, 2) pairs of faces without a common point of which an edge of one pierces the other.
+
+    Candidates are pairs whose bounding spheres meet; each edge is then tested against the other triangle.
+    """
+    pairs = _near_pairs(surface)
+    triangles = surface.triangles
+    crossing = np.zeros(len(pairs), dtype=bool)
+    for first, second in ((0, 1), (1, 0)):
+        a, b = triangles[pairs[:, first]], triangles[pairs[:, second]]
+        for corner in range(3):
+            crossing |= _pierces(a[:, corner], a[:, (corner + 1) % 3], b)
+    return pairs[crossing]
+
+
+def _near_pairs(surface: Surface) -> NDArray[np.int64]:
+    """Pairs of faces that share no point and whose bounding boxes overlap."""
+    triangles = surface.triangles
+    centre = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - centre[:, None], axis=2).max(axis=1)
+    lists = _pairs_within(centre, radius)
+    low, high = triangles.min(axis=1), triangles.max(axis=1)
+    i, j = lists.T
+    apart = np.any((low[i] > high[j]) | (low[j] > high[i]), axis=1)
+    lists = lists[~apart]
+    shared = (surface.faces[lists[:, 0]][:, :, None] == surface.faces[lists[:, 1]][:, None, :]).any(
+        axis=(1, 2)
+    )
+    return lists[~shared]
+
+
+def _pairs_within(centre: Array, radius: Array) -> NDArray[np.int64]:
+    """Pairs (p, 2) whose spheres may meet; faces of a size together, as large ones are few."""
+    octave = np.floor(np.log2(radius / radius.min())).astype(int)
+    groups = [np.flatnonzero(octave == k) for k in np.unique(octave)]
+    trees = [cKDTree(centre[group]) for group in groups]
+    found = []
+    for i, (group, tree) in enumerate(zip(groups, trees)):
+        reach = radius[group].max()
+        found.append(group[tree.query_pairs(2 * reach, output_type="ndarray")])
+        for larger, other in zip(groups[i + 1 :], trees[i + 1 :]):
+            near = other.query_ball_tree(tree, reach + radius[larger].max())
+            counts = [len(members) for members in near]
+            members = group[np.concatenate([np.array(m, dtype=np.int64) for m in near])]
+            found.append(np.column_stack([members, np.repeat(larger, counts)]))
+    return np.concatenate(found).astype(np.int64).reshape(-1, 2)
+
+
+def _pierces(start: Array, end: Array, triangle: Array) -> NDArray[np.bool_]:
+    """Whether each segment passes through the inside of its triangle (signed volumes)."""
+    a, b, c = np.moveaxis(triangle, 1, 0)
+
+    def side(p: Array, q: Array, r: Array, s: Array) -> Array:
+        return np.einsum("ij,ij->i", np.cross(q - p, r - p), s - p)
+
+    above, below = side(a, b, c, start), side(a, b, c, end)
+    u, v, w = side(start, end, a, b), side(start, end, b, c), side(start, end, c, a)
+    same = ((u > 0) & (v > 0) & (w > 0)) | ((u < 0) & (v < 0) & (w < 0))
+    return same & (above * below < 0)

@@ -1,0 +1,1 @@
+"""Records that cannot be right, other choices of sites, sites worth testing."""

@@ -1,0 +1,202 @@
+"""Which sites to test, and how deep: the choice whose data would determine the parameters best.
+
+At stated parameters each candidate indentation has a Fisher information on the logarithms of the parameters,
+``J' S^-1 J``, from the exact derivatives of its force and a noise model. Information of several indentations
+adds up. D-optimal is the choice with the largest determinant of the sum (the smallest volume of the joint
+confidence region), A-optimal the one with the least sum of variances (Fedorov 1972; Atkinson and Donev 1992).
+What the bounds say stands in for data where there are none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+from math import comb, prod
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_toeplitz
+
+from ...errors import CalibrationError
+from ..fit.objective import SiteResponse
+from ..fit.parameters import Unknowns
+
+Array = NDArray[np.float64]
+Criterion = Literal["D", "A"]
+
+EXHAUSTIVE = 20_000  # choices that are all looked at; more are searched by exchanges
+_RESTARTS = 20
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """What a record's force scatters about the model by.
+
+    ``sensor_N`` is white; ``misfit`` (a fraction of the largest force) is the model's own error, which drifts
+    along the trace: ``correlation`` is that of neighbouring points.
+    """
+
+    sensor_N: float
+    misfit: float = 0.0
+    correlation: float = 0.9
+
+    def __post_init__(self) -> None:
+        if not (self.sensor_N >= 0 and self.misfit >= 0 and 0 <= self.correlation < 1):
+            raise CalibrationError("a noise model has standard deviations >= 0 and a correlation below 1")
+        if self.sensor_N == 0 and self.misfit == 0:
+            raise CalibrationError("a design needs some noise: without any, one site tells everything")
+
+    def row(self, force_N: Array) -> Array:
+        """First row (n,) of the covariance (Toeplitz) of a record."""
+        n = len(force_N)
+        drift = (self.misfit * float(force_N.max())) ** 2 * self.correlation ** np.arange(n)
+        drift[0] += self.sensor_N**2
+        return np.asarray(drift, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An indentation that could be made, and its ``information`` (p, p) on log(parameters)."""
+
+    site: str
+    depth_mm: float
+    information: Array
+
+
+def candidate(
+    site: str, depth_mm: float, response: SiteResponse, parameters: Array, noise: NoiseModel
+) -> Candidate:
+    """The candidate of a simulated indentation.
+
+    Raises
+    ------
+    CalibrationError
+        Where the simulation is partial: half a record informs otherwise than the whole.
+    """
+    if not response.completed:
+        raise CalibrationError(f"{site}, {depth_mm:g} mm: {response.reason or 'simulation failed'}")
+    scaled = response.jacobian * parameters
+    information = scaled.T @ solve_toeplitz(noise.row(response.force_N), scaled)
+    return Candidate(site, depth_mm, (information + information.T) / 2)
+
+
+def prior_information(unknowns: Unknowns) -> Array:
+    """Information (p, p) of the bounds: as if uniform between them."""
+    return np.diag(12.0 / np.log(unknowns.upper / unknowns.lower) ** 2)
+
+
+@dataclass(frozen=True)
+class Design:
+    """A choice of candidates (indices) and what is expected of it.
+
+    ``covariance`` (p, p) is that of log(parameters); ``log_det`` that of the information; ``exhaustive`` says
+    that no choice is better.
+    """
+
+    chosen: tuple[int, ...]
+    covariance: Array
+    log_det: float
+    exhaustive: bool = True
+
+    @property
+    def trace(self) -> float:
+        return float(np.trace(self.covariance))
+
+    @property
+    def factors_95(self) -> Array:
+        """(p,) the factor f of the expected 95 % interval [value / f, value x f]."""
+        return np.exp(np.minimum(1.96 * np.sqrt(np.diag(self.covariance)), 50.0))
+
+
+def evaluate(candidates: Sequence[Candidate], chosen: Sequence[int], prior: Array) -> Design:
+    """What to expect of a stated choice."""
+    information = prior + sum(candidates[i].information for i in chosen)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return Design(tuple(chosen), covariance, float(np.linalg.slogdet(information)[1]))
+
+
+def efficiency(design: Design, best: Design, criterion: Criterion) -> float:
+    """Between 0 and 1 for a worse design: the share of ``best``'s data that would tell as much (D), or the
+    ratio of the sums of variances (A)."""
+    if criterion == "A":
+        return best.trace / design.trace
+    return float(np.exp((design.log_det - best.log_det) / len(best.covariance)))
+
+
+def choose(
+    candidates: Sequence[Candidate], size: int, prior: Array, criterion: Criterion = "D", seed: int = 0
+) -> Design:
+    """The best choice of ``size`` sites, each with one of its depths.
+
+    All choices are looked at where there are at most 20,000; else a greedy choice and random ones are
+    improved by exchanging one candidate at a time until none helps.
+
+    Raises
+    ------
+    CalibrationError
+        Where there are fewer sites than wanted.
+    """
+    groups = _by_site(candidates)
+    if not 0 < size <= len(groups):
+        raise CalibrationError(f"{size} sites are wanted of {len(groups)}")
+    number = comb(len(groups), size) * max(prod([max(map(len, groups))] * size), 1)
+    infos = np.stack([c.information for c in candidates])
+    if number <= EXHAUSTIVE:
+        best = min(_every(groups, size), key=lambda chosen: _cost(infos, chosen, prior, criterion))
+        return evaluate(candidates, best, prior)
+    rng = np.random.default_rng(seed)
+    starts = [_greedy(infos, groups, size, prior, criterion)]
+    for _ in range(_RESTARTS):
+        picked = rng.choice(len(groups), size, replace=False)
+        starts.append([int(rng.choice(groups[g])) for g in picked])
+    ends = [_exchanged(infos, groups, start, prior, criterion) for start in starts]
+    end = min(ends, key=lambda chosen: _cost(infos, chosen, prior, criterion))
+    found = evaluate(candidates, sorted(end), prior)
+    return Design(found.chosen, found.covariance, found.log_det, exhaustive=False)
+
+
+def _by_site(candidates: Sequence[Candidate]) -> list[list[int]]:
+    sites = list(dict.fromkeys(c.site for c in candidates))
+    return [[i for i, c in enumerate(candidates) if c.site == site] for site in sites]
+
+
+def _every(groups: Sequence[Sequence[int]], size: int) -> Iterator[tuple[int, ...]]:
+    for picked in combinations(groups, size):
+        yield from product(*picked)
+
+
+def _cost(infos: Array, chosen: Sequence[int], prior: Array, criterion: Criterion) -> float:
+    information = prior + infos[list(chosen)].sum(axis=0)
+    if criterion == "A":
+        return float(np.trace(np.linalg.inv(information)))
+    return -float(np.linalg.slogdet(information)[1])
+
+
+def _greedy(
+    infos: Array, groups: Sequence[Sequence[int]], size: int, prior: Array, criterion: Criterion
+) -> list[int]:
+    chosen: list[int] = []
+    for _ in range(size):
+        free = [i for group in groups if not set(group) & set(chosen) for i in group]
+        chosen.append(min(free, key=lambda i: _cost(infos, [*chosen, i], prior, criterion)))
+    return chosen
+
+
+def _exchanged(
+    infos: Array, groups: Sequence[Sequence[int]], start: Sequence[int], prior: Array, criterion: Criterion
+) -> list[int]:
+    """The choice after the best exchange of one candidate, again and again, until none helps."""
+    chosen, cost = list(start), _cost(infos, start, prior, criterion)
+    while True:
+        trials = []
+        for at in range(len(chosen)):
+            rest = chosen[:at] + chosen[at + 1 :]
+            free = [i for group in groups if not set(group) & set(rest) for i in group if i not in chosen]
+            trials += [[*rest, i] for i in free]
+        best = min(trials, key=lambda trial: _cost(infos, trial, prior, criterion), default=chosen)
+        least = _cost(infos, best, prior, criterion)
+        if not least < cost - 1e-12 * abs(cost):
+            return chosen
+        chosen, cost = best, least

@@ -1,0 +1,492 @@
+"""Sites whose record does not belong to the model that the others agree on, found after the fit.
+
+Each site is left out and predicted from the others; its standardised error is that prediction's over the
+error with which sites *other than it* are predicted when it has no say (both left out), so that one bad
+record cannot hide behind the misfit that it causes. For two bad records, pairs are left out together. The
+force ratio of measured over predicted names a unit; Cook's distance says how much a site moves the fit; an
+exchange of two records that lowers the misfit of all sites says that names were swapped.
+
+The fits are regularised Gauss-Newton on ``simulate``, which is meant to be cheap: :class:`FirstOrder` around
+the answer, or an emulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...phases import boundaries, find_phases
+from ..fit.objective import Measured, Simulate, SiteResponse, check_responses
+from .plausibility import UNITS, Flag
+
+Array = NDArray[np.float64]
+History = tuple[Array, Array]
+
+_PRIOR_SD = 0.5  # of log(parameters) about the answer: keeps what few sites leave open where it was
+_ASSUMED = 0.03  # force error, as a fraction of the peak, that data and prior are weighed by
+_STEPS = 6
+_FLOOR = 0.02  # prediction error, as a fraction of the peak, below which sites are not told apart
+LARGE, ERROR = 4.0, 0.12  # standardised error and prediction error over the peak that are flagged
+_SHARE = 0.25  # of the logarithm of a unit's factor: how near the force ratio must come
+_MOST = 3  # corrections that are looked for
+_LOOKED_AT = 3  # exchanges that are simulated
+_WORST = 8  # sites of which pairs and units are tried
+MIN_SITES = 4
+GAIN = 4.0  # by which a correction must lower the squared misfit of all sites
+FORCE_UNITS = {name: force for name, (force, travel, time) in UNITS.items() if travel == time == 1.0}
+
+
+class FirstOrder:
+    """A simulation expanded about one point: log(force) to first order in log(parameters).
+
+    A force scales with the moduli, which this form keeps exactly; where it is small it is linear.
+    """
+
+    def __init__(self, parameters: Array, responses: Sequence[SiteResponse]) -> None:
+        self.parameters, self.responses = parameters, tuple(responses)
+
+    def __call__(self, parameters: Array) -> list[SiteResponse]:
+        step = np.log(parameters / self.parameters)
+        return [self._moved(response, step, parameters) for response in self.responses]
+
+    def _moved(self, response: SiteResponse, step: Array, parameters: Array) -> SiteResponse:
+        force, scaled = response.force_N, response.jacobian * self.parameters
+        small = force < 0.05 * force.max()
+        rate = scaled / np.where(small, 1.0, force)[:, None]
+        grown = np.exp(np.clip(rate @ step, -5.0, 5.0))
+        moved = np.where(small, force + scaled @ step, force * grown)
+        slope = np.where(small[:, None], scaled, scaled * grown[:, None])
+        return SiteResponse(moved, slope / parameters)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A site predicted without itself.
+
+    ``error`` is the root mean square of its prediction error over its peak; ``expected`` that of the others
+    when it has no say; ``ratio`` the best factor from predicted to measured force; ``cook`` how far it moves
+    the forces of all sites, against the misfit.
+    """
+
+    site: str
+    error: float
+    expected: float
+    ratio: float
+    cook: float
+
+    @property
+    def standardised(self) -> float:
+        return self.error / self.expected
+
+
+@dataclass(frozen=True)
+class Correction:
+    """One change to the records that makes all sites agree better: names exchanged, or a unit converted.
+
+    ``gain`` is the squared misfit of all sites before over after, each refitted; the errors (root mean
+    square over the peak) are those of ``sites``, ``worst_before`` that of any site: a fit may follow the bad
+    record and miss the others.
+    """
+
+    kind: Literal["swap", "unit"]
+    sites: tuple[int, ...]
+    cause: str
+    gain: float
+    errors_before: tuple[float, ...]
+    errors_after: tuple[float, ...]
+    worst_before: float
+
+    @property
+    def convinces(self) -> bool:
+        worst = self.worst_before
+        return self.gain > GAIN and worst > ERROR / 2 and max(self.errors_after) < 0.6 * worst
+
+
+class Sites:
+    """All recorded sites with their simulation: regularised fits on some, errors on others."""
+
+    def __init__(self, simulate: Simulate, measured: Sequence[Measured], start: Array) -> None:
+        self.simulate, self.measured, self.start = simulate, tuple(measured), start
+        self.peaks = [float(site.force_N.max()) for site in measured]
+        self._fits: dict[tuple[int, ...], Array] = {}
+
+    def without(self, *left: int) -> Array:
+        """Forces of all sites, one flat vector each, from the fit without some."""
+        key = tuple(sorted(left))
+        if key not in self._fits:
+            self._fits[key] = self._fit([i for i in range(len(self.measured)) if i not in left])
+        return self._fits[key]
+
+    def _fit(self, chosen: Sequence[int]) -> Array:
+        z = np.zeros(len(self.start))
+        for _ in range(_STEPS):
+            p = self.start * np.exp(z)
+            responses = self.simulate(p)
+            rows = [self._rows(i, responses[i], p) for i in chosen]
+            residual = np.concatenate([r for r, _ in rows])
+            slope = np.concatenate([s for _, s in rows])
+            H = slope.T @ slope + np.eye(len(z)) / _PRIOR_SD**2
+            step = np.linalg.solve(H, -slope.T @ residual - z / _PRIOR_SD**2)
+            z = z + np.clip(step, -1.0, 1.0)
+            if np.abs(step).max() < 1e-3:
+                break
+        return self.start * np.exp(z)
+
+    def _rows(self, i: int, response: SiteResponse, parameters: Array) -> tuple[Array, Array]:
+        weight = 1 / (_ASSUMED * self.peaks[i] * np.sqrt(response.force_N.size))
+        difference = response.force_N - self.measured[i].force_N
+        # A record that is many times too strong must not drown the others (Huber's weight).
+        size = float(np.sqrt(np.mean(difference**2))) / self.peaks[i]
+        weight *= np.sqrt(min(1.0, 5 * _ASSUMED / max(size, 1e-12)))
+        return difference * weight, response.jacobian * parameters * weight
+
+    def errors(self, parameters: Array) -> Array:
+        """Root mean square error (n,) of each site over its peak, simulated or measured, the larger one.
+
+        So a record that is too weak by a factor counts as much as one that is too strong by it.
+        """
+        triples = zip(self.simulate(parameters), self.measured, self.peaks)
+        return np.array(
+            [
+                np.sqrt(np.mean((r.force_N - m.force_N) ** 2)) / max(peak, r.force_N.max())
+                for r, m, peak in triples
+            ]
+        )
+
+    def ratio(self, i: int, parameters: Array) -> float:
+        force = self.simulate(parameters)[i].force_N
+        return float(force @ self.measured[i].force_N / (force @ force))
+
+    def expected(self, *left: int) -> float:
+        """Root mean square of the errors with which sites are predicted without themselves and ``left``."""
+        rest = [j for j in range(len(self.measured)) if j not in left]
+        errors = [self.errors(self.without(*left, j))[j] for j in rest]
+        return max(float(np.sqrt(np.mean(np.square(errors)))), _FLOOR)
+
+
+def leave_one_out(simulate: Simulate, measured: Sequence[Measured], start: Array) -> tuple[LeftOut, ...]:
+    """Every site predicted from all others.
+
+    Parameters
+    ----------
+    simulate : all sites of ``measured``, in order; cheap.
+    start : the answer (p,) that the fits start from and are drawn to where the data say nothing.
+    """
+    return tuple(_left_out(Sites(simulate, measured, start)))
+
+
+def _left_out(sites: Sites) -> list[LeftOut]:
+    whole = [r.force_N for r in sites.simulate(sites.without())]
+    misfit = max(float(np.mean(sites.errors(sites.without()) ** 2)), (_FLOOR / 2) ** 2)
+    found = []
+    for i, site in enumerate(sites.measured):
+        parameters = sites.without(i)
+        moved = [
+            np.mean((r.force_N - w) ** 2) / peak**2
+            for r, w, peak in zip(sites.simulate(parameters), whole, sites.peaks)
+        ]
+        found.append(
+            LeftOut(
+                site=site.name,
+                error=float(sites.errors(parameters)[i]),
+                expected=sites.expected(i),
+                ratio=sites.ratio(i, parameters),
+                cook=float(np.sum(moved) / (len(sites.start) * misfit)),
+            )
+        )
+    return found
+
+
+def suspects(
+    simulate: Simulate, measured: Sequence[Measured], start: Array
+) -> tuple[tuple[LeftOut, ...], tuple[int, ...]]:
+    """Every site left out, and the indices of those that do not belong: none, one, or a pair.
+
+    Fewer than four sites cannot tell who is wrong.
+    """
+    if len(measured) < MIN_SITES:
+        return (), ()
+    sites = Sites(simulate, measured, start)
+    singles = _left_out(sites)
+    best = int(np.argmax([single.standardised for single in singles]))
+    alone = singles[best].standardised if singles[best].error > ERROR else 0.0
+    pair, together = _worst_pair(sites, singles)
+    if together > LARGE and together > 1.5 * alone and len(measured) > MIN_SITES:
+        return tuple(singles), pair
+    return tuple(singles), (best,) if alone > LARGE else ()
+
+
+def _worst_pair(sites: Sites, singles: Sequence[LeftOut]) -> tuple[tuple[int, ...], float]:
+    """The two sites that, both left out, are predicted worst by the rest; 0 where one of them is fine."""
+    everyone = sites.errors(sites.without())
+    if max(everyone.max(), *(single.error for single in singles)) <= ERROR / 2:
+        return (), 0.0
+    found: tuple[tuple[int, ...], float] = ((), 0.0)
+    for i, j in combinations(sorted(_worst(sites, everyone)), 2):
+        errors = sites.errors(sites.without(i, j))[[i, j]]
+        if errors.min() < ERROR:
+            continue
+        size = float(np.sqrt(np.mean(errors**2))) / sites.expected(i, j)
+        if size > found[1]:
+            found = ((i, j), size)
+    return found
+
+
+Exchange = Callable[[Array, int, int], tuple[SiteResponse, SiteResponse]]
+
+
+def as_driven(response: SiteResponse, own: History, other: History) -> SiteResponse:
+    """About what a site would answer to another site's record: the curve stretched in time, and by a power
+    law in depth, whose exponent is that of its own loading.
+
+    Parameters
+    ----------
+    own, other : times (n,) s and depths (n,) mm of its record and of the other one.
+    """
+    (time, depth), (_, other_depth) = own, other
+    deep = depth.max()
+    rising = np.zeros(len(time), dtype=bool)
+    for phase in find_phases(time, depth):
+        if phase.kind == "load":
+            rising |= (time >= phase.start_s) & (time <= phase.end_s)
+    loading, force = depth[rising], response.force_N[rising]
+    used = (loading > 0.3 * deep) & (force > 0)
+    exponent = float(np.polyfit(np.log(loading[used]), np.log(force[used]), 1)[0]) if used.sum() > 2 else 1.0
+    factor = (other_depth.max() / deep) ** np.clip(exponent, 0.5, 4.0)
+    at = _same_moment(own, other)
+    columns = [np.interp(at, time, column) for column in response.jacobian.T]
+    return SiteResponse(factor * np.interp(at, time, response.force_N), factor * np.stack(columns, axis=1))
+
+
+def _same_moment(own: History, other: History) -> Array:
+    """The times (n,) of a site's own record at which it has come as far as the other one at its times.
+
+    As far in the same phase; in the same share of the whole where they do not have the same phases.
+    """
+    mine, theirs = find_phases(*own), find_phases(*other)
+    if [phase.kind for phase in mine] == [phase.kind for phase in theirs]:
+        return np.asarray(np.interp(other[0], boundaries(theirs), boundaries(mine)))
+    return other[0] / other[0][-1] * own[0][-1]
+
+
+def best_correction(
+    simulate: Simulate,
+    measured: Sequence[Measured],
+    start: Array,
+    exchange: Exchange,
+    exactly: Exchange | None = None,
+) -> Correction | None:
+    """The one change of names or of a unit that lowers the misfit of all sites most; None where none
+    convinces.
+
+    Parameters
+    ----------
+    exchange : at parameters (p,), the responses of the first site to the second's record, and of the second
+        to the first's, each at the times of the record; may be an approximation (``as_driven``).
+    exactly : the same by simulation, asked for the few exchanges that may matter, which it then judges; one
+        that fails is not judged.
+    """
+    as_is = Sites(simulate, measured, start)
+    before = as_is.errors(as_is.without())
+    if before.max() <= ERROR / 2:
+        return None  # nothing to explain
+    worst = sorted(_worst(as_is, before))
+    units = [converted(simulate, measured, start, i, unit, before) for i in worst for unit in FORCE_UNITS]
+    pairs = combinations(worst, 2)
+    swaps = [exchanged(simulate, measured, start, pair, exchange, before) for pair in pairs]
+    if exactly is not None:
+        likely = sorted((s for s in swaps if s.gain > GAIN / 2), key=lambda s: -s.gain)[:_LOOKED_AT]
+        known = [_pair(s) for s in likely if all(r.completed for r in exactly(start, *_pair(s)))]
+        swaps = [exchanged(simulate, measured, start, pair, exactly, before) for pair in known]
+    convincing = [found for found in (*units, *swaps) if found.convinces]
+    return max(convincing, key=lambda found: found.gain, default=None)
+
+
+def _pair(found: Correction) -> tuple[int, int]:
+    i, j = found.sites
+    return i, j
+
+
+def _worst(sites: Sites, before: Array) -> list[int]:
+    """The sites that are predicted worst, with or without themselves, at most eight."""
+    alone = [sites.errors(sites.without(i))[i] for i in range(len(before))]
+    return [int(i) for i in np.argsort(-np.maximum(before, alone))[:_WORST]]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found: every site left out as the records are named, and the flags."""
+
+    left_out: tuple[LeftOut, ...]
+    flags: tuple[Flag, ...]
+
+
+def find_outliers(
+    simulate: Simulate,
+    measured: Sequence[Measured],
+    start: Array,
+    exchange: Callable[[FirstOrder], Exchange],
+    exactly: Exchange | None = None,
+    neutral: Array | None = None,
+) -> Findings:
+    """Look for names exchanged, units of force, and sites that do not belong, one after the other.
+
+    A correction that convinces is flagged and applied before the next is looked for, so that what is left is
+    judged by what is right. Fewer than four sites cannot tell who is wrong: there is no finding then.
+
+    Where the fit that ``start`` comes from was led astray, sites are off everywhere, and two materials end at
+    bounds to please a wrong record. Then sites are looked at from ``neutral``, the answer with one material,
+    which cannot be led as far.
+
+    Parameters
+    ----------
+    simulate : all sites; called at ``start``, and at ``neutral`` where that is needed.
+    exchange : from the expansion of all sites to the exchange of two, approximately (``as_driven``).
+    exactly : the same by simulation.
+    """
+    if len(measured) < MIN_SITES:
+        return Findings((), ())
+    first = FirstOrder(start, simulate(start))
+    named = leave_one_out(first, measured, start)
+    if neutral is not None and Sites(first, measured, start).errors(start).max() > ERROR:
+        responses = simulate(neutral)
+        if not check_responses(responses, measured, len(neutral)):
+            first = FirstOrder(neutral, responses)
+    return Findings(named, _flags(first, measured, exchange(first), exactly))
+
+
+def _flags(
+    first: FirstOrder, measured: Sequence[Measured], exchange: Exchange, exactly: Exchange | None
+) -> tuple[Flag, ...]:
+    start = first.parameters
+    respond: Simulate = first
+    flags, corrected = [], list(measured)
+    for _ in range(_MOST):
+        found = best_correction(respond, corrected, start, exchange, exactly)
+        if found is None:
+            break
+        if found.kind == "unit":
+            i = found.sites[0]
+            factor = FORCE_UNITS[found.cause]
+            corrected[i] = replace(corrected[i], force_N=corrected[i].force_N / factor)
+        else:
+            i, j = found.sites
+            respond = _renamed(respond, start, (i, j), exactly or exchange)
+            corrected[i], corrected[j] = corrected[j], corrected[i]
+        flags.append(flag_of_correction(found, [site.name for site in measured]))
+    singles, odd = suspects(respond, corrected, start)
+    flags += [flag_of(singles[i]) for i in odd if not _named(flags, measured[i].name)]
+    return tuple(flags)
+
+
+def _named(flags: Sequence[Flag], site: str) -> bool:
+    return any(site in flag.sites for flag in flags)
+
+
+def _renamed(simulate: Simulate, start: Array, pair: tuple[int, int], exchange: Exchange) -> Simulate:
+    """The same sites, two of them driven by each other's record."""
+    i, j = pair
+    moved = FirstOrder(start, exchange(start, i, j))
+
+    def respond(parameters: Array) -> list[SiteResponse]:
+        responses = list(simulate(parameters))
+        responses[i], responses[j] = moved(parameters)
+        return responses
+
+    return respond
+
+
+def converted(
+    simulate: Simulate, measured: Sequence[Measured], start: Array, i: int, unit: str, before: Array
+) -> Correction:
+    """The fit to all sites with the force of one converted; ``before`` are the errors without."""
+    renamed = list(measured)
+    renamed[i] = replace(measured[i], force_N=measured[i].force_N / FORCE_UNITS[unit])
+    return _correction("unit", (i,), unit, before, Sites(simulate, renamed, start))
+
+
+def exchanged(
+    simulate: Simulate,
+    measured: Sequence[Measured],
+    start: Array,
+    pair: tuple[int, int],
+    exchange: Exchange,
+    before: Array,
+) -> Correction:
+    """The fit to all sites with the records of two exchanged; ``before`` are the errors without."""
+    i, j = pair
+    renamed = list(measured)
+    renamed[i], renamed[j] = measured[j], measured[i]
+    sites = Sites(_renamed(simulate, start, pair, exchange), renamed, start)
+    return _correction("swap", pair, "swapped site names", before, sites)
+
+
+def _correction(
+    kind: Literal["swap", "unit"], which: tuple[int, ...], cause: str, before: Array, sites: Sites
+) -> Correction:
+    after = sites.errors(sites.without())
+    gain = float(np.sum(before**2) / max(np.sum(after**2), len(after) * (_FLOOR / 2) ** 2))
+    pairs = [(float(before[i]), float(after[i])) for i in which]
+    return Correction(
+        kind,
+        which,
+        cause,
+        gain,
+        tuple(b for b, _ in pairs),
+        tuple(a for _, a in pairs),
+        float(before.max()),
+    )
+
+
+def flag_of(found: LeftOut) -> Flag:
+    """The flag of a site that does not belong, with the unit that its force ratio is near."""
+    numbers = {
+        "prediction_error_percent": 100 * found.error,
+        "expected_error_percent": 100 * found.expected,
+        "standardised_error": found.standardised,
+        "force_ratio": found.ratio,
+        "cooks_distance": found.cook,
+    }
+    what = (
+        f"predicted from the other sites it is off by {100 * found.error:.0f} % of its peak, "
+        f"{found.standardised:.1f} times what other sites are (measured {found.ratio:.2f} times predicted)"
+    )
+    unit = unit_of(found.ratio)
+    if unit:
+        return Flag((found.site,), "unit", what, numbers, unit, "convert the force to N")
+    cause = "another place, axis, limb or name, or tissue that differs there"
+    remedy = "check the record, position and axis of this site; leave it out of the fit until then"
+    return Flag((found.site,), "outlier", what, numbers, cause, remedy)
+
+
+def flag_of_correction(found: Correction, names: Sequence[str]) -> Flag:
+    sites = tuple(names[i] for i in found.sites)
+    numbers = {
+        "misfit_ratio": found.gain,
+        "error_before_percent": 100 * max(found.errors_before),
+        "error_after_percent": 100 * max(found.errors_after),
+    }
+    done = "their records exchanged" if found.kind == "swap" else "its force converted"
+    what = (
+        f"with {done}, the squared misfit of all sites falls {found.gain:.1f} times and the error here from "
+        f"{numbers['error_before_percent']:.0f} to {numbers['error_after_percent']:.0f} % of the peak"
+    )
+    remedies = {
+        "swap": "exchange the traces of the two sites, or their names",
+        "unit": "convert the force to N",
+    }
+    return Flag(sites, found.kind, what, numbers, found.cause, remedies[found.kind])
+
+
+def unit_of(ratio: float) -> str:
+    """The unit of force that a ratio of measured to predicted force comes near; empty if none does."""
+    if ratio <= 0:
+        return ""
+    name = min(FORCE_UNITS, key=lambda unit: abs(np.log(ratio / FORCE_UNITS[unit])))
+    away = abs(np.log(ratio / FORCE_UNITS[name]))
+    return name if away < min(_SHARE * abs(np.log(FORCE_UNITS[name])), 0.5) else ""

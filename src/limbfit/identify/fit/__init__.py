@@ -1,0 +1,1 @@
+"""The search: parameters, residuals, least squares, stages, several starts, two meshes."""

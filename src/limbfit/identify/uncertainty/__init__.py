@@ -1,0 +1,1 @@
+"""What the data cannot tell: noise and misfit, intervals, samples, profiles, other sources."""

@@ -1,0 +1,69 @@
+"""The calibration as an estimator: how its answer follows the records and the priors that it was given.
+
+At the answer the gradient of what was minimised is zero, so the implicit function theorem gives the change of
+the answer from that of the records and of the priors' medians (Huber 1967, the sandwich): ``H^-1 J' W dy``
+and ``H^-1 s^2 R' db``, with J the derivatives of a site's force, W the curvature of its cost
+(``objective.curvature``), s^2 the weight of the priors, R their rows, ``H = J' W J + s^2 R' R``. The force's
+own second derivatives are left out: they meet residuals whose mean is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fit.calibration import CalibrationSettings
+from ..fit.objective import Measured, curvature
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """The linearised calibration in its search space of k coordinates.
+
+    ``force_hessian`` (k, k) is what the forces add to the second derivative of what was minimised,
+    ``prior_hessian`` (k, k) what q stated priors add; ``by_record`` (k, n), per site, is how its gradient
+    changes with the record, and ``by_prior`` (k, q) with the priors' medians, in their standard deviations.
+    """
+
+    force_hessian: Array
+    prior_hessian: Array
+    by_record: tuple[Array, ...]
+    by_prior: Array
+
+    @classmethod
+    def at(
+        cls,
+        left: Sequence[Array],
+        scaled: Sequence[Array],
+        measured: Sequence[Measured],
+        rows: Array,
+        settings: CalibrationSettings,
+    ) -> Estimator:
+        """From residuals (n,) N and derivatives (n, k) N per site at the answer.
+
+        ``rows @ z`` (q, k) are the priors' logarithms in their standard deviations.
+        """
+        weights = [curvature(settings.objective, r, site) for r, site in zip(left, measured, strict=True)]
+        by_record = tuple(J.T @ W for J, W in zip(scaled, weights, strict=True))
+        forces = np.sum([G @ J for G, J in zip(by_record, scaled)], axis=0)
+        share = (settings.force_error_percent / 100) ** 2
+        return cls(forces, share * rows.T @ rows, by_record, share * rows.T)
+
+    @property
+    def hessian(self) -> Array:
+        return self.force_hessian + self.prior_hessian
+
+    def by_covariance(self, covariances: Sequence[Array]) -> Array:
+        """Covariance (k, k) of the gradient where that of each site's record is (n, n) N^2."""
+        parts = [G @ C @ G.T for G, C in zip(self.by_record, covariances, strict=True)]
+        return np.asarray(np.sum(parts, axis=0))
+
+    @property
+    def by_medians(self) -> Array:
+        """Covariance (k, k) of the gradient by the priors: each median off by its stated deviation."""
+        return self.by_prior @ self.by_prior.T

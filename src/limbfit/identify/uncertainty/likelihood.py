@@ -1,0 +1,172 @@
+"""How probable parameters are, given the records: one function that posterior, profiles and evidence share.
+
+The residuals have the covariance of ``discrepancy``. The size of the misfit is not known exactly, so it stays
+an unknown of its own: a factor on all misfits, 1 where it was estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fit.objective import Measured, SiteResponse
+from ..fit.parameters import Space, Unknowns
+from ..fit.trust_region import Point, minimise
+from .discrepancy import ResidualModel
+
+Array = NDArray[np.float64]
+
+_ITERATIONS = 60
+_TOLERANCE = 1e-5
+FACTORS = (0.2, 5.0)  # of the misfit
+
+
+class StandIn(Protocol):
+    """What answers fast enough for thousands of questions: an `Emulator`, or what is made of one."""
+
+    def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
+        """Force (n,) and derivatives (n, p) of every site at parameters (p,)."""
+        ...
+
+    def forces(self, parameters: Array) -> Array:
+        """Forces (m, N) of all sites, one after the other, at parameters (m, p)."""
+        ...
+
+
+Doubting = Callable[[Array], tuple[Array, Array]]
+_LEAST_MISFIT = 1e-7  # over the largest force: much less than any noise
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The most probable z (k,) of a space: ``parameters`` (p,), ``minus_2_log`` of the likelihood there."""
+
+    z: Array
+    parameters: Array
+    minus_2_log: float
+
+
+class Likelihood:
+    """The records' likelihood over a search space, with the emulator in place of the solver.
+
+    Coordinates ``z`` (k,) are those of ``space``. Stated priors of ``unknowns`` count as data; bounds hold.
+    ``doubting`` gives forces (m, N) and their expected error (m, sites), one sd in N, at parameters (m, p):
+    it counts as misfit that grows away from what was simulated (Kennedy and O'Hagan 2001).
+    """
+
+    def __init__(
+        self,
+        emulator: StandIn,
+        measured: Sequence[Measured],
+        model: ResidualModel,
+        unknowns: Unknowns,
+        space: Space,
+        doubting: Doubting | None = None,
+    ) -> None:
+        self.doubting = doubting
+        if doubting is not None:  # an expected error has the shape of misfit, which none would not have
+            model = replace(model, misfit=np.maximum(model.misfit, _LEAST_MISFIT))
+        self.emulator, self.measured, self.model = emulator, tuple(measured), model
+        self.unknowns, self.space = unknowns, space
+        spectra = model.spectra()
+        sizes = np.cumsum([0, *(len(s.values) for s in spectra)])
+        self._sites = tuple(
+            (spectrum.transform, slice(a, b)) for spectrum, a, b in zip(spectra, sizes[:-1], sizes[1:])
+        )
+        self._misfit = np.concatenate([s.values for s in spectra])
+        self._site = np.repeat(np.arange(len(spectra)), np.diff(sizes))
+        unit = model.misfit * model.peaks_N if doubting is not None else np.ones(len(spectra))
+        self._per_N2 = self._misfit / unit[self._site] ** 2
+        self._constant = sum(s.log_determinant for s in spectra) + sizes[-1] * np.log(2 * np.pi)
+        self._target = self._whiten(np.concatenate([site.force_N for site in measured]))
+        self._rows, self._known = unknowns.prior_rows()
+
+    @property
+    def has_misfit(self) -> bool:
+        """Whether the size of the misfit makes any difference."""
+        return bool(self._misfit.max(initial=0.0) > 1e-6)
+
+    def _whiten(self, forces: Array) -> Array:
+        """Forces of all sites (N, ...) where noise has variance 1 and misfit is diagonal."""
+        return np.concatenate([transform @ forces[where] for transform, where in self._sites])
+
+    def parameters(self, z: Array) -> Array:
+        """The full parameters (m, p) at z (m, k)."""
+        return np.exp(self.space.fixed + np.atleast_2d(z) @ self.space.tie.T)
+
+    def minus_2_log(self, z: Array, factor: Array | float = 1.0) -> Array:
+        """Minus twice the log-likelihood (m,) at z (m, k), with the misfit ``factor`` (m,) times as large.
+
+        Infinite outside the bounds.
+        """
+        z = np.atleast_2d(z)
+        p = self.parameters(z)
+        if self.doubting is None:
+            forces, doubt = self.emulator.forces(p), np.zeros((1, len(self.measured)))
+        else:
+            forces, doubt = self.doubting(p)
+        residual = self._whiten(forces.T).T - self._target
+        variances = 1.0 + np.atleast_1d(factor)[:, None] ** 2 * self._misfit
+        variances = variances + doubt[:, self._site] ** 2 * self._per_N2
+        beliefs = np.log(p) @ self._rows.T - self._known
+        found = np.sum(residual**2 / variances + np.log(variances), axis=1) + np.sum(beliefs**2, axis=1)
+        found = np.where(np.isfinite(found), found, np.inf) + self._constant
+        outside = np.any((z < self.space.lower - 1e-9) | (z > self.space.upper + 1e-9), axis=1)
+        return np.where(outside, np.inf, found)
+
+    def at_responses(self, responses: Sequence[SiteResponse], parameters: Array) -> float:
+        """The same with the forces of the solver, to check the emulator by."""
+        forces = np.concatenate([response.force_N for response in responses])
+        residual = self._whiten(forces) - self._target
+        variances = 1.0 + self._misfit
+        beliefs = self._rows @ np.log(parameters) - self._known
+        return float(np.sum(residual**2 / variances + np.log(variances)) + beliefs @ beliefs + self._constant)
+
+    def point(self, z: Array, factor: float = 1.0) -> Point | None:
+        """Residuals of unit variance and their derivatives at z (k,), for least squares."""
+        parameters = self.parameters(z)[0]
+        responses = self.emulator(parameters)
+        sd = np.sqrt(1.0 + factor**2 * self._misfit)
+        forces = np.concatenate([response.force_N for response in responses])
+        slopes = np.concatenate([self.space.pull_back(r.jacobian, parameters) for r in responses])
+        if not (np.isfinite(forces).all() and np.isfinite(slopes).all()):
+            return None
+        residual = (self._whiten(forces) - self._target) / sd
+        beliefs = self._rows @ np.log(parameters) - self._known
+        jacobian = np.concatenate([self._whiten(slopes) / sd[:, None], self._rows @ self.space.tie])
+        return Point(z, np.concatenate([residual, beliefs]), jacobian)
+
+    def optimum(self, start: Array, held: int | None = None, factor: float = 1.0) -> Optimum:
+        """The most probable z from ``start`` (k,), where ``held`` names an entry that stays."""
+        free = np.arange(len(start)) != (-1 if held is None else held)
+
+        def evaluate(part: Array) -> Point | None:
+            z = start.copy()
+            z[free] = part
+            point = self.point(z, factor)
+            return point and Point(part, point.residual, point.jacobian[:, free])
+
+        z = start.copy()
+        first = evaluate(start[free])
+        if first is not None and free.any():
+            lower, upper = self.space.lower[free], self.space.upper[free]
+            steps = minimise(evaluate, first, lower, upper, tolerance=_TOLERANCE, max_iterations=_ITERATIONS)
+            for step in steps:
+                z[free] = step.point.z
+        return Optimum(z, self.parameters(z)[0], float(self.minus_2_log(z, factor)[0]))
+
+    def best(self, starts: Sequence[Array]) -> Optimum:
+        """The most probable of the optima from several full parameters (p,)."""
+        found = [self.optimum(self.space.reduce(np.log(start))) for start in starts]
+        return min(found, key=lambda one: one.minus_2_log)
+
+    def covariance(self, z: Array) -> Array:
+        """Of z (k,) there, linearised (k, k); what the bounds say keeps it finite."""
+        point = self.point(z)
+        assert point is not None
+        bounds = np.diag(12.0 / (self.space.upper - self.space.lower) ** 2)
+        return np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)

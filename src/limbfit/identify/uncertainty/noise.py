@@ -1,0 +1,108 @@
+"""What a record adds to the force: sensor noise as its own scatter shows it, and the doubt about touch-down.
+
+The forces compared are a smoothed record at a few points. Slow noise passes the smoothing unchanged, fast
+noise does not. So the compared points are given the covariance that means of their share of the samples have,
+which keeps what the smoothing keeps and claims no knowledge of what it removed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...autoregressive import block_covariance, lag_one
+from ...phases import find_phases
+
+Array = NDArray[np.float64]
+
+_LEAST_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
+
+
+@dataclass(frozen=True)
+class SiteNoise:
+    """Noise of a site's record at the n times of comparison.
+
+    ``covariance`` (n, n) N^2; ``sd_N`` and ``autocorrelation`` of neighbours are those of the samples as
+    recorded; ``touch_down_mm`` is the standard deviation of the touch-down that is part of the covariance.
+    """
+
+    name: str
+    times_s: Array
+    covariance: Array
+    sd_N: float
+    autocorrelation: float
+    touch_down_mm: float = 0.0
+
+
+def record_noise(
+    name: str,
+    times_s: Array,
+    residual_N: Array,
+    force_N: Array,
+    displacement_mm: Array,
+    touch_down_sd_mm: float = 0.0,
+    smoothing: Array | None = None,
+) -> SiteNoise:
+    """Noise of a record with ``residual_N`` (samples,), raw minus smoothed force.
+
+    Parameters
+    ----------
+    times_s, force_N, displacement_mm : the compared curve (n,).
+    touch_down_sd_mm : a depth counted from elsewhere moves the whole curve along its own slope.
+    smoothing : (n, n) of the curve, which that slope passes too; by default none.
+    """
+    residual = residual_N - residual_N.mean()
+    sd = float(residual.std())
+    lag = lag_one(residual)
+    samples = _samples_of_points(times_s, residual.size)
+    slope = touch_down_sd_mm * depth_slope(times_s, displacement_mm, force_N)
+    slope = slope if smoothing is None else smoothing @ slope
+    floor = (_LEAST_SHARE * force_N.max()) ** 2
+    covariance = block_covariance(sd, lag, samples) + np.outer(slope, slope)
+    covariance += floor * np.eye(len(times_s))
+    return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm)
+
+
+def curve_noise(name: str, times_s: Array, residual_N: Array, force_N: Array) -> SiteNoise:
+    """White noise of a curve that was never smoothed, from how neighbouring residuals (n,) scatter.
+
+    Second differences take what is smooth out of them.
+    """
+    differences = np.diff(residual_N, 2)
+    sd = float(np.sqrt(np.mean(differences**2) / 6.0)) if differences.size else 0.0
+    sd = float(np.hypot(sd, _LEAST_SHARE * force_N.max()))
+    return SiteNoise(name, times_s, sd**2 * np.eye(len(times_s)), sd, 0.0)
+
+
+def _samples_of_points(times_s: Array, samples: int) -> NDArray[np.int64]:
+    """How many of the samples (n,) belong to each point: its share of the time, and one at least."""
+    steps = np.diff(times_s)
+    widths = np.r_[steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]]
+    return np.maximum(np.round(samples * widths / widths.sum()).astype(np.int64), 1)
+
+
+def depth_slope(times_s: Array, displacement_mm: Array, force_N: Array) -> Array:
+    """dF/dd (n,) N/mm at every point.
+
+    Where the indenter goes deeper than before it is the slope of the curve itself. In a hold, on the way out
+    and in later cycles it is that of the same depth when it was new, as much smaller as the force is, and
+    none where the tissue has let go.
+    """
+    slope, new = np.zeros_like(force_N), np.zeros(len(force_N), dtype=bool)
+    deepest = -np.inf
+    for phase in find_phases(times_s, displacement_mm):
+        inside = np.flatnonzero((times_s >= phase.start_s) & (times_s <= phase.end_s))
+        so_far = np.maximum.accumulate(displacement_mm[inside])
+        inside = inside[displacement_mm[inside] > np.r_[-np.inf, so_far[:-1]]]
+        if phase.kind != "load" or len(inside) < 2:
+            continue
+        rising = np.gradient(force_N[inside], displacement_mm[inside])
+        deeper = displacement_mm[inside] > deepest
+        slope[inside[deeper]], new[inside[deeper]] = rising[deeper], True
+        deepest = max(deepest, float(displacement_mm[inside[-1]]))
+    depth = displacement_mm[new]
+    entering = np.interp(displacement_mm, depth, force_N[new])
+    share = np.clip(force_N / np.maximum(entering, 1e-6 * force_N.max()), 0.0, 1.0)
+    return np.where(new, slope, share * np.interp(displacement_mm, depth, slope[new]))

@@ -1,0 +1,1 @@
+"""What verbs, experiments and stages share: the store and its keys, simulations kept, provenance."""

@@ -1,0 +1,60 @@
+"""What every stage is given: the study, where to store, what to run on, whom to tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ...execution import Executor, Limits, make_executor
+from ...study import Study
+from .store import Store
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of a stage: ``done`` of ``total`` (``total`` 0: not known), and what is going on in words.
+
+    ``fit``: the words are the identified parameters and their error so far, ``facts`` the same as numbers.
+    """
+
+    stage: str
+    done: float = 0.0
+    total: float = 0.0
+    text: str = ""
+    fit: bool = False
+    facts: Mapping[str, Any] | None = None
+
+
+Listener = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Context:
+    """One run of one study."""
+
+    study: Study
+    store: Store
+    executor: Executor
+    listener: Listener
+
+    def tell(
+        self,
+        stage: str,
+        done: float,
+        total: float,
+        text: str = "",
+        fit: bool = False,
+        facts: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.listener(Progress(stage, done, total, text, fit, facts))
+
+    def stored(self, stage: str, name: str) -> Any:
+        """A JSON artefact of a finished stage."""
+        return self.store.read(stage, name)
+
+
+def executor_of(study: Study) -> Executor:
+    """What a study's jobs run on, with its limits."""
+    table = study.execution
+    return make_executor(table.workers, Limits(table.time_limit_s, table.memory_limit_GB))

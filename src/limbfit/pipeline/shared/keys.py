@@ -1,0 +1,71 @@
+"""Keys of stages and experiments: digests of all that decides them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ...study import Study
+from .provenance import input_files
+from .sources import code_digest
+from .store import digest, file_digest
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage: what it stands on and the study tables it reads; its code is that of `sources.sources_of`."""
+
+    name: str
+    run: Callable[..., dict[str, Any]]
+    needs: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ()
+    site_keys: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of the stages of one study; input files are digested once, whatever part of it is asked about."""
+
+    study: Study
+
+    @cached_property
+    def digests(self) -> dict[Path, str]:
+        named = {path for paths in input_files(self.study).values() for path in paths}
+        places = {path: self.study.path(path) for path in named}
+        # A record that is yet to be made has none.
+        return {path: file_digest(place) if place.exists() else "" for path, place in places.items()}
+
+    def of(
+        self,
+        stages: Iterable[Stage],
+        known: Mapping[str, str] | None = None,
+        study: Study | None = None,
+        options: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> dict[str, str]:
+        """The key of each stage, in order; those below it are among ``stages`` or ``known``.
+
+        Parameters
+        ----------
+        known : keys of other stages; a stage that is in it has that key.
+        study : a part of the study, instead of the whole.
+        options : what a stage is run with beside the study, by its name.
+        """
+        known, options, study = known or {}, options or {}, study or self.study
+        stated, files = study.model_dump(mode="json"), input_files(study)
+        found: dict[str, str] = {}
+        for stage in stages:
+            read = files.get(stage.name)
+            extra = [options[stage.name]] if options.get(stage.name) else []
+            found[stage.name] = known.get(stage.name) or digest(
+                stage.name,
+                {table: stated[table] for table in stage.tables},
+                [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
+                None if read is None else {str(path): self.digests[path] for path in read},
+                code_digest(stage.run),
+                [found.get(below) or known.get(below) for below in stage.needs],
+                *extra,
+            )
+        return found

@@ -1,0 +1,181 @@
+"""Simulations of a study, never done twice: kept on disk as they finish, keyed by what decides them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...execution import Executor
+from ...fe import Doubt
+from ...indentation import Simulation, SimulationJob, SiteModel, simulate
+from ...study import Site, Study
+from .context import Context
+from .sources import code_digest
+from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
+
+CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
+
+
+class SimulationCache:
+    """Finished simulations in ``folder``, one file each.
+
+    ``also`` are folders of earlier runs, beside those of interrupted attempts: what is found there is copied,
+    since they may be replaced.
+    ``work`` does a job; what it tells beyond `simulate` is in the simulation's facts.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        also: Sequence[Path] = (),
+        work: Callable[[SimulationJob], Simulation] = simulate,
+    ) -> None:
+        self.folder, self.work = folder, work
+        self.places = (folder, folder.parent / EARLIER, *also)
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def run(
+        self, jobs: Sequence[SimulationJob], executor: Executor, again: bool = False
+    ) -> Iterator[Simulation]:
+        """The jobs' simulations, in order; those not found are done on the executor and kept.
+
+        ``again``: those that failed are tried once more.
+        """
+        found = {i: kept for i, job in enumerate(jobs) if (kept := self._find(job)) is not None}
+        if again:
+            found = {i: kept for i, kept in found.items() if kept.completed}
+        missing = [job for i, job in enumerate(jobs) if i not in found]
+        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], lost=_lost)
+        for i, job in enumerate(jobs):
+            if i in found:
+                yield found[i]
+                continue
+            simulation = next(made)
+            if not simulation.facts.get("lost"):  # the machine's fault: another run tries it again
+                self._keep(job, simulation)
+            yield simulation
+
+    def example(self) -> Simulation | None:
+        """Any kept simulation, for what they all have in common; None where there is none."""
+        file = next(self.folder.glob("*.npz"), None)
+        return None if file is None else _load(file)
+
+    def __len__(self) -> int:
+        return len(list(self.folder.glob("*.npz")))
+
+    def with_sensitivities(self) -> int:
+        """How many of the kept simulations have derivatives."""
+        return sum(_load(file).jacobian is not None for file in self.folder.glob("*.npz"))
+
+    def _find(self, job: SimulationJob) -> Simulation | None:
+        name = f"{job_digest(job)}.npz"
+        for place in self.places:
+            if (place / name).is_file():
+                if place != self.folder:
+                    with atomic(self.folder / name) as stream:
+                        stream.write((place / name).read_bytes())
+                return _load(self.folder / name)
+        return None
+
+    def _keep(self, job: SimulationJob, simulation: Simulation) -> None:
+        with atomic(self.folder / f"{job_digest(job)}.npz") as stream:
+            arrays = {"force_N": simulation.force_N}
+            if simulation.jacobian is not None:
+                arrays["jacobian"] = simulation.jacobian
+            facts = {
+                "site": simulation.site,
+                "completed": simulation.completed,
+                "reason": simulation.reason,
+                "penetration_mm": simulation.penetration_mm,
+                "facts": simulation.facts,
+                "doubts": [asdict(doubt) for doubt in simulation.doubts],
+            }
+            np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
+
+
+def _lost(job: SimulationJob, reason: str) -> Simulation:
+    """A failed simulation in place of one whose worker died or went over its limits."""
+    n, site = len(job.times_s), job.model.name
+    slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
+    facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts)
+
+
+def _load(file: Path) -> Simulation:
+    with np.load(file, allow_pickle=False) as stored:
+        facts: dict[str, Any] = json.loads(str(stored["facts"]))
+        jacobian = stored.get("jacobian")
+        doubts = tuple(Doubt(**one) for one in facts.pop("doubts"))
+        return Simulation(force_N=stored["force_N"], jacobian=jacobian, doubts=doubts, **facts)
+
+
+def job_digest(job: SimulationJob) -> str:
+    """What decides a simulation, code included, wherever its mesh file happens to lie."""
+    model = {key: value for key, value in vars(job.model).items() if key != "mesh"}
+    indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
+    model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
+    return digest(
+        code_digest(simulate), model, job.tissues, job.parameters, job.times_s, job.sensitivities, job.start
+    )
+
+
+def site_model(
+    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float], coarse: bool = False
+) -> SiteModel:
+    """The stored mesh (or the coarse one) and place of a site with a displacement history."""
+    study: Study = context.study
+    placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
+    mesh = context.store["mesh"] / (COARSE if coarse else "") / f"{site.name}.vtu"
+    file = None if study.indenter.file is None else study.path(study.indenter.file)
+    return SiteModel(
+        name=site.name,
+        mesh=mesh,
+        mesh_digest=file_digest(mesh),
+        position=tuple(placed["position_mm"]),
+        axis=tuple(placed["axis"]),
+        knots_s=tuple(knots_s),
+        knots_mm=tuple(knots_mm),
+        edge=site.edge,
+        indenter=study.indenter.model_copy(update={"file": file}),
+        indenter_digest="" if file is None else file_digest(file),
+        kappa_ratio=study.material.kappa_ratio,
+        steps=study.solver,
+        element=study.mesh.element,
+    )
+
+
+def recorded_model(context: Context, site: Site, coarse: bool = False) -> SiteModel:
+    """The site driven by its record, from touch-down; ``coarse``: on its coarse mesh."""
+    facts = context.stored("traces", "traces.json")["sites"][site.name]
+    return site_model(context, site, facts["knots_s"], facts["knots_mm"], coarse)
+
+
+def planned_model(context: Context, site: Site) -> SiteModel:
+    """The site driven by the depth and speed that the study plans for it, in and out."""
+    assert site.depth_mm is not None
+    ramp = site.depth_mm / site.speed_mm_s
+    return site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+
+
+def experiment_cache(context: Context, folder: Path) -> SimulationCache:
+    """Simulations of the experiment in ``folder``; all others of the study count as done."""
+    others = sorted(place for place in context.store.folder.glob(f"*/{RUNS}") if place.parent != folder)
+    return SimulationCache(folder / RUNS, also=others)
+
+
+def newest_simulations(folder: Path, sites: Sequence[str]) -> dict[str, Simulation]:
+    """The last kept simulation of each of the sites, of those that have one, while a stage goes on."""
+    found: dict[str, Simulation] = {}
+    files = [(file.stat().st_mtime_ns, file) for file in folder.glob("*.npz")]
+    for _, file in sorted(files, reverse=True):
+        if len(found) == len(sites):
+            break
+        simulation = _load(file)
+        if simulation.site in sites:
+            found.setdefault(simulation.site, simulation)
+    return found

@@ -1,0 +1,1 @@
+"""What is asked of a study: one file for each."""

@@ -1,0 +1,50 @@
+"""Many studies in one go, on one executor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from ...errors import LimbfitError
+from ...execution import make_executor, sharing
+from ...study import load_study
+from ..shared.context import Listener, Progress
+from .run import run_study
+
+_FIGURES = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
+
+
+def run_batch(
+    paths: Sequence[Path], *, until: str | None = None, workers: int = 0, listener: Listener
+) -> Iterator[dict[str, Any]]:
+    """Run studies one after the other on the same workers; a study that fails does not stop the others.
+
+    Parameters
+    ----------
+    paths : of studies, each a ``study.toml`` or its folder.
+    until : name of the last stage to do; default all.
+    workers : how many simulate side by side; 0: one per core.
+    listener : is told of progress.
+
+    Yields
+    ------
+    dict
+        For each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
+        ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
+    """
+    with make_executor(workers) as executor, sharing(executor):
+        for i, path in enumerate(paths):
+            start = perf_counter()
+            listener(Progress("batch", i, len(paths), str(path)))
+            row: dict[str, Any] = {"study": str(path), "state": "done", "error": None}
+            try:
+                summary = run_study(load_study(path), until=until, listener=listener)
+                row |= {key: summary.get(key) for key in _FIGURES}
+            except LimbfitError as error:
+                row |= {"state": "failed", "error": str(error)}
+            except Exception as error:  # one study's bad luck must not cost the others
+                row |= {"state": "failed", "error": f"internal error: {type(error).__name__}: {error}"}
+            yield row | {"seconds": round(perf_counter() - start, 1)}
+        listener(Progress("batch", len(paths), len(paths), "done"))

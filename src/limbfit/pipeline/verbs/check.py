@@ -1,0 +1,112 @@
+"""Read every input of a study and say what is wrong with it, before anything runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.imaging import Volume
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...indentation import read_indenter
+from ...study import Study
+from ..shared.context import Listener, Progress
+from ..shared.store import Store
+from ..stages.inputs import marked_image, study_image, study_labels
+from ..stages.plausible import record_flags
+from ..stages.sites import place_site
+from ..stages.surfaces import given_anatomy
+from ..stages.traces import read_site_trace
+from .run import keys
+
+
+def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
+    """Facts about a study's inputs; raises at the first that cannot be used.
+
+    Returns
+    -------
+    dict
+        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down per recorded site),
+        ``flags`` (what looks wrong about records and places, with the evidence).
+
+    Raises
+    ------
+    InputError
+        For an image, label map, surface, site or record that cannot be used.
+    """
+    facts = list(study.notes)
+    listener(Progress("check", 0, 2, "geometry"))
+    given, notes = given_anatomy(study) if study.surfaces is not None else (None, ())
+    facts += _image_facts(study) if given is None else [*notes, *_surface_facts(study, given)]
+    if study.indenter.file is not None:
+        table = study.indenter.model_copy(update={"file": study.path(study.indenter.file)})
+        width = read_indenter(table, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+        facts.append(f"indenter: {study.indenter.file}, {width:.1f} mm wide")
+    listener(Progress("check", 1, 2, "records"))
+    read = {site.name: read_site_trace(study, site) for site in study.sites if site.trace is not None}
+    sites = {name: record for name, (_, _, record) in read.items()}
+    for name, record in sites.items():
+        facts.append(
+            f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
+            f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} "
+            f"mm; {record['phases_in_words']}"
+            + ("" if record["speed_unload_mm_s"] is not None else "; loading only, no unloading")
+        )
+    facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
+    steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
+    placed, anatomy = _places(study, given)
+    if sites and not placed:
+        facts.append(
+            "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
+            "(limbfit run --until sites, then check again)"
+        )
+    flags = record_flags(study, sites, steps, placed, anatomy)
+    listener(Progress("check", 2, 2))
+    return {
+        "study": study.study.name,
+        "facts": facts,
+        "sites": sites,
+        "flags": [flag.to_dict() for flag in flags],
+    }
+
+
+def _places(study: Study, given: Anatomy | None) -> tuple[dict[str, dict[str, Any]], Anatomy | None]:
+    """Sites on the skin and the anatomy, of given surfaces or of stages that are done; else none."""
+    if given is not None:
+        return {site.name: place_site(site, study, given, None) for site in study.sites}, given
+    store = Store(study.results)
+    if store.stamp("sites") is None or store.state("sites", keys(study)["sites"]).state != "done":
+        return {}, None
+    rows = store.read("sites", "sites.json")["sites"]
+    return {row["site"]: row for row in rows}, load_anatomy(store["surfaces"])
+
+
+def _image_facts(study: Study) -> list[str]:
+    volume = study_image(study)
+    facts = [_sampling("image", volume)]
+    marked = marked_image(study)
+    if marked is not None:
+        facts.append(_sampling("image with markers", marked))
+    given = study_labels(study, volume)
+    if given is not None:
+        labels, notes = given
+        facts.append("corrected labels: " + ", ".join(labels.names.values()))
+        facts += [f"label map: {note}" for note in notes]
+    return facts
+
+
+def _sampling(name: str, volume: Volume) -> str:
+    size = " x ".join(str(n) for n in volume.size)
+    spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
+    return f"{name}: {size} voxels of {spacing} mm"
+
+
+def _surface_facts(study: Study, anatomy: Anatomy) -> list[str]:
+    facts = [
+        f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
+        for name, surface in {"skin": anatomy.skin, **anatomy.bones}.items()
+    ]
+    for site in study.sites:
+        place_site(site, study, anatomy, None)
+    largest = np.ptp(anatomy.skin.points, axis=0)
+    return [*facts, "extent of the skin: " + " x ".join(f"{x:.0f}" for x in largest) + " mm"]

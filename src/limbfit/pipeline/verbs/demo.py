@@ -1,0 +1,56 @@
+"""The synthetic patient as a study, and the demo that identifies it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...errors import InputError
+from ...execution import make_executor
+from ...phantom.build import make_phantom
+from ...study import load_study
+from ..shared.context import Listener, Progress
+from ..shared.store import read_json
+from .run import run_study
+
+
+def make_phantom_study(
+    folder: Path, *, detail: str, seed: int, fat: bool = False, listener: Listener, workers: int = 0
+) -> dict[str, Any]:
+    """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
+    with make_executor(workers) as executor:
+        return make_phantom(
+            folder,
+            detail=detail,
+            seed=seed,
+            fat=fat,
+            mapping=executor.map,
+            progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
+        )
+
+
+def run_demo(folder: Path, *, seed: int, listener: Listener) -> dict[str, Any]:
+    """A coarse synthetic patient identified from its DICOM images and records; goes on where it was stopped.
+
+    Returns
+    -------
+    dict
+        The summary of :func:`run_study` with the ``truth`` beside it.
+
+    Raises
+    ------
+    InputError
+        When ``folder`` holds something else, or the demo of another seed.
+    """
+    truth_file = folder / "truth.json"
+    if not truth_file.is_file():
+        make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)
+    truth = read_json(truth_file)
+    if truth["seed"] != seed or truth["detail"] != "coarse":
+        raise InputError(
+            f"holds the phantom of seed {truth['seed']}, {truth['detail']}",
+            file=folder,
+            remedy="give another folder, or the same seed",
+        )
+    summary = run_study(load_study(folder), listener=listener)
+    return {**summary, "truth": truth["parameters"]}

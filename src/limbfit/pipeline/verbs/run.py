@@ -1,0 +1,298 @@
+"""Which stages there are, what each depends on, and the run that does what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..._version import __version__
+from ...errors import InputError
+from ...study import Study
+from ..experiments.catalogue import (
+    do_experiment,
+    experiment_key,
+    experiment_rows,
+    find_experiment,
+    options_of,
+)
+from ..shared.causes import causes, parts_of
+from ..shared.context import Context, Listener, executor_of
+from ..shared.corrections import keep_corrections
+from ..shared.keys import Keys, Stage
+from ..shared.provenance import input_digests, machine, settings_record, versions
+from ..shared.store import Store, lock, write_json
+from ..stages.calibrate import run_calibrate
+from ..stages.mesh import run_mesh
+from ..stages.predict import run_predict
+from ..stages.report import run_report
+from ..stages.segment import run_segment
+from ..stages.sites import run_sites
+from ..stages.surfaces import run_surfaces
+from ..stages.traces import run_traces
+from .journal import journal
+
+_PLACE = ("name", "position", "near", "axis", "region", "fitted")
+_RECORD = ("trace", "touch_down_s", "peak_s")
+_UNSEEN: dict[str, Any] = {"region": "", **dict.fromkeys((*_RECORD, "axis", "edge"))}
+STAGES = (
+    Stage("segment", run_segment, (), ("image", "segmentation")),
+    Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces")),
+    Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE),
+    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD)),
+    Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",)),
+    Stage(
+        "calibrate",
+        run_calibrate,
+        ("sites", "traces", "mesh"),
+        ("material", "calibration", "solver", "indenter"),
+        ("name", "fitted", "weight", "edge"),
+    ),
+    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge")),
+    Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
+)
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+
+def stages_of(study: Study) -> tuple[Stage, ...]:
+    """The stages that a study has: without an image there is nothing to segment."""
+    return tuple(stage for stage in STAGES if stage.name != "segment" or study.image is not None)
+
+
+def keys(study: Study) -> dict[str, str]:
+    """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
+
+    The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
+    change, come and go without it. The report's covers the experiments that it shows.
+    """
+    return _chain(Keys(study))
+
+
+def _chain(known: Keys) -> dict[str, str]:
+    study = known.study
+    stages = stages_of(study)
+    calibrate = known.of(stages, study=_seen_by_calibration(study))["calibrate"]
+    found = known.of(stages[:-1], {"calibrate": calibrate})
+    shown = [row["key"] for row in experiment_rows(study, known, found) if row["state"] == "done"]
+    return found | known.of(stages[-1:], found, options={"report": {"experiments": shown} if shown else {}})
+
+
+def _seen_by_calibration(study: Study) -> Study:
+    """The study's fitted sites; with markers the others' places too, since each marker goes to one site."""
+    sites = [site.model_copy(update={"region": ""}) for site in study.fitted]
+    if any(site.near is not None for site in sites):
+        others = [site for site in study.sites if not site.fitted and site.near is not None]
+        sites += [site.model_copy(update=_UNSEEN) for site in others]
+    return study.model_copy(update={"sites": tuple(sites)})
+
+
+def study_status(study: Study) -> list[dict[str, Any]]:
+    """State of every stage: done, begun, stale (made from other inputs, settings or code) or missing.
+
+    ``why`` names what changed since a stale one was made. Below the stages: the experiments that were begun
+    or done.
+    """
+    store, known = Store(study.results), Keys(study)
+    wanted, rows = _chain(known), []
+    for stage in stages_of(study):
+        state = store.state(stage.name, wanted[stage.name])
+        rows.append(
+            {
+                "stage": stage.name,
+                "state": state.state,
+                "seconds": state.seconds,
+                "finished": state.finished,
+                "why": _why(known, stage, wanted) if state.state == "stale" else [],
+            }
+        )
+    columns = ("state", "seconds", "finished")
+    for row in experiment_rows(study, known, wanted):
+        if row["state"] != "missing":
+            why = _why(known, find_experiment(row["experiment"]), wanted) if row["state"] == "stale" else []
+            rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}, "why": why})
+    return rows
+
+
+def _parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """What the key of a stage is made of, for a later status to say what changed."""
+    seen = _seen_by_calibration(known.study) if stage.name == "calibrate" else known.study
+    return parts_of(stage, known, seen, chain)
+
+
+def _why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
+    stamp = Store(known.study.results).stamp(stage.name) or {}
+    return causes(stamp.get("parts"), _parts(known, stage, chain))
+
+
+def run_study(
+    study: Study,
+    *,
+    until: str | None = None,
+    start: str | None = None,
+    force: Sequence[str] = (),
+    listener: Listener,
+) -> dict[str, Any]:
+    """Do every stage that is not done, in order; return the summary of the study.
+
+    Parameters
+    ----------
+    study : a checked study.
+    until : name of the last stage to do; default all.
+    start : name of a stage that is done anew, and all after it.
+    force : names of stages that are done anew. Kept simulations count: the same ones would come out.
+    listener : is told of progress; ``results/log`` too.
+
+    Raises
+    ------
+    InputError
+        When an input cannot be used.
+    RunError
+        When another run holds the study, or the disk is full.
+    """
+    anew = _anew(study, until, start, force)
+    store = Store(study.results)
+    with (
+        lock(study.results),
+        journal(study, "run", listener) as listener,
+        executor_of(study) as executor,
+    ):
+        context = Context(study, store, executor, listener)
+        kept = keep_corrections(study)
+        if kept is not None:
+            context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
+        known = Keys(study)
+        chain = _chain(known)
+        for stage, key in chain.items():
+            if stage in anew or store.state(stage, key).state != "done":
+                _do(context, stage, known, chain)
+            else:
+                context.tell(stage, 1, 1, "is up to date")
+            if stage == until:
+                break
+        summary = summarise(study)
+    if until is not None:
+        summary["until"] = until
+    return summary
+
+
+def _anew(study: Study, until: str | None, start: str | None, force: Sequence[str]) -> set[str]:
+    """Stages that are done whether they are up to date or not."""
+    names = [stage.name for stage in stages_of(study)]
+    for name in (until, start, *force):
+        if name is not None and name not in names:
+            raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(names))
+    if until is not None and start is not None and names.index(start) > names.index(until):
+        raise InputError(f"{start} comes after {until}", remedy="leave out one of the two")
+    return {*force, *(names[names.index(start) :] if start is not None else ())}
+
+
+def run_experiment(study: Study, name: str, *, listener: Listener, **options: Any) -> dict[str, Any]:
+    """Do an experiment of a study, and before it every stage that it needs and that is not done.
+
+    Its results lie in ``results/<name>``; ``limbfit report`` shows them.
+
+    Parameters
+    ----------
+    study : a checked study.
+    name : of the experiment.
+    listener : is told of progress.
+    options : as the experiment takes them; left out: its defaults.
+
+    Returns
+    -------
+    dict
+        What ``results/<name>/<name>.json`` holds, and ``folder``, where that is.
+
+    Raises
+    ------
+    InputError
+        For an experiment or option that there is not, or an input that cannot be used.
+    RunError
+        When another run holds the study, or the disk is full.
+    """
+    experiment = find_experiment(name)
+    chosen = options_of(experiment, options)
+    last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
+    if last:
+        run_study(study, until=last[0], listener=listener)
+    store = Store(study.results)
+    with (
+        lock(study.results),
+        journal(study, name, listener) as listener,
+        executor_of(study) as executor,
+    ):
+        known = Keys(study)
+        chain = _chain(known)
+        key, parts = experiment_key(experiment, known, chain, chosen), _parts(known, experiment, chain)
+        context = Context(study, store, executor, listener)
+        found = do_experiment(context, experiment, key, chosen, parts)
+    return found | {"folder": str(store[name])}
+
+
+def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> None:
+    stage = next(stage for stage in STAGES if stage.name == name)
+    if name == "report":
+        write_json(context.store.folder / "run.json", run_record(context.study))
+    parts = _parts(known, stage, chain)
+    stamp = context.store.make(
+        name, chain[name], lambda folder: {**stage.run(context, folder), "parts": parts}
+    )
+    context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
+
+
+def run_record(study: Study) -> dict[str, Any]:
+    """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
+    store = Store(study.results)
+    stamps = {stage.name: store.stamp(stage.name) for stage in stages_of(study)}
+    inputs, known = input_digests(study), Keys(study)
+    return {
+        "limbfit": __version__,
+        "study": study.study.model_dump(mode="json"),
+        "settings": settings_record(study, inputs),
+        "versions": versions(),
+        "machine": machine(),
+        "inputs": inputs,
+        "stages": {
+            name: {"seconds": stamp["seconds"], "finished": stamp["finished"], "key": stamp["key"]}
+            for name, stamp in stamps.items()
+            if stamp
+        },
+        "experiments": {
+            row["experiment"]: {key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
+            for row in experiment_rows(study, known, _chain(known))
+            if row["state"] in ("done", "stale")
+        },
+    }
+
+
+def report_study(study: Study, *, listener: Listener) -> dict[str, Any]:
+    """Make the report anew from what is stored, stale or not; nothing is solved."""
+    store = Store(study.results)
+    with lock(study.results), executor_of(study) as executor:
+        context = Context(study, store, executor, listener)
+        known = Keys(study)
+        _do(context, "report", known, _chain(known))
+        return summarise(study)
+
+
+def summarise(study: Study) -> dict[str, Any]:
+    """The figures of a study from what is stored: parameters, sites with errors, where the report is."""
+    store = Store(study.results)
+    summary: dict[str, Any] = {"study": study.study.name, "results": str(study.results)}
+    if (store["calibrate"] / "calibration.json").is_file():
+        calibration = store.read("calibrate", "calibration.json")
+        summary["parameters"] = calibration["stages"][-1]["parameters"]
+        summary["intervals_95"] = calibration["uncertainty"]["intervals_95"]
+    if (store["predict"] / "predict.json").is_file():
+        predicted = store.read("predict", "predict.json")
+        columns = ("site", "region", "fitted", "peak_force_N", "error_percent")
+        summary["sites"] = [
+            {**{key: row[key] for key in columns}, "warnings": row.get("warnings", [])}
+            for row in predicted["sites"]
+        ]
+        for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
+            summary[key] = predicted[key]
+        summary["flags"] = predicted.get("flags", [])
+    report = store["report"] / "report.html"
+    if report.is_file():
+        summary["report"] = str(report)
+    return summary

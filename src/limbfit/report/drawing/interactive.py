@@ -1,0 +1,227 @@
+"""What moves in the report: the limb in three dimensions with fields of its sites, and curves to read from.
+
+All of it is data for scripts of the room ``web``; the pictures stay, for print and where there is no WebGL.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...mesh import read_vtu
+from ...web.arrays import pack
+from ...web.shapes import interface, read_shell, shell_of, volume_of
+from ..page import Interactive
+from ..store import PARAMETERS, Curves, Json, Store
+from ..tables import SYMBOLS, UNITS
+from .pictures import BONE, FITTED, HELD_OUT, SKIN_SURFACE, cut_views, drawable, far_side, limb_frame, linear
+
+MOST_FACES, MOST_SAMPLES = 12_000, 300
+FIELD_RADIUS_MM = 50.0
+LAYER = "#c8a13a"
+STRESS = "von_mises_kPa"
+
+
+def explorer(store: Store) -> Interactive | None:
+    """Surfaces, layers, bones and sites, the field at the deepest point of each site, and its curves."""
+    if "skin" not in store.surface_files:
+        return None
+    arrays: dict[str, NDArray[Any]] = {}
+    surfaces = _surfaces(store, arrays)
+    fields = _fields(store, arrays)
+    facts = {
+        "frame": limb_frame(store).tolist(),
+        "surfaces": surfaces,
+        "sites": [_site(store, row) for row in store.sites if row.get("position_mm") and row.get("axis")],
+        "fields": fields,
+    }
+    content = {
+        "arrays": base64.b64encode(pack(arrays, facts)).decode("ascii"),
+        "curves": {site: curves for site in store.site_names if (curves := _site_curves(store, site))},
+    }
+    caption = (
+        "Skin, layers, bones and sites of the model; choose a site to see its forces and, where stored, the "
+        f"deformed cut at its deepest point, up to {FIELD_RADIUS_MM:.0f} mm around it. Filled marks: sites "
+        "that were fitted; open: held out. Pictures of the same stand below."
+    )
+    return Interactive("explorer", "model", "The limb in three dimensions.", caption, content)
+
+
+def _surfaces(store: Store, arrays: dict[str, NDArray[Any]]) -> list[Json]:
+    rows = []
+    for name, file in store.surface_files.items():
+        shell = read_shell(file, MOST_FACES)
+        bone = name != "skin"
+        rows.append(
+            {
+                "name": name,
+                "title": name.removeprefix("bone-") if bone else "skin",
+                "kind": "bone" if bone else "skin",
+                "colour": BONE if bone else SKIN_SURFACE,
+                "opacity": 1.0 if bone else 0.38,
+            }
+        )
+        arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
+    for name, shell in _layers(store):
+        rows.append({"name": name, "title": name, "kind": "layer", "colour": LAYER, "opacity": 0.5})
+        arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
+    return rows
+
+
+def _layers(store: Store) -> Iterable[tuple[str, Any]]:
+    """The inner face of each layer, as in the first stored mesh."""
+    file = next((file for site in store.site_names if (file := store.vtu("mesh", site))), None)
+    if file is None:
+        return
+    mesh = read_vtu(file)
+    volume = volume_of(mesh)
+    for index, name in enumerate(mesh.region_names[:-1]):
+        yield f"inner face of {name}", interface(volume, index)
+
+
+def _site(store: Store, row: Json) -> Json:
+    fitted = bool(row.get("fitted"))
+    axis = np.asarray(row["axis"], dtype=float)
+    known = {one["site"]: one for one in store.predicted}.get(row["site"], {})
+    return {
+        "name": str(row["site"]),
+        "region": store.region(row["site"]),
+        "fitted": fitted,
+        "at": [float(value) for value in row["position_mm"]],
+        "axis": (axis / np.linalg.norm(axis)).tolist(),
+        "colour": FITTED if fitted else HELD_OUT,
+        "error_percent": known.get("error_percent"),
+    }
+
+
+def _fields(store: Store, arrays: dict[str, NDArray[Any]]) -> list[Json]:
+    """The cut through each site at its deepest point, as triangles with displacements and stress."""
+    stage = "predict" if store.predict else "simulate"
+    found = []
+    for row, file in drawable(store, store.site_names, stage):
+        cut = _field(store, row, file)
+        if cut is None:
+            continue
+        name = f"field.{row['site']}"
+        arrays |= {f"{name}.{part}": values for part, values in cut.items() if part != "direction"}
+        found.append({"site": str(row["site"]), "name": name, "direction": cut["direction"].tolist()})
+    return found
+
+
+def _field(store: Store, row: Json, file: Path) -> dict[str, NDArray[Any]] | None:
+    grid = linear(file)
+    if STRESS not in grid.cell_data or "displacement_mm" not in grid.point_data:
+        return None
+    view = cut_views(store, row, file)[1]
+    surface = far_side(grid, view, smooth=True).extract_surface(algorithm="dataset_surface").triangulate()
+    near = np.linalg.norm(np.asarray(surface.cell_centers().points) - view.focal, axis=1) < FIELD_RADIUS_MM
+    if not near.any():
+        return None
+    part = surface.extract_cells(np.flatnonzero(near)).extract_surface(algorithm="dataset_surface")
+    shell = shell_of(part)
+    return {
+        "points": shell.points,
+        "faces": shell.faces,
+        "moved": np.asarray(part.point_data["displacement_mm"], dtype=np.float32),
+        "stress": np.asarray(part.cell_data[STRESS], dtype=np.float32),
+        "direction": np.asarray(view.direction, dtype=float),
+    }
+
+
+def _thinned(values: NDArray[np.float64], stride: int) -> list[float | None]:
+    """Every so many values with five digits, and the last one."""
+    chosen = np.unique(np.r_[np.arange(0, len(values), stride), len(values) - 1])
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values[chosen]]
+
+
+def _plain(curves: Curves, names: Sequence[str]) -> dict[str, list[float | None]]:
+    stride = max(1, math.ceil(len(next(iter(curves.values()))) / MOST_SAMPLES))
+    return {name: _thinned(curves[name], stride) for name in names if name in curves}
+
+
+_COLUMNS = (
+    "time_s",
+    "displacement_mm",
+    "force_measured_N",
+    "force_simulated_N",
+    "force_one_material_N",
+    "force_low_N",
+    "force_high_N",
+    "force_N",
+)
+
+
+def _site_curves(store: Store, site: str) -> Json | None:
+    """What is known of a site's force: predicted, else simulated by itself, else as recorded."""
+    for stage in ("predict", "simulate", "traces"):
+        curves = store.curves(stage, site)
+        if curves is not None and len(next(iter(curves.values()))):
+            return {"stage": stage, "materials": store.materials, **_plain(curves, _COLUMNS)}
+    return None
+
+
+def record_curves(store: Store, sites: Sequence[str]) -> Interactive | None:
+    """Each record as the robot wrote it and regularised, to choose from."""
+    choices = {}
+    for site in sites:
+        raw, regular = store.curves("traces", f"{site}-raw"), store.curves("traces", site)
+        if raw is None or regular is None:
+            continue
+        facts = store.traces.get(site, {})
+        start = (facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0))
+        smooth = {
+            "time_s": regular["time_s"] + start[0],
+            "displacement_mm": regular["displacement_mm"] + start[1],
+            "force_N": regular["force_N"],
+        }
+        phases = facts.get("phases") or []
+        choices[site] = {
+            "raw": _plain(raw, _COLUMNS),
+            "smooth": _plain(smooth, _COLUMNS),
+            "touch": {"time_s": start[0], "displacement_mm": start[1]},
+            "ends": {
+                "time_s": [one["end_s"] for one in phases],
+                "displacement_mm": [one["end_mm"] + start[1] for one in phases],
+            },
+        }
+    if not choices:
+        return None
+    caption = (
+        "Every record, raw and regularised; vertical lines are the touch-down that was found and the ends "
+        "of the indenter's phases."
+    )
+    return Interactive("records", "records", "Records of all sites.", caption, {"sites": choices})
+
+
+def convergence_curves(store: Store) -> Interactive | None:
+    """The error and each parameter over the accepted iterates of all stages."""
+    steps = [(stage, step) for stage in store.stages for step in stage.get("iterations") or ()]
+    if not steps:
+        return None
+    panels: list[Json] = [_errors([step for _, step in steps])]
+    for name in PARAMETERS:
+        series = [
+            {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for _, step in steps]}
+            for tissue in store.tissues
+        ]
+        panels.append({"title": SYMBOLS[name], "unit": UNITS[name], "log": False, "series": series})
+    caption = "The same, to read values from; iterates are counted through all stages."
+    return Interactive(
+        "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": panels}
+    )
+
+
+def _errors(steps: Sequence[Json]) -> Json:
+    sites = sorted({site for step in steps for site in step.get("error_percent_by_site", {})})
+    series = [{"label": "mean error", "y": [step.get("error_percent") for step in steps]}]
+    series += [
+        {"label": f"site {site}", "y": [step.get("error_percent_by_site", {}).get(site) for step in steps]}
+        for site in sites
+    ]
+    return {"title": "Error", "unit": "%", "log": True, "series": series}

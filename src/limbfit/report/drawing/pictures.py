@@ -1,0 +1,312 @@
+"""Pictures of the model, drawn off-screen: surfaces with sites (the paper's figure 1), cut meshes (figures 4
+and 6) and the deformed cut at the peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from vtkmodules.vtkCommonCore import vtkLogger
+
+from ...web.shapes import patient_frame
+from ..page import Figure
+from ..store import Json, Store
+from .panels import FIELD_MAP, PAPER, Mark, Shot, View, colour_bar, legend, strip
+
+SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
+BETWEEN = ("#7d6a2e", "#f7efce", "#4a6472")  # layers between the outermost and the core
+SKIN_SURFACE = "#d9a07c"
+MATT: dict[str, Any] = {"ambient": 0.35, "diffuse": 0.75, "specular": 0.0}
+FITTED, HELD_OUT = "#0072b2", "#d55e00"
+SIDES = ("anterior view", "left view", "posterior view", "right view")
+MARKER_COLOUR_MM = 4.0  # the height of a skin marker in the image
+FIELDS = (
+    ("von_mises_kPa", "von Mises stress (kPa)"),
+    ("displacement_mm", "displacement (mm)"),
+    ("J", "volume ratio J (–)"),
+)
+Array = NDArray[np.float64]
+Grid = Any  # a pyvista data set; what its stubs promise differs between its releases
+
+
+def unit(values: Iterable[float]) -> Array:
+    v = np.asarray(tuple(values), dtype=float)
+    return v / np.linalg.norm(v)
+
+
+def limb_frame(store: Store) -> Array:
+    """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
+    return patient_frame(store.surfaces.get("cut_normal"))
+
+
+@contextmanager
+def without_display_warning() -> Iterator[None]:
+    """VTK warns on the terminal that there is no display before it draws without one, as it should."""
+    before = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    try:
+        yield
+    finally:
+        vtkLogger.SetStderrVerbosity(before)
+
+
+def shoot(plotter: Any, view: View) -> Array:
+    """The picture (rows, columns, 3) of what the plotter holds, seen by a view."""
+    camera = plotter.camera
+    camera.parallel_projection = True
+    camera.focal_point = tuple(view.focal)
+    camera.position = tuple(view.focal - 2000.0 * view.direction)
+    camera.up = tuple(view.up)
+    camera.parallel_scale = view.half_height_mm
+    plotter.render_window.SetSize(*view.size)
+    plotter.renderer.ResetCameraClippingRange()
+    plotter.render()
+    return np.asarray(plotter.screenshot(return_img=True))
+
+
+def new_plotter() -> Any:
+    plotter: Any = pv.Plotter(off_screen=True, lighting="light kit")
+    plotter.set_background(PAPER)
+    plotter.enable_anti_aliasing("ssaa")
+    return plotter
+
+
+@without_display_warning()
+def surface_figure(store: Store) -> Figure | None:
+    """The limb from four sides: skin translucent, bones inside, sites named on the side that shows them."""
+    files = store.surface_files
+    if "skin" not in files:
+        return None
+    plotter = new_plotter()
+    skin = pv.read(files["skin"])
+    plotter.enable_depth_peeling(8)
+    plotter.add_mesh(skin, color=SKIN_SURFACE, opacity=0.36, smooth_shading=True, **MATT)
+    for name, file in files.items():
+        if name != "skin":
+            plotter.add_mesh(pv.read(file), color=BONE, **MATT)
+    views = four_sides(store, skin)
+    shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
+    plotter.close()
+    alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
+    caption = (
+        "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
+        "Filled: sites that were fitted; open: held out."
+    )
+    return Figure("model", strip(shots, SIDES, alt), caption)
+
+
+@without_display_warning()
+def marker_figure(store: Store) -> Figure | None:
+    """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
+    marked_file, plain_file = store.folder / "segment" / "skin-markers.stl", store.surface_files.get("skin")
+    if plain_file is None or not marked_file.is_file():
+        return None
+    plain = pv.read(plain_file)
+    marked = pv.read(marked_file).compute_implicit_distance(plain)
+    plotter = new_plotter()
+    limits = (0.0, float(np.ceil(MARKER_COLOUR_MM)))
+    plotter.add_mesh(
+        marked, scalars="implicit_distance", clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, **MATT
+    )
+    views = four_sides(store, plain)
+    shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
+    plotter.close()
+    alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
+    caption = (
+        "Figure 1 of the paper for this study: skin with markers, coloured by its distance from the skin "
+        "without: each site of the "
+        "study was matched to one of the bumps."
+    )
+    bar = colour_bar(limits, "distance (mm)")
+    return Figure("markers", strip(shots, SIDES, alt) + bar, caption)
+
+
+def four_sides(store: Store, skin: Any) -> list[View]:
+    """Views of the whole limb, in the order of ``SIDES``."""
+    left, back, up = limb_frame(store)
+    points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
+    half = np.abs(points).max(axis=0) * 1.06 + 4
+    width = 2 * max(half[0], half[1]) + 8
+    size = (round(1000 * width / (2 * half[2])), 1000)
+    return [View(np.array(skin.center), side, up, half[2], size) for side in (back, -left, -back, left)]
+
+
+def _facing(store: Store, view: View) -> list[Mark]:
+    """The sites whose skin faces the camera of a view."""
+    marks = []
+    for row in store.sites:
+        if row.get("position_mm") and row.get("axis") and unit(row["axis"]) @ view.direction > 0.5:
+            marks.append(site_mark(row))
+    return marks
+
+
+def site_mark(row: Json, axis: bool = False) -> Mark:
+    fitted = bool(row.get("fitted"))
+    color = FITTED if fitted else HELD_OUT
+    position, direction = np.array(row["position_mm"]), unit(row["axis"]) if axis else None
+    return Mark(str(row["site"]), position, color, fitted, direction)
+
+
+@without_display_warning()
+def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
+    """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
+    rows = drawable(store, sites, "mesh")
+    if not rows:
+        return None
+    whole: list[Shot] = []
+    near: list[Shot] = []
+    colours: dict[str, str] = {}
+    for row, file in rows:
+        view, close = cut_views(store, row, file)
+        plotter = new_plotter()
+        grid = linear(file)
+        colours |= region_colours(grid)
+        add_regions(plotter, far_side(grid, view))
+        whole.append((shoot(plotter, view), view, [site_mark(row, axis=True)]))
+        near.append((shoot(plotter, close), close, []))
+        plotter.close()
+    names = [row["site"] for row, _ in rows]
+    alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
+    paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
+    words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
+    key = legend((*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE)))
+    caption = (
+        "Figures 4 and 6 of the paper for this study: the mesh of each fitted site, cut along the limb "
+        "through the site (above), and near the indenter "
+        "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
+    )
+    titles = [f"site {name}" for name in names]
+    markup = strip(whole, titles, alt) + strip(near, [f"{t}, near" for t in titles], alt) + key
+    return Figure("mesh-cut", markup, caption)
+
+
+@without_display_warning()
+def field_figure(store: Store, sites: Sequence[str], stage: str, name: str) -> Figure | None:
+    """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
+    rows = drawable(store, sites, stage)
+    grids = [(row, file, linear(file)) for row, file in rows]
+    stored = {name for _, _, grid in grids for name in grid.array_names}
+    field = next(((name, title) for name, title in FIELDS if name in stored), None)
+    if not grids or field is None or "displacement_mm" not in stored:
+        return None
+    views = [cut_views(store, row, file)[1] for row, file, _ in grids]
+    cuts = [far_side(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
+    limits = _limits(cuts, views, field[0])
+    shots: list[Shot] = [
+        (_shoot_field(cut, view, field[0], limits), view, []) for view, cut in zip(views, cuts, strict=True)
+    ]
+    names = [row["site"] for row, _, _ in grids]
+    alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
+    caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
+    return Figure(
+        name, strip(shots, [f"site {name}" for name in names], alt) + colour_bar(limits, field[1]), caption
+    )
+
+
+def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
+    """A deformed cut, coloured by a field without shading, so that colours can be read off the bar."""
+    plotter = new_plotter()
+    surface = cut.warp_by_vector("displacement_mm").extract_surface(algorithm="dataset_surface")
+    plotter.add_mesh(
+        surface, scalars=field, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, lighting=False
+    )
+    pixels = shoot(plotter, view)
+    plotter.close()
+    return pixels
+
+
+def drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
+    """Sites with a place and a stored mesh."""
+    rows = {row["site"]: row for row in store.sites if row.get("position_mm") and row.get("axis")}
+    found = [(rows[name], store.vtu(stage, name)) for name in sites if name in rows]
+    return [(row, file) for row, file in found if file is not None]
+
+
+def linear(file: Path) -> Grid:
+    """The stored mesh with straight-edged tetrahedra, which draw much faster.
+
+    Made by hand: VTK's linear copy keeps the mid-edge nodes in the connectivity, and cutting it crashes.
+    """
+    grid = pv.read(file)
+    width = 10 if grid.celltypes[0] == pv.CellType.QUADRATIC_TETRA else 4
+    corners, tets = np.unique(grid.cell_connectivity.reshape(-1, width)[:, :4], return_inverse=True)
+    plain = pv.UnstructuredGrid({pv.CellType.TETRA: tets.reshape(-1, 4)}, grid.points[corners])
+    for name in grid.point_data.keys():  # noqa: SIM118 - not a dictionary
+        plain.point_data[name] = grid.point_data[name][corners]
+    for name in grid.cell_data.keys():  # noqa: SIM118
+        plain.cell_data[name] = grid.cell_data[name]
+    plain.field_data["region_names"] = grid.field_data["region_names"]
+    return plain
+
+
+def cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
+    """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
+    up = limb_frame(store)[2]
+    axis = unit(row["axis"])
+    normal = unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else limb_frame(store)[0]
+    points = np.asarray(pv.read(file).points)
+    height = points @ up
+    middle = points.mean(axis=0)
+    half = float(np.ptp(height)) / 2 * 1.05
+    centre = middle + ((height.max() + height.min()) / 2 - middle @ up) * up
+    reach = float(np.abs((points - centre) @ axis).max()) + 30
+    whole = View(centre, normal, up, half, (round(900 * reach / half), 900))
+    close = View(np.array(row["position_mm"]) + 14 * axis, normal, up, 34.0, (700, 700))
+    return whole, close
+
+
+def far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
+    """What lies behind the plane through the middle of the view: whole cells, or cut through."""
+    if smooth:
+        return grid.clip(normal=tuple(view.direction), origin=tuple(view.focal), invert=False)
+    centres = np.asarray(grid.cell_centers().points)
+    return grid.extract_cells(np.flatnonzero((centres - view.focal) @ view.direction > 0))
+
+
+def add_regions(plotter: Any, grid: Grid) -> None:
+    regions = np.asarray(grid.cell_data["region"])
+    for index, colour in enumerate(region_colours(grid).values()):
+        part = grid.extract_cells(np.flatnonzero(regions == index))
+        if part.n_cells:
+            surface = part.extract_surface(algorithm="dataset_surface")
+            bone = _on_bone(surface)
+            for chosen, color in ((~bone, colour), (bone, BONE)):
+                _add_faces(plotter, surface.extract_cells(np.flatnonzero(chosen)), color)
+
+
+def region_colours(grid: Grid) -> dict[str, str]:
+    """The colour of each region: layers, outermost first, and the core."""
+    names = [str(name) for name in grid.field_data["region_names"]]
+    between = [BETWEEN[i % len(BETWEEN)] for i in range(len(names) - 2)]
+    return dict(zip(names, [SKIN, *between, MUSCLE], strict=False))
+
+
+def _on_bone(surface: Grid) -> NDArray[np.bool_]:
+    """Which triangles of a region's surface are the wall of a bone void."""
+    if "in fixed_bone" not in surface.point_data:
+        return np.zeros(surface.n_cells, dtype=bool)
+    triangles = np.asarray(surface.faces).reshape(-1, 4)[:, 1:]
+    return np.asarray(surface.point_data["in fixed_bone"])[triangles].all(axis=1)
+
+
+def _add_faces(plotter: Any, faces: Grid, color: str) -> None:
+    if faces.n_cells:
+        plotter.add_mesh(faces, color=color, show_edges=True, edge_color="#4a2f2f", line_width=1.5, **MATT)
+
+
+def _limits(cuts: Sequence[Grid], views: Sequence[View], field: str) -> tuple[float, float]:
+    """Colour limits shared by all pictures: percentiles of what they show, so that a corner does not rule."""
+    shown = []
+    for cut, view in zip(cuts, views, strict=True):
+        where = cut.points if field in cut.point_data else cut.cell_centers().points
+        values = np.asarray(cut[field], dtype=float)
+        seen = np.linalg.norm(np.asarray(where) - view.focal, axis=1) < view.half_height_mm
+        shown.append((np.linalg.norm(values, axis=1) if values.ndim == 2 else values)[seen])
+    low, high = np.percentile(np.concatenate(shown), [1, 99])
+    return float(low), float(max(high, low + 1e-9))

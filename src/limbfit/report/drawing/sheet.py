@@ -1,0 +1,131 @@
+"""The quality sheet of a segmentation as one picture: outlines over slices; slices to look at, enlarged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from ...anatomy.grid import FAT, SOFT_TISSUE, LabelMap, Volume
+from ...anatomy.labels.contours import outlines
+from ...anatomy.labels.quality import LIMB, Quality
+
+Mask = NDArray[np.bool_]
+
+COLOURS = {LIMB: "#e34a33", FAT: "#f28e2b", "tibia": "#3bb2d0", "fibula": "#f4c542"}
+_OTHERS = ("#76d275", "#c58af9", "#ff9da7", "#9aa0ff")
+_COLUMNS, _ROWS = 6, 3
+_LARGE = 3  # suspects in a row
+_MOST = 6  # suspects drawn
+_MARGIN = 4  # voxels around the limb
+
+
+def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Quality) -> None:
+    """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
+    order = [*(n for n in range(3) if n != quality.axis), quality.axis]
+    image, turned = volume.turned(order), labels.turned(order)
+    window = _window(turned.limb)
+    masks = {LIMB: turned.limb} | {
+        name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE
+    }
+    colours = _colours(list(masks))
+    shown = _evenly(turned.limb)
+    odd = _worst(quality)
+    large_rows = -(-len(odd) // _LARGE)
+    ratio = _ratio(window, turned)
+    small, large = 12 / _COLUMNS / ratio + 0.25, 12 / _LARGE / ratio + 0.3
+    rows = -(-len(shown) // _COLUMNS)
+    figure = Figure(figsize=(12, 0.9 + rows * small + large_rows * large), facecolor="white")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(
+        rows + large_rows,
+        _COLUMNS,
+        height_ratios=[small] * rows + [large] * large_rows,
+        **{"left": 0.01, "right": 0.99, "top": 1 - 0.5 / figure.get_figheight(), "bottom": 0.01},
+        wspace=0.04,
+        hspace=0.14,
+    )
+    span = _COLUMNS // _LARGE
+    for n, k in enumerate(shown):
+        axes = figure.add_subplot(grid[n // _COLUMNS, n % _COLUMNS])
+        _draw(axes, image, masks, colours, k, window, f"slice {k}")
+    for n, (k, text) in enumerate(odd):
+        place = (n % _LARGE) * span
+        axes = figure.add_subplot(grid[rows + n // _LARGE, place : place + span])
+        _draw(axes, image, masks, colours, k, window, f"slice {k}: {text}", bold=True)
+    handles = [Line2D([], [], color=colours[name], label=name) for name in masks]
+    figure.legend(handles=handles, loc="upper center", ncol=len(handles), frameon=False, fontsize=10)
+    figure.savefig(path, dpi=100, metadata={"Software": "limbfit"})
+
+
+def _window(limb: Mask) -> tuple[slice, slice]:
+    """Rows and columns of the limb with a margin."""
+    found = []
+    for axes in ((0, 2), (0, 1)):
+        filled = np.flatnonzero(limb.any(axis=axes))
+        found.append(slice(max(int(filled[0]) - _MARGIN, 0), int(filled[-1]) + 1 + _MARGIN))
+    return found[0], found[1]
+
+
+def _ratio(window: tuple[slice, slice], labels: LabelMap) -> float:
+    """Width over height of the window, as it is drawn."""
+    rows, columns = (part.stop - part.start for part in window)
+    return float(columns * labels.spacing[0] / (rows * labels.spacing[1]))
+
+
+def _evenly(limb: Mask) -> list[int]:
+    """Slices from the limb's first to its last."""
+    filled = np.flatnonzero(limb.any(axis=(1, 2)))
+    count = min(_COLUMNS * _ROWS, len(filled))
+    return [int(filled[n]) for n in np.unique(np.linspace(0, len(filled) - 1, count).round().astype(int))]
+
+
+def _worst(quality: Quality) -> list[tuple[int, str]]:
+    """Slices to look at with what is odd there, at most six, evenly taken from all."""
+    said: dict[int, list[str]] = {}
+    for suspect in quality.suspects:
+        said.setdefault(suspect.slice, []).append(f"{suspect.label} {suspect.what}")
+    slices = sorted(said)
+    if len(slices) > _MOST:
+        slices = [slices[n] for n in np.linspace(0, len(slices) - 1, _MOST).round().astype(int)]
+    return [(k, "; ".join(said[k][:2])) for k in slices]
+
+
+def _colours(names: list[str]) -> dict[str, str]:
+    others = iter(_OTHERS * (len(names) // len(_OTHERS) + 1))
+    return {name: COLOURS.get(name) or next(others) for name in names}
+
+
+def _draw(
+    axes: Axes,
+    image: Volume,
+    masks: dict[str, Mask],
+    colours: dict[str, str],
+    k: int,
+    window: tuple[slice, slice],
+    title: str,
+    bold: bool = False,
+) -> None:
+    """One slice with the outlines of its labels."""
+    rows, columns = window
+    plane = image.array[k][window]
+    low, high = np.percentile(image.array[k], (1, 99.7))
+    extent = (columns.start - 0.5, columns.start + plane.shape[1] - 0.5)
+    heights = (rows.start + plane.shape[0] - 0.5, rows.start - 0.5)
+    axes.imshow(
+        plane, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), extent=(*extent, *heights), origin="upper"
+    )
+    for name, mask in masks.items():
+        for line in outlines(mask[k]):
+            closed = np.vstack([line, line[:1]])
+            axes.plot(closed[:, 0], closed[:, 1], color=colours[name], linewidth=0.8)
+    axes.set_xlim(*extent)
+    axes.set_ylim(*heights)
+    axes.set_aspect(float(image.spacing[1] / image.spacing[0]))
+    axes.set_title(title, fontsize=8, pad=2, fontweight="bold" if bold else "normal")
+    axes.axis("off")

@@ -1,0 +1,42 @@
+"""The sections of the experiments: each in a file of its own, listed here in the order of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ..page import Note, Section
+from ..store import Json, Store
+from .cube import cube_section
+from .design import design_section
+from .regions import regions_section
+from .sensitivity import SENSITIVITIES
+from .uncertainty import uncertainty_section
+from .validation import validation_section
+
+Maker = Callable[[Store, Json], Section]
+# By the name of the experiment; a maker is given the store and what ``<name>.json`` holds.
+MAKERS: dict[str, Maker] = {
+    "uncertainty": uncertainty_section,
+    "regions": regions_section,
+    "cube": cube_section,
+    **SENSITIVITIES,
+    "crossvalidate": validation_section,
+    "design": design_section,
+}
+
+
+def experiment_sections(store: Store) -> tuple[Section, ...]:
+    """A section for each finished experiment, then one that names those that are stale."""
+    done = store.experiments
+    sections = [make(store, done[name]) for name, make in MAKERS.items() if name in done]
+    if store.outdated:
+        sections.append(Section("outdated", "Left out", tuple(map(_outdated, store.outdated))))
+    return tuple(sections)
+
+
+def _outdated(name: str) -> Note:
+    verb = name.replace("sensitivity-", "sensitivity --only ")
+    return Note(
+        f"The stored results of “limbfit {verb}” are left out: they were made from other inputs, settings or "
+        "code. Run it again to see them here."
+    )

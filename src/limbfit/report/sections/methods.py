@@ -1,0 +1,396 @@
+"""The method in words for a paper's supplement, made of what is stored: settings, meshes, runs, versions.
+
+Nothing here comes from an image's header, and inputs are named by their keys in the study file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from ..page import Prose, Section
+from ..store import PARAMETERS, Json, Store
+from ..tables import NOTHING, SYMBOLS, UNITS, fixed, flatten, mean_and_deviation, number
+
+Part = tuple[str, str]  # a heading and its paragraph
+
+
+def method_section(store: Store) -> Section:
+    """The parts as paragraphs, each after its heading."""
+    return Section("method", "Methods", tuple(Prose(f"{head}. {text}") for head, text in method_parts(store)))
+
+
+def method_markdown(store: Store) -> str:
+    """The same as Markdown, with every setting as a table at its end."""
+    name = str((store.run.get("study") or {}).get("name") or "Unnamed study")
+    lines = [f"# Methods: {name}", ""]
+    for head, text in method_parts(store):
+        lines += [f"## {head}", "", text, ""]
+    settings = flatten(store.run.get("settings") or {})
+    if settings:
+        lines += ["## Every setting", "", "| key | value |", "|---|---|"]
+        lines += [f"| {_cell(key)} | {_cell(value)} |" for key, value in settings.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return str(text).replace("|", "\\|").replace("\n", " ")
+
+
+def method_parts(store: Store) -> tuple[Part, ...]:
+    """Heading and paragraph of every part of which something is stored."""
+    parts = (
+        ("Geometry", _geometry(store)),
+        ("Indentations", _indentations(store)),
+        ("Meshes", _meshes(store)),
+        ("Constitutive law", _law(store)),
+        ("Boundary conditions and contact", _contact(store)),
+        ("Solution", _solution(store)),
+        ("Identification", _identification(store)),
+        ("Uncertainty", _uncertainty(store)),
+        ("Prediction", _prediction(store)),
+        ("Further analyses", _experiments(store)),
+        ("Software", _software(store)),
+    )
+    return tuple((head, text) for head, text in parts if text)
+
+
+def _settings(store: Store, table: str) -> Json:
+    return (store.run.get("settings") or {}).get(table) or {}
+
+
+def _said(sentences: Iterable[str]) -> str:
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _geometry(store: Store) -> str:
+    geometry = _settings(store, "geometry")
+    source = store.segment.get("method")
+    start = (
+        f"The image was segmented ({source})."
+        if source
+        else "Closed surfaces of skin and bones were given."
+        if _settings(store, "surfaces")
+        else ""
+    )
+    repairs = len(store.segment.get("repairs") or ())
+    edge = geometry.get("surface_edge_mm")
+    return _said(
+        (
+            start,
+            f"{repairs} repairs were made to the label map." if repairs else "",
+            f"Smooth closed surfaces have edges of about {edge} mm." if edge else "",
+            _layers(geometry),
+            "Bones are voids. Where bone lies shallower than the layer, the rule is "
+            f"“{geometry['bone_policy']}”, with {geometry.get('bone_clearance_mm')} mm between."
+            if geometry.get("bone_policy")
+            else "",
+            "Coordinates are those of the patient (LPS), in millimetres." if store.sites else "",
+        )
+    )
+
+
+def _layers(geometry: Json) -> str:
+    """The layers of tissue in a sentence."""
+    layers = geometry.get("layers")
+    if not layers:
+        thickness = geometry.get("skin_layer_mm")
+        return f"The skin–adipose layer is {thickness} mm thick." if thickness else ""
+    words = [
+        f"{layer['name']} ("
+        + (
+            f"{layer['thickness_mm']} mm)"
+            if layer.get("thickness_mm")
+            else f"as thick as the segmented fat, at least {layer.get('min_thickness_mm')} mm)"
+        )
+        for layer in layers
+    ]
+    return f"Over the {geometry.get('core')} lie, outermost first: {', '.join(words)}."
+
+
+def _indentations(store: Store) -> str:
+    if not store.traces:
+        return ""
+    facts = tuple(store.traces.values())
+    marked = sum(1 for site in store.sites if site.get("marker"))
+    where = f" {marked} of their places come from skin markers in the image." if marked else ""
+    noise = [fact["noise_N"] for fact in facts if fact.get("noise_N") is not None]
+    return (
+        f"{len(facts)} sites have a record of time, displacement and force; {len(store.fitted)} were fitted "
+        f"({', '.join(store.fitted)}).{where} The indenter's axis is the mean inward normal of the skin "
+        "under it "
+        "unless the study states one. Touch-down is where the force of each record leaves its baseline as a "
+        f"power of the depth in a tissue with memory{_touch_downs(facts)}; from there on displacement was "
+        "made piecewise linear and force smoothed, every phase (loading, hold, unloading) by itself so that "
+        "the peak is kept; where parameters are searched and judged, the simulated force is smoothed in the "
+        "same way. "
+        f"Depths are {_range(facts, 'depth_mm', 2)} mm, largest forces {_range(facts, 'peak_force_N', 2)} N, "
+        f"loading speeds {_range(facts, 'speed_load_mm_s', 2)} mm/s"
+        + (f", noise of the force {fixed(min(noise), 3)} to {fixed(max(noise), 3)} N." if noise else ".")
+    )
+
+
+def _touch_downs(facts: Sequence[Json]) -> str:
+    known = [one for one in facts if one.get("touch_down_uncertainty_mm") is not None]
+    if not known:
+        return ""
+    return f" (known to {_range(known, 'touch_down_uncertainty_mm', 3)} mm, one standard deviation)"
+
+
+def _range(facts: Iterable[Json], key: str, digits: int) -> str:
+    values = [fact[key] for fact in facts if isinstance(fact.get(key), int | float)]
+    return f"{fixed(min(values), digits)} to {fixed(max(values), digits)}" if values else NOTHING
+
+
+def _meshes(store: Store) -> str:
+    table = _settings(store, "mesh")
+    if not store.mesh:
+        return ""
+    facts = tuple(store.mesh.values())
+    element = table.get("element") or facts[0].get("element")
+    edges = (
+        f" by {table.get('engine')}: edges of {table['edge_near_mm']} mm within "
+        f"{table.get('near_radius_mm')} mm of the site, growing at {table.get('growth')} per mm "
+        f"to {table.get('edge_far_mm')} mm"
+        if "edge_near_mm" in table
+        else ""
+    )
+    coarse = table.get("coarse")
+    return _said(
+        (
+            f"Each site has a mesh of its own of {_element(element)}{edges}.",
+            f"They have {_range(facts, 'nodes', 0)} nodes and {_range(facts, 'cells', 0)} elements, with a "
+            f"smallest dihedral angle of {_range(facts, 'min_dihedral_deg', 1)} degrees.",
+            f"Parameters were searched on coarser meshes ({_pairs(coarse)}), corrected by the finer ones."
+            if coarse
+            else "",
+        )
+    )
+
+
+def _element(name: object) -> str:
+    words = {
+        "tet4": "linear tetrahedra (tet4)",
+        "tet10": "quadratic tetrahedra (tet10)",
+        "tet10p0": "quadratic tetrahedra with constant pressure (tet10p0)",
+    }
+    return words.get(str(name), str(name))
+
+
+def _pairs(table: Json) -> str:
+    return ", ".join(f"{key} = {value}" for key, value in table.items() if value not in (None, [], ""))
+
+
+def _law(store: Store) -> str:
+    kappa = number(_settings(store, "material").get("kappa_ratio"))
+    return (
+        "As in Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater. 59, 379), each "
+        "tissue has "
+        "the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
+        "G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress; γ has no unit. The bulk modulus κ is c "
+        "times "
+        f"{kappa}."
+    )
+
+
+def _contact(store: Store) -> str:
+    indenter, solver = _settings(store, "indenter"), _settings(store, "solver")
+    if not indenter:
+        return ""
+    penalty = solver.get("penalty_per_mm")
+    stiff = (
+        f"a stiffness of {penalty} per mm times the mean instantaneous shear modulus"
+        if penalty
+        else "a stiffness with which a reference tissue lets it sink in by 0.3 % of the depth at most"
+    )
+    deepest = [row["penetration_mm"] for row in store.predicted if row.get("penetration_mm") is not None]
+    return _said(
+        (
+            "Nodes on bones and on the proximal cut are fixed. A rigid "
+            f"{indenter.get('shape')} indenter of {indenter.get('width_mm')} mm (edge radius "
+            f"{indenter.get('edge_radius_mm')} mm) starts where it just touches the skin and follows the "
+            "recorded "
+            f"displacement along its axis; contact is {indenter.get('friction')}, by a penalty at the skin's "
+            f"quadrature points with {stiff}.",
+            f"The largest penetration was {fixed(max(deepest), 3)} mm." if deepest else "",
+        )
+    )
+
+
+def _solution(store: Store) -> str:
+    solver = _settings(store, "solver")
+    if not solver:
+        return ""
+    name = store.calibration.get("linear_solver")
+    return _said(
+        (
+            f"Quasi-static equilibrium was solved in {solver.get('load_steps')} steps of loading and "
+            f"{solver.get('unload_steps')} of unloading, cut where Newton's method does not converge",
+            f"(residual below {solver['tolerance']:g} of the reactions; at most {solver['max_cuts']} "
+            "cuts in a row)."
+            if "tolerance" in solver
+            else ".",
+            f"Linear systems were solved by {name}." if name else "",
+            "Derivatives of the force with respect to every parameter come from the tangent at equilibrium.",
+        )
+    ).replace(" .", ".")
+
+
+def _identification(store: Store) -> str:
+    table, found = _settings(store, "calibration"), store.calibration
+    if not store.stages:
+        return ""
+    first = store.stages[0]
+    runs, exact = found.get("forward_runs"), found.get("forward_runs_with_sensitivities")
+    return _said(
+        (
+            _objective(str(found.get("objective"))),
+            f"Stages: {', then '.join(str(stage['name']) for stage in store.stages)}.",
+            f"Start: {_values(first.get('start') or {})}.",
+            f"Bounds: {_bounds(found.get('bounds') or {})}.",
+            _stopping(table),
+            _constraints(table),
+            f"{table['starts']} starts were tried, all but the first at random (seed {table.get('seed')})."
+            if (table.get("starts") or 1) > 1
+            else "",
+            *(
+                f"{str(stage['name']).capitalize()}: {'' if stage.get('converged') else 'not '}converged "
+                "after "
+                f"{stage.get('evaluations')} evaluations ({stage.get('reason')})."
+                for stage in store.stages
+            ),
+            f"In all {runs} simulations were made, {exact} of them with derivatives."
+            if runs is not None and exact is not None
+            else "",
+        )
+    )
+
+
+def _objective(name: str) -> str:
+    what = (
+        "equation 8 of that paper, a vector with the mean squared force difference of each site"
+        if name == "paper"
+        else "the force differences at all times of comparison, each over its site's largest force and the "
+        "root of their number"
+    )
+    return (
+        f"Parameters minimise {what}, by bounded least squares: a trust region in the logarithms of the "
+        "parameters with exact Jacobian."
+    )
+
+
+def _stopping(table: Json) -> str:
+    if not table:
+        return ""
+    if table.get("stopping") == "paper":
+        return "A stage ends where no parameter or no entry of the objective changed by more than 0.01."
+    return (
+        f"A stage ends at a relative change of parameters below {table.get('relative_tolerance')}, where "
+        "four "
+        f"steps gain less than that each, or after {table.get('max_iterations')} accepted steps."
+    )
+
+
+def _constraints(table: Json) -> str:
+    fixed_names, tied, prior = (table.get(key) or () for key in ("fixed", "tied", "prior"))
+    words = [f"{', '.join(fixed_names)} stayed at the start" if fixed_names else ""]
+    words += [f"{' and '.join(group)} were kept equal" for group in tied]
+    if prior:
+        known = (f"{name}: median {p['median']}, factor {p['factor']}" for name, p in dict(prior).items())
+        words.append(f"lognormal priors were put on {'; '.join(known)}")
+    text = "; ".join(word for word in words if word)
+    return text[:1].upper() + text[1:] + "." if text else ""
+
+
+def _values(tissues: Json) -> str:
+    """Parameters in words; once for all tissues where they are alike."""
+    texts = {
+        tissue: ", ".join(f"{SYMBOLS[n]} = {number(values.get(n))}{_unit(n)}" for n in PARAMETERS)
+        for tissue, values in tissues.items()
+    }
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values()))
+    return "; ".join(f"{tissue} {text}" for tissue, text in texts.items()) or NOTHING
+
+
+def _bounds(bounds: Json) -> str:
+    lower, upper = bounds.get("lower") or {}, bounds.get("upper") or {}
+    texts = {
+        tissue: ", ".join(
+            f"{SYMBOLS[n]} {number(values.get(n))} to {number(upper.get(tissue, {}).get(n))}{_unit(n)}"
+            for n in PARAMETERS
+        )
+        for tissue, values in lower.items()
+    }
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values()))
+    return "; ".join(f"{tissue} {text}" for tissue, text in texts.items()) or NOTHING
+
+
+def _unit(name: str) -> str:
+    return f" {UNITS[name]}" if UNITS[name] != NOTHING else ""
+
+
+def _mesh_error(sites: Json) -> str:
+    """The meshes' part of the residuals' covariance, in words; nothing where it was not measured."""
+    shares = [100 * one["mesh_share"] for one in sites.values() if one.get("mesh_share") is not None]
+    if not shares:
+        return ""
+    least, most = fixed(min(shares), 1), fixed(max(shares), 1)
+    return f", and for the error of the meshes: {least} to {most} % of the largest force, from others"
+
+
+def _uncertainty(store: Store) -> str:
+    residuals = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
+    if not residuals:
+        return ""
+    sites = residuals.get("sites") or {}
+    words = ", ".join(
+        f"{name} {fixed(one.get('noise_sd_N'), 3)} N and {fixed(one.get('misfit_sd_N'), 3)} N"
+        for name, one in sites.items()
+    )
+    return (
+        "Residuals at the fitted sites are taken for noise of the records and a smooth misfit of the model, "
+        f"correlated along the record (standard deviations, site by site: {words}){_mesh_error(sites)}. 95 % "
+        "intervals follow from their covariance and the exact derivatives, in the logarithms of the "
+        "parameters."
+    )
+
+
+def _prediction(store: Store) -> str:
+    if not store.predict:
+        return ""
+    held = [row for row in store.predicted if not row.get("fitted")]
+    others = f" and {mean_and_deviation(store, 'heldout')} % at {len(held)} held-out sites" if held else ""
+    return (
+        "The error of a site is the mean absolute force difference over the trace over the largest "
+        "measured force. "
+        f"With the identified parameters it is {mean_and_deviation(store, 'fitted')} % at the fitted "
+        f"sites{others} "
+        "(mean ± standard deviation over sites)."
+    )
+
+
+def _experiments(store: Store) -> str:
+    rows = store.run.get("experiments") or {}
+    done = []
+    for name in store.experiments:
+        if name in rows:
+            # What is nested (the parameters of a design) stands in the experiment's own record.
+            plain = {k: v for k, v in (rows[name].get("options") or {}).items() if not isinstance(v, dict)}
+            done.append(name + (f" ({_pairs(plain)})" if plain else ""))
+    return f"Done beside the identification, with their options: {', '.join(done)}." if done else ""
+
+
+def _software(store: Store) -> str:
+    versions = store.run.get("versions") or {}
+    if not store.run.get("limbfit"):
+        return ""
+    machine = store.run.get("machine") or {}
+    libraries = ", ".join(f"{name} {version}" for name, version in versions.items())
+    seconds = [stage.get("seconds") or 0.0 for stage in (store.run.get("stages") or {}).values()]
+    return (
+        f"limbfit {store.run['limbfit']} with {libraries}; Python {machine.get('python')} on "
+        f"{machine.get('system')}, {machine.get('cores')} cores. All stages took "
+        f"{fixed(sum(seconds) / 60, 1)} min. "
+        "The SHA-256 of every input is stored in run.json."
+    )

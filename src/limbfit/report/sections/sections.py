@@ -1,0 +1,448 @@
+"""The sections of the report, each made from the store; what is not stored is said in a sentence."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+
+from .. import tables
+from ..drawing import figures, pictures
+from ..drawing.interactive import convergence_curves, explorer, record_curves
+from ..drawing.slices import slices_figure
+from ..page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
+from ..store import PARAMETERS, Json, Store
+from .comparison import comparison
+from .doubted import search_doubts
+from .doubts import doubts
+from .experiments import experiment_sections
+from .methods import method_section
+from .records import record_figure, trace_table
+
+PRIVACY = (
+    "This report holds no name, date of birth or other identity from the images. It does show the shape of "
+    "a limb and how it responds, which is health data: handle it as the study's consent allows."
+)
+
+
+def make_page(store: Store) -> Page:
+    """Every section in the order in which a reader asks."""
+    study = store.run.get("study") or {}
+    name = str(study.get("name") or "Unnamed study")
+    makers: tuple[Callable[[Store], Section], ...] = (
+        model,
+        meshes,
+        records,
+        fit,
+        prediction,
+        doubts,
+        parameters,
+        convergence,
+    )
+    closing: tuple[Callable[[Store], Section], ...] = (
+        simulated,
+        comparison,
+        solver,
+        method_section,
+        timing,
+        settings,
+        provenance,
+    )
+    absent: dict[Callable[[Store], Section], bool] = {
+        simulated: not store.simulated,
+        comparison: not store.compared,
+        doubts: "flags" not in store.predict,
+    }
+    version = store.run.get("limbfit", "unknown version")
+    return Page(
+        title=name,
+        subtitle=str(study.get("description") or ""),
+        key_numbers=key_numbers(store),
+        summary=summary(store),
+        sections=(
+            *(make(store) for make in makers if not absent.get(make)),
+            *experiment_sections(store),
+            *(make(store) for make in closing if not absent.get(make)),
+        ),
+        footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
+    )
+
+
+def _blocks(*blocks: Block | None, otherwise: str) -> tuple[Block, ...]:
+    """The blocks that exist, or a note that says what is missing."""
+    found = tuple(block for block in blocks if block is not None)
+    return found or (Note(otherwise),)
+
+
+def key_numbers(store: Store) -> tuple[KeyNumber, ...]:
+    """The numbers that a reader looks for first."""
+    found = []
+    if store.predict:
+        heldout, fitted = (tables.mean_and_deviation(store, which) for which in ("heldout", "fitted"))
+        found.append(KeyNumber(heldout, "%", "mean force error at the held-out sites"))
+        found.append(KeyNumber(fitted, "%", "mean force error at the fitted sites"))
+    for tissue in store.tissues:
+        last = store.stages[-1].get("parameters", {}).get(tissue) if store.stages else None
+        if last:
+            found.append(KeyNumber(tables.number(last.get("c_kPa")), "kPa", _with_interval(store, tissue)))
+    seconds = [stage.get("seconds", 0.0) for stage in (store.run.get("stages") or {}).values()]
+    if seconds:
+        found.append(KeyNumber(*_short_time(sum(seconds)), "computing time, all stages"))
+    return tuple(found)
+
+
+def _short_time(seconds: float) -> tuple[str, str]:
+    return (f"{seconds:.0f}", "s") if seconds < 120 else (f"{seconds / 60:.0f}", "min")
+
+
+def _with_interval(store: Store, tissue: str) -> str:
+    limits = tables.interval(store, tissue, "c_kPa")
+    text = f"{tissue}, long-term shear modulus c"
+    return f"{text} ({tables.number(limits[0])} to {tables.number(limits[1])} kPa)" if limits else text
+
+
+def summary(store: Store) -> tuple[Block, ...]:
+    """One paragraph in plain words, then the verdict."""
+    sentences = [_what_was_done(store), _how_well(store), _one_or_two(store)]
+    blocks: list[Block] = [Prose(" ".join(sentence for sentence in sentences if sentence))]
+    words = _verdict(store)
+    return (*blocks, Bullets(words)) if words else tuple(blocks)
+
+
+def _what_was_done(store: Store) -> str:
+    names, fitted = store.site_names, store.fitted
+    if not names:
+        return "Nothing has been computed yet for this study."
+    if not store.stages:
+        sites = f"{len(names)} indentation site{'s' if len(names) > 1 else ''}"
+        simulated = ", each simulated with the parameters of the study" if store.predicted else ""
+        return f"The study has {sites}{simulated}; no parameters have been identified."
+    start = (
+        f"The soft tissue of this limb was identified from robotic indentations at {len(fitted)} of "
+        f"{len(names)} sites ({', '.join(fitted)})"
+    )
+    if len(store.stages) == 1:
+        return f"{start} as one material."
+    paper = store.tissues == tuple(tables.PAPER_TISSUES)
+    parts = "a skin–adipose layer and the muscle–soft tissue beneath it"
+    return f"{start}: first as one material, then as {parts if paper else _listed(store.tissues)}."
+
+
+def _listed(words: Sequence[str]) -> str:
+    """``skin, fat and muscle``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _how_well(store: Store) -> str:
+    held = [row for row in store.predicted if not row.get("fitted")]
+    if not store.predict:
+        return ""
+    if not held:
+        return f"At the fitted sites the force error is {tables.mean_and_deviation(store, 'fitted')} %."
+    places = "the one site that was" if len(held) == 1 else f"the {len(held)} sites that were"
+    errors = [row["error_percent"] for row in held if row.get("error_percent") is not None]
+    worst = f" (largest {tables.fixed(max(errors))} %)" if errors else ""
+    return (
+        f"At {places} not used, the model predicts the force with a mean error of "
+        f"{tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted sites "
+        f"it is {tables.mean_and_deviation(store, 'fitted')} %."
+    )
+
+
+def _one_or_two(store: Store) -> str:
+    held = [row for row in store.predicted if not row.get("fitted")]
+    pairs = [(row.get("error_one_material_percent"), row.get("error_percent")) for row in held]
+    known = [(one, two) for one, two in pairs if one is not None and two is not None]
+    if not known:
+        return ""
+    first, second = (statistics.fmean(column) for column in zip(*known, strict=True))
+    start = f"With one material for all soft tissue the held-out error is {tables.fixed(first)} %: "
+    if abs(first - second) < 0.1 * max(first, second):
+        return start + f"here {store.materials} predict no better than one."
+    return start + f"{store.materials} predict {'better' if second < first else 'worse'}."
+
+
+def _verdict(store: Store) -> tuple[str, ...]:
+    """Which parameters the data determine, best first, and how many combinations of them."""
+    uncertainty = store.calibration.get("uncertainty") or {}
+    stored = uncertainty.get("verdict") or {}
+    if not stored:
+        return ()
+    symbols = _symbols(store)
+    groups: dict[str, list[str]] = {}
+    for name, word in stored.items():
+        groups.setdefault(str(word), []).append(symbols.get(name, name))
+    best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
+    words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
+    combinations = [str(sentence) for sentence in uncertainty.get("combinations") or ()]
+    known = sum(sentence.endswith(": determined") for sentence in combinations)
+    if not known:
+        return tuple(words)
+    return (*words, f"Determined together: {known} of {len(combinations)} products of them (see Parameters).")
+
+
+_RANKS = {"determined": 0, "weakly": 1, "not": 2}
+
+
+def _symbols(store: Store) -> dict[str, str]:
+    """Each parameter's name as people read it: ``muscle.tau_s`` is muscle τ."""
+    return {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
+
+
+def _combinations(store: Store) -> tuple[Block, ...]:
+    """What the data determine of several parameters together, best determined first."""
+    sentences = (store.calibration.get("uncertainty") or {}).get("combinations") or ()
+    if not sentences:
+        return ()
+    told = []
+    for sentence in map(str, sentences):
+        for name, symbol in _symbols(store).items():
+            sentence = sentence.replace(name, symbol)
+        told.append(sentence)
+    lead = (
+        "Products of powers of the parameters, the best determined by the data first. They and the intervals "
+        "are those of the records alone, sampled on what the calibration simulated; limbfit uncertainty adds "
+        "geometry, contact and mesh."
+    )
+    return Prose(lead), Bullets(tuple(told))
+
+
+def model(store: Store) -> Section:
+    """Surfaces, sites and volumes."""
+    blocks = _blocks(
+        explorer(store),
+        slices_figure(store),
+        pictures.surface_figure(store),
+        pictures.marker_figure(store),
+        tables.volume_table(store),
+        tables.place_table(store) if store.sites else None,
+        Bullets(tuple(store.surfaces["notes"])) if store.surfaces.get("notes") else None,
+        otherwise="No surfaces and sites are stored yet.",
+    )
+    source = store.segment.get("method")
+    if source:
+        blocks = (Prose(f"Segmentation: {source}."), *blocks)
+    return Section("model", "The model", blocks)
+
+
+def meshes(store: Store) -> Section:
+    """Cut meshes and their quality."""
+    warnings = tuple(
+        f"Site {site}: {text}"
+        for site, facts in store.mesh.items()
+        for text in (*(facts.get("repairs") or ()), *(facts.get("warnings") or ()))
+    )
+    blocks = _blocks(
+        pictures.mesh_figure(store, store.fitted[:4]),
+        tables.mesh_table(store) if store.mesh else None,
+        Bullets(warnings) if warnings else None,
+        otherwise="No meshes are stored yet.",
+    )
+    return Section("meshes", "Meshes", blocks)
+
+
+def records(store: Store) -> Section:
+    """Indentation records."""
+    chosen = [site for site in (*store.fitted, *store.traces) if store.curves("traces", site)]
+    blocks = _blocks(
+        record_figure(store, chosen[0]) if chosen else None,
+        record_curves(store, tuple(dict.fromkeys(chosen))),
+        trace_table(store) if store.traces else None,
+        otherwise="No indentation records are stored yet.",
+    )
+    return Section("records", "Indentation records", blocks)
+
+
+def fit(store: Store) -> Section:
+    """Force against time at the fitted sites."""
+    rows = [row for row in store.predicted if row.get("fitted")]
+    blocks = _blocks(
+        figures.force_figure(store, rows, "time_s", "forces-fitted", 2),
+        pictures.field_figure(store, store.fitted[:4], "predict", "field"),
+        otherwise="No simulated forces of fitted sites are stored yet.",
+    )
+    return Section("fit", "Fitted sites", blocks)
+
+
+def prediction(store: Store) -> Section:
+    """Everything about the sites that were not used, and table 2."""
+    rows = [row for row in store.predicted if not row.get("fitted")]
+    blocks = _blocks(
+        tables.site_table(store) if store.predicted else None,
+        figures.error_figure(store),
+        figures.force_figure(store, rows, "time_s", "forces-held-out", 3),
+        figures.force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
+        otherwise="No predictions are stored yet.",
+    )
+    if store.predicted and not rows:
+        blocks = (*blocks, Note("Every site was fitted, so nothing tests the model on unseen data."))
+    return Section("prediction", "All sites, held-out sites", blocks)
+
+
+def parameters(store: Store) -> Section:
+    """Table 1, intervals and correlations."""
+    found: tuple[Block | None, ...] = ()
+    if store.stages:
+        found = (
+            tables.parameter_table(store),
+            figures.interval_figure(store),
+            tables.correlation_table(store),
+        )
+    blocks = _blocks(*found, otherwise="No parameters have been identified yet.")
+    if store.stages and not store.calibration.get("uncertainty"):
+        blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
+    blocks = (*blocks, *_combinations(store))
+    residuals = _residuals(store)
+    if residuals:
+        blocks = (*blocks, Prose(residuals))
+    return Section("parameters", "Parameters", blocks)
+
+
+def _residuals(store: Store) -> str:
+    """What the intervals rest on: noise, misfit of the model and error of the mesh, site by site."""
+    found = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
+    rows = found.get("sites") or {}
+    if not rows:
+        return ""
+    sites = ", ".join(
+        f"{name} {tables.fixed(site['noise_sd_N'], 3)} N and {tables.fixed(site['misfit_sd_N'], 3)} N"
+        for name, site in rows.items()
+    )
+    meshes = ", ".join(
+        f"{name} {tables.fixed(100 * site['mesh_share'], 1)} %"
+        for name, site in rows.items()
+        if site.get("mesh_share") is not None
+    )
+    return (
+        "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
+        f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
+        f"{tables.fixed(100 * found['correlation'], 0)} % of a record. "
+        + (
+            f"To these comes the error of the meshes, from others, in percent of the largest force: {meshes}."
+            if meshes
+            else "The error of the meshes is not in them: no other mesh was simulated."
+        )
+    )
+
+
+def convergence(store: Store) -> Section:
+    """How the identification went."""
+    stages = store.stages
+    texts = tuple(
+        f"{str(stage['name']).capitalize()}: {'' if stage.get('converged') else 'not '}converged after "
+        f"{len(stage.get('iterations') or ())} iterates and {stage.get('evaluations', tables.NOTHING)} "
+        f"evaluations; {stage.get('reason') or 'no reason stored'}."
+        for stage in stages
+    )
+    figure: Figure | None = figures.convergence_figure(store)
+    details: tuple[Table, ...] = tuple(
+        tables.iteration_table(stage) for stage in stages if stage.get("iterations")
+    )
+    blocks = _blocks(
+        Bullets(texts) if texts else None,
+        figure,
+        convergence_curves(store),
+        *search_doubts(store),
+        *details,
+        otherwise="No identification is stored yet.",
+    )
+    return Section("convergence", "Convergence of the identification", blocks)
+
+
+def _doubts(rows: Sequence[Json]) -> Bullets | None:
+    """The solver's warnings about the simulations of the sites; None where there are none."""
+    texts = tuple(f"Site {row['site']}: {text}" for row in rows for text in row.get("warnings") or ())
+    return Bullets(texts) if texts else None
+
+
+def simulated(store: Store) -> Section:
+    """Indentations that were simulated one by one."""
+    names = [str(row["site"]) for row in store.simulated][:4]
+    blocks = _blocks(
+        _doubts(store.simulated),
+        figures.simulated_figure(store),
+        pictures.field_figure(store, names, "simulate", "field-simulated"),
+        tables.simulated_table(store),
+        otherwise="No single indentations were simulated.",
+    )
+    return Section("simulated", "Simulated indentations", blocks)
+
+
+def _corrections(rounds: Sequence[Json]) -> str | None:
+    """How many, and what the last one changed."""
+    if not rounds:
+        return None
+    last = rounds[-1]
+    if last["reason"]:
+        return f"{len(rounds)}; the last failed: {last['reason']}"
+    left = max(last["change_percent_by_site"].values())
+    return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
+
+
+def solver(store: Store) -> Section:
+    """What the simulations say about themselves."""
+    facts = {
+        "Objective": store.calibration.get("objective"),
+        "Forward simulations of the identification": store.calibration.get("forward_runs"),
+        "Of them with derivatives": store.calibration.get("forward_runs_with_sensitivities"),
+        "Corrections of coarse meshes": _corrections(store.calibration.get("corrections") or []),
+        "Starts": (store.calibration.get("multistart") or {}).get("summary"),
+        "Linear solver": store.calibration.get("linear_solver"),
+        "Element": store.calibration.get("element"),
+    }
+    known = {key: value for key, value in facts.items() if value is not None}
+    failed = [str(row["site"]) for row in store.predicted if not row.get("completed")]
+    warning = (
+        f"The simulation did not reach the end of the record at: {', '.join(failed)}." if failed else None
+    )
+    blocks = _blocks(
+        Note(warning) if warning else None,
+        _doubts(store.predicted),
+        tables.solver_table(store) if store.predicted else None,
+        tables.pair_table("solver-facts", "The identification's solver.", ("Fact", "Value"), known)
+        if known
+        else None,
+        otherwise="No simulations are stored yet.",
+    )
+    return Section("solver", "Solver", blocks)
+
+
+def timing(store: Store) -> Section:
+    """How long it took, and on what."""
+    machine = store.run.get("machine") or {}
+    words = [
+        f"{machine['cores']} cores" if "cores" in machine else "",
+        f"{tables.fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
+        f"Python {machine['python']}" if "python" in machine else "",
+    ]
+    known = ", ".join(word for word in words if word)
+    blocks = _blocks(
+        tables.timing_table(store) if store.run.get("stages") else None,
+        Prose(f"Machine: {known}.") if known else None,
+        otherwise="No times are stored.",
+    )
+    return Section("timing", "Computing time", blocks)
+
+
+def settings(store: Store) -> Section:
+    """Every setting of the study file."""
+    flat = tables.flatten(store.run.get("settings") or {})
+    table = tables.pair_table(
+        "all-settings", "Every setting of the study, defaults included.", ("Key", "Value"), flat
+    )
+    blocks = _blocks(table if flat else None, otherwise="No settings are stored.")
+    return Section("settings", "Settings", blocks)
+
+
+def provenance(store: Store) -> Section:
+    """Versions and hashes: what someone else needs to get the same numbers."""
+    versions = {"limbfit": store.run.get("limbfit")} | (store.run.get("versions") or {})
+    inputs = store.run.get("inputs") or {}
+    known = {name: value for name, value in versions.items() if value}
+    blocks = _blocks(
+        tables.pair_table("versions", "Software.", ("Library", "Version"), known) if known else None,
+        tables.pair_table("inputs", "Inputs and their SHA-256.", ("Key of the study", "SHA-256"), inputs)
+        if inputs
+        else None,
+        otherwise="No versions and input hashes are stored.",
+    )
+    return Section("provenance", "Versions and inputs", blocks)
