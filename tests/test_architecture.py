@@ -28,6 +28,7 @@ HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
 # Floors inside a room, from the top; "" is what stands in the room's own folder.
 INNER_FLOORS = {
     "anatomy": ["imaging", "meshing", "sites", "segmentation", "surfaces", "labels", "images", ""],
+    "fe": ["__init__", "solution", "", "contact", "kernel", "materials", "lanes threads"],
     "identify": ["__init__", "checks", "uncertainty", "fit"],
     "pipeline": ["__init__", "verbs", "experiments", "stages", "shared"],
     "report": ["__init__ build html files", "sections", "drawing", "page store tables"],

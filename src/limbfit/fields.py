@@ -12,7 +12,7 @@ import numpy as np
 
 from .fe import Problem, State, Step, System
 from .fe.history import Memory
-from .fe.laws import Laws
+from .fe.kernel.laws import Laws
 from .fe.observables import contact_pressure, element_fields, nodal_average, von_mises
 from .mesh import write_pvd, write_vtu
 

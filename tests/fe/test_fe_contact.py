@@ -10,8 +10,8 @@ from blocks import MUSCLE, SKIN, block, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
-from limbfit.fe.laws import Laws
-from limbfit.fe.linear import symmetric_product
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.solution.linear import symmetric_product
 from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
 

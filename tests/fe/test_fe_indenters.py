@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter, Problem, RigidSurface, StepControl, System, solve
-from limbfit.fe.indenter import SHAPES, signed_distance
+from limbfit.fe.contact.indenter import SHAPES, signed_distance
 from limbfit.febio.faceting import FRONTS, STEEPEST_DEG
 from limbfit.pipeline.stages.plausible import SECTION_RADIUS
 from limbfit.study import IndenterTable

@@ -9,9 +9,9 @@ from numba import njit
 from samples import SAMPLES
 
 from limbfit.fe import ELEMENTS, History, Problem, System
-from limbfit.fe.assembly import assemble
 from limbfit.fe.history import elastic_stresses
-from limbfit.fe.kinematics import (
+from limbfit.fe.kernel.assembly import assemble
+from limbfit.fe.kernel.kinematics import (
     deformation_gradient,
     from_principal,
     invert,
@@ -19,8 +19,8 @@ from limbfit.fe.kinematics import (
     principal,
     principal_axes,
 )
+from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.lanes import LANES, block_places, exponential, logarithm, workspace
-from limbfit.fe.laws import Laws
 from limbfit.fe.materials.ogden import ogden, ogden_lanes
 
 

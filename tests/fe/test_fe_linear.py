@@ -11,12 +11,12 @@ from blocks import punch
 
 from limbfit.bench.blocks import punched_block
 from limbfit.fe import StepControl, Support, System
-from limbfit.fe.factor import Factor
 from limbfit.fe.history import Memory
-from limbfit.fe.laws import Laws
-from limbfit.fe.linear import SOLVERS, NotPositiveDefiniteError, linear_solver, symmetric_product
-from limbfit.fe.multigrid import Multigrid
-from limbfit.fe.stepping import Simulation
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.solution.factor import Factor
+from limbfit.fe.solution.linear import SOLVERS, NotPositiveDefiniteError, linear_solver, symmetric_product
+from limbfit.fe.solution.multigrid import Multigrid
+from limbfit.fe.solution.stepping import Simulation
 
 
 def system(n: int = 200) -> tuple[sp.csr_matrix, np.ndarray]:

@@ -22,8 +22,8 @@ from limbfit.fe import (
     iterate,
     solve,
 )
-from limbfit.fe.kinematics import logarithmic_stretches, principal
-from limbfit.fe.laws import Laws
+from limbfit.fe.kernel.kinematics import logarithmic_stretches, principal
+from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.materials import prony_factors
 from limbfit.fe.materials.ogden import ogden, ogden_derivative
 from limbfit.fe.materials.volumetric import volumetric

@@ -16,7 +16,7 @@ from blocks import SKIN, block, punch
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.fe.doubts import slipped
-from limbfit.fe.pace import Pace
+from limbfit.fe.solution.pace import Pace
 from limbfit.study import PARAMETERS, MaterialTable
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

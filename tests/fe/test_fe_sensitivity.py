@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from blocks import punch
 
-from limbfit.fe import Indenter, StepControl, solve, stepping
+from limbfit.fe import Indenter, StepControl, solve
+from limbfit.fe.solution import stepping
 
 TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-10)
 

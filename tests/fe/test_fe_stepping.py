@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, StepControl, iterate, solve
-from limbfit.fe.stepping import schedule
+from limbfit.fe.solution.stepping import schedule
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from blocks import MUSCLE, SKIN, block, punch, symmetry
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, OgdenQLV, Problem, StepControl, System, iterate, solve
-from limbfit.fe.laws import Laws
-from limbfit.fe.linear import symmetric_product
-from limbfit.fe.sticky import Anchors
+from limbfit.fe.contact.sticky import Anchors
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.solution.linear import symmetric_product
 from limbfit.fe.system import Increment
 
 

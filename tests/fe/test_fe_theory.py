@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from limbfit.fe import ELEMENTS, History, Indenter, NeoHookean, Problem, StepControl, Support, System, iterate
-from limbfit.fe.laws import Laws
+from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import element_fields
 from limbfit.fe.system import Increment
 

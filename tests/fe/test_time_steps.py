@@ -9,7 +9,7 @@ from blocks import punch
 from limbfit.bench.layer import curve_error, reference_layer, solve_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.fe.materials import prony_factors
-from limbfit.fe.schedule import foresee, graded
+from limbfit.fe.solution.schedule import foresee, graded
 from limbfit.phantom.forces import STEPS as TRUTH
 from limbfit.study import SolverTable
 

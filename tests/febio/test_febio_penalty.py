@@ -11,7 +11,7 @@ import pytest
 
 from limbfit.bench.blocks import punched_block
 from limbfit.fe import State, Step, StepControl, System, solve
-from limbfit.fe.elements import face_quadrature
+from limbfit.fe.kernel.elements import face_quadrature
 from limbfit.febio import (
     FaceWise,
     FebSettings,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..fe import System, iterate, solve
-from ..fe.laws import Laws
+from ..fe.kernel.laws import Laws
 from ..fe.observables import element_fields
 from .reference import CUBES, PUNCHED, ReferenceCase, Tell, find_reference, load_case, pushing_force
 

@@ -22,14 +22,14 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 
 from __future__ import annotations
 
+from .contact.indenter import Indenter
+from .contact.rigid_surface import RigidSurface
 from .doubts import Doubt
-from .elements import ELEMENTS
-from .indenter import Indenter
+from .kernel.elements import ELEMENTS
 from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from .problem import History, Problem, Support
 from .result import Result, State, Step
-from .rigid_surface import RigidSurface
-from .stepping import StepControl, iterate, solve
+from .solution.stepping import StepControl, iterate, solve
 from .system import System
 
 __all__ = [

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .kinematics import deform, invert, principal_axes
+from .kernel.kinematics import deform, invert, principal_axes
+from .kernel.laws import Laws
 from .lanes import COMPILED, LANES, workspace
-from .laws import Laws
 from .materials import prony_factors
 from .materials.ogden import ogden_lanes, set_terms
 from .system import Increment, System

@@ -9,8 +9,8 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
-from .elements import Element
-from .kinematics import (
+from .kernel.elements import Element
+from .kernel.kinematics import (
     deformation_gradient,
     from_principal,
     logarithmic_stretches,
@@ -18,7 +18,7 @@ from .kinematics import (
     principal,
     push_forward,
 )
-from .laws import Laws
+from .kernel.laws import Laws
 from .materials.ogden import ogden
 from .materials.volumetric import volumetric
 from .result import State

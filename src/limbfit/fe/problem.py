@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..errors import ProblemError
 from ..mesh import Mesh
 from ..phases import Phase, boundaries, find_phases, loading_end
-from .elements import ELEMENTS, Element, reference_gradients
-from .indenter import Indenter
+from .contact.indenter import Indenter
+from .kernel.elements import ELEMENTS, Element, reference_gradients
 from .materials import Material
 
 FACE_NODES = {"tet4": 3, "tet10": 6, "hex8": 4}

@@ -16,13 +16,13 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
-from .assembly import assemble
-from .contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
-from .elements import Element, reference_gradients
-from .indenter import Indenter
-from .laws import Laws
+from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
+from .contact.indenter import Indenter
+from .contact.sticky import Anchors
+from .kernel.assembly import assemble
+from .kernel.elements import Element, reference_gradients
+from .kernel.laws import Laws
 from .problem import Problem, ProblemError, check
-from .sticky import Anchors
 from .threads import thread_pool
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fe import ELEMENTS
-from ..fe.elements import reference_gradients
+from ..fe.kernel.elements import reference_gradients
 from .geometry import Part, triangles
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import ELEMENTS, Material, Problem, Step, StepControl, System
-from ..fe.contact import ContactSurface, touching_offset
-from ..fe.elements import face_quadrature, reference_gradients
+from ..fe.contact.contact import ContactSurface, touching_offset
+from ..fe.kernel.elements import face_quadrature, reference_gradients
 from ..fe.materials import prony_factors
 from ..mesh import Mesh
 from .model import Contact

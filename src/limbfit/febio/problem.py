@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, Problem, RigidSurface, StepControl, Support
-from ..fe.elements import reference_gradients
-from ..fe.indenter import SHARP_EDGE
+from ..fe.contact.indenter import SHARP_EDGE
+from ..fe.kernel.elements import reference_gradients
 from ..mesh import Mesh
 from .controls import step_times
 from .geometry import boundary, refuse_part, triangles

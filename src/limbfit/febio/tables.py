@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fe import Step, System
-from ..fe.laws import Laws
+from ..fe.kernel.laws import Laws
 from ..fe.observables import ElementFields, element_fields
 from ..fe.system import Increment
 from .model import FebModel

@@ -17,7 +17,7 @@ from ... import report
 from ...bench.blocks import HEX, boxes
 from ...errors import InputError, RunError
 from ...fe import History, Material, OgdenQLV, Problem, StepControl, Support, System, iterate
-from ...fe.laws import Laws
+from ...fe.kernel.laws import Laws
 from ...fe.observables import element_fields
 from ...indentation import KPA, materials
 from ...mesh import Mesh

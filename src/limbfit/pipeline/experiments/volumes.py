@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...fe import Result, solve
-from ...fe.laws import Laws
+from ...fe.kernel.laws import Laws
 from ...fe.observables import element_fields
 from ...indentation import Simulation, SimulationJob, SiteModel, build_problem, steps_of, to_parameters
 from ...mesh import read_vtu

@@ -21,7 +21,7 @@ from ..._version import __version__
 from ...errors import InputError, LimbfitError
 from ...execution import THREAD_VARIABLES, ProcessExecutor, usable_cores
 from ...fe import OgdenQLV
-from ...fe.linear import SOLVERS, linear_solver
+from ...fe.solution.linear import SOLVERS, linear_solver
 from ...febio.program import find_febio
 from ...indentation import KPA
 from ..experiments.cube import RAMP_S, compress

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .materials import Material
+from ..materials import Material
 
 Array = NDArray[np.float64]
 

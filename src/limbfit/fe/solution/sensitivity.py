@@ -14,21 +14,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .direction import solve_at
-from .factor import Factor
-from .history import Memory
-from .kinematics import (
+from ..history import Memory
+from ..kernel.kinematics import (
     deformation_gradient,
     from_principal,
     logarithmic_stretches,
     mean_dilatation,
     principal,
 )
-from .laws import Laws
-from .materials import prony_factors
-from .materials.ogden import ogden, ogden_derivative
-from .materials.volumetric import volumetric
-from .system import Evaluation, Increment, System
+from ..kernel.laws import Laws
+from ..materials import prony_factors
+from ..materials.ogden import ogden, ogden_derivative
+from ..materials.volumetric import volumetric
+from ..system import Evaluation, Increment, System
+from .direction import solve_at
+from .factor import Factor
 
 Array = NDArray[np.float64]
 # Residual of the linear systems, relative to their right-hand sides: what is left then in the force is of

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..errors import ProblemError
-from .elements import Element, face_quadrature
+from ...errors import ProblemError
+from ..kernel.elements import Element, face_quadrature
 from .indenter import Indenter, signed_distance
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import TET10_EDGES, TRI6_EDGES
+from ...mesh import TET10_EDGES, TRI6_EDGES
 
 Array = NDArray[np.float64]
 Shape = Callable[[Array], tuple[Array, Array]]

@@ -21,7 +21,7 @@ import scipy.sparse.linalg as spla
 from numba import njit
 from numpy.typing import NDArray
 
-from .threads import quiet_openmp, thread_pool
+from ..threads import quiet_openmp, thread_pool
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernel.laws import Laws
+from ..system import Evaluation, Increment, System
 from .direction import newton_direction
 from .factor import Factor
-from .laws import Laws
 from .linear import NotPositiveDefiniteError
-from .system import Evaluation, Increment, System
 
 Array = NDArray[np.float64]
 # A shorter step damps the next directions, at first by this share of each tissue's own shear modulus; it is

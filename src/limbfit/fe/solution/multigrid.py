@@ -15,9 +15,9 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
-from ..mesh import TET10_EDGES
+from ...mesh import TET10_EDGES
+from ..system import System, node_graph, place_of, upper_pattern
 from .linear import Index, NotPositiveDefiniteError, linear_solver
-from .system import System, node_graph, place_of, upper_pattern
 
 Array = NDArray[np.float64]
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.

@@ -16,8 +16,8 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from ..phases import Phase
-from .problem import History
+from ...phases import Phase
+from ..problem import History
 
 Array = NDArray[np.float64]
 

@@ -16,11 +16,11 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from ..system import System
 from .convexity import shear_stiffness
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
 from .multigrid import Multigrid
 from .springs import SpringChange, SpringColumns
-from .system import System
 
 Array = NDArray[np.float64]
 # A factor in single precision that needs more iterations at its own matrix has too few digits.

@@ -14,22 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .contact import ContactSurface
+from ..contact.contact import ContactSurface
+from ..contact.indenter import Indenter
+from ..contact.sticky import Anchors
+from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced
+from ..history import Memory, elastic_stresses
+from ..kernel.laws import Laws
+from ..problem import History, Problem, ProblemError
+from ..result import Result, State, Step
+from ..system import Evaluation, Increment, System
+from ..threads import single_threaded_numpy
 from .direction import renew
-from .doubts import Doubt, folded, inexact, slipped, sunk, unbalanced
 from .factor import Factor
-from .history import Memory, elastic_stresses
-from .indenter import Indenter
-from .laws import Laws
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .pace import Pace
-from .problem import History, Problem, ProblemError
-from .result import Result, State, Step
 from .schedule import foresee, graded
 from .sensitivity import Explicit, MemoryDerivative, solve_with_adjoint
-from .sticky import Anchors
-from .system import Evaluation, Increment, System
-from .threads import single_threaded_numpy
 
 Array = NDArray[np.float64]
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.

@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..lanes import COMPILED, LANES, block_places, prefetch, workspace
+from ..materials.ogden import ogden_lanes, set_terms
+from ..materials.volumetric import volumetric
 from .kinematics import deform, invert, principal_axes
-from .lanes import COMPILED, LANES, block_places, prefetch, workspace
-from .materials.ogden import ogden_lanes, set_terms
-from .materials.volumetric import volumetric
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..errors import ProblemError
+from ...errors import ProblemError
 from .rigid_surface import NO_BODY, Body, RigidSurface, surface_distance
 
 SHAPES = {"square": 0, "sphere": 1, "cylinder": 2, "stl": 3}

@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .contact import Touch
+from ..contact.contact import Touch
+from ..system import Evaluation, System
 from .factor import Factor, Solution
 from .springs import SpringChange
-from .system import Evaluation, System
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

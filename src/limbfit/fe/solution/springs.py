@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .system import System
+from ..system import System
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

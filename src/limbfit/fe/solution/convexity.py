@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .system import System
+from ..system import System
 
 Array = NDArray[np.float64]
 _CELLS = 2000  # at a time

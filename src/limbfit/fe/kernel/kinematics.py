@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from .lanes import COMPILED, LANES
+from ..lanes import COMPILED, LANES
 
 
 @njit(cache=True)

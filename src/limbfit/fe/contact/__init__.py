@@ -1,0 +1,1 @@
+"""Rigid bodies as signed distances, and the energy of touching them."""

@@ -1,0 +1,1 @@
+"""Compiled element kernels, the table of elements, the laws of all cells."""

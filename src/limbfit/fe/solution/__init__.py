@@ -1,0 +1,1 @@
+"""Simulations in time: steps, equilibrium of each, factors and preconditioners, sensitivities."""
