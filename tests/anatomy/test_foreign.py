@@ -10,11 +10,12 @@ import pytest
 from bodies import limb
 from limbs import SHARED, rotation
 
+from limbfit.anatomy.meshing import meshing, untangling
 from limbfit.anatomy.meshing.background import volumes
 from limbfit.anatomy.meshing.engines import VolumeMesh
 from limbfit.anatomy.meshing.layered import with_layers
 from limbfit.anatomy.meshing.layers import LimbFields
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site, meshing, untangling
+from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.anatomy.meshing.smoothing import held
 from limbfit.anatomy.meshing.untangling import inverted, repaired, thinned, untangled
 from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin

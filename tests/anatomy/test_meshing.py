@@ -13,11 +13,12 @@ import pytest
 from bodies import limb
 from limbs import SHARED, rotation
 
+from limbfit.anatomy.meshing import engines
 from limbfit.anatomy.meshing.background import LAYER, banded, box_grid, cut, volumes
 from limbfit.anatomy.meshing.columns import columns
 from limbfit.anatomy.meshing.curving import with_diagonals
 from limbfit.anatomy.meshing.layers import LayerSpec, limb_fields, signed_distance
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, engines, mesh_site
+from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
 from limbfit.errors import MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces, quality, to_tet10

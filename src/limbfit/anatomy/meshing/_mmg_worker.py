@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from mmgpy import MmgMesh3D
 
-from limbfit.anatomy.meshing.meshing._worker import work
+from limbfit.anatomy.meshing._worker import work
 
 SMALLEST_PART = 0.1  # of the smallest wanted edge: MMG's lower bound where curvature asks for more
 

@@ -10,7 +10,7 @@ import numpy as np
 from mmgpy import MmgMeshS
 from netgen.meshing import FaceDescriptor, Mesh, MeshingParameters, Pnt
 
-from limbfit.anatomy.meshing.meshing._worker import work
+from limbfit.anatomy.meshing._worker import work
 
 SMALLEST_PART = 0.1  # of the smallest wanted edge: MMG's lower bound where curvature asks for more
 GRADING = 0.5
