@@ -18,7 +18,7 @@ FLOORS = [
     {"pipeline"},
     {"bench"},
     {"report", "phantom"},
-    {"indentation"},
+    {"indentation", "notebook"},
     {"study", "febio", "fields", "acquire"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive"},

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .fe import Problem, State, Step, System
 from .fe.history import Memory
@@ -16,14 +17,21 @@ from .fe.kernel.laws import Laws
 from .fe.observables import contact_pressure, element_fields, nodal_average, von_mises
 from .mesh import write_pvd, write_vtu
 
+Array = NDArray[np.float64]
 KPA = 1e-3  # MPa
 
 
 def write_fields(system: System, problem: Problem, state: State, file: Path) -> None:
-    """Write the fields of a state that kept its memory as VTU.
+    """Write the fields of a state as VTU (see `state_fields`); points are at rest."""
+    point_data, cell_data = state_fields(system, problem, state)
+    write_vtu(problem.mesh, file, point_data=point_data, cell_data=cell_data)
 
-    Points are at rest; ``displacement_mm`` moves them.  The state is one of a `Step` that `iterate` yields,
-    or the one kept with ``store="peak"``.
+
+def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Fields at points (n, ..) and of cells (m, ..) of a state that kept its memory, by name and unit.
+
+    ``displacement_mm`` moves the points from rest.  The state is one of a `Step` that `iterate` yields, or
+    the one kept with ``store="peak"``.
     """
     laws = _laws(problem)
     fields = element_fields(system, laws, state)
@@ -42,7 +50,7 @@ def write_fields(system: System, problem: Problem, state: State, file: Path) -> 
         "J": fields.J,
         "energy_density_kPa": fields.energy / KPA,
     }
-    write_vtu(problem.mesh, file, point_data=point_data, cell_data=cell_data)
+    return point_data, cell_data
 
 
 class Animation:

@@ -8,6 +8,8 @@ Its Kirchhoff stress is ``tau = s tau_e + J U' I + F K F^T``; the tangent is spa
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -54,6 +56,12 @@ def assemble(
     elements = cells, grads, weights, regions, history
     places = block_places(nodes), positions
     return float(_assemble(elements, mean, tables, scale, u, tangent, places, residual, data, records))
+
+
+def is_compiled() -> bool:
+    """Whether the costliest kernel is at hand, in this process or stored on this machine."""
+    stored = Path(_assemble.stats.cache_path or ".").glob(f"assembly.{_assemble.py_func.__name__}-*.nbi")
+    return bool(_assemble.signatures) or any(stored)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

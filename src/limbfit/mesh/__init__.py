@@ -1,0 +1,39 @@
+"""Volume meshes: points, cells, named sets; their quality; VTU on disk."""
+
+from .measures import Quality, dihedral_angles, quality
+from .volume import (
+    CELL_NODES,
+    TET10_EDGES,
+    TET_FACES,
+    TRI6_EDGES,
+    VTK_CELL,
+    Mesh,
+    boundary_faces,
+    cell_volumes,
+    check,
+    node_jacobians,
+    to_tet10,
+)
+from .vtu import read_grid, read_vtu, silent_vtk, write_pvd, write_vtu
+
+__all__ = [
+    "CELL_NODES",
+    "TET10_EDGES",
+    "TET_FACES",
+    "TRI6_EDGES",
+    "VTK_CELL",
+    "Mesh",
+    "Quality",
+    "boundary_faces",
+    "cell_volumes",
+    "check",
+    "dihedral_angles",
+    "node_jacobians",
+    "quality",
+    "read_grid",
+    "read_vtu",
+    "silent_vtk",
+    "to_tet10",
+    "write_pvd",
+    "write_vtu",
+]

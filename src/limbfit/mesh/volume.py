@@ -1,0 +1,351 @@
+"""Volume meshes: points, cells, regions and named sets; made of arrays, or of other libraries' meshes.
+
+Vocabulary
+----------
+points   (n, 3) float64, millimetres, LPS.
+cells    (m, k) int64, in VTK order: tet4 (k=4), tet10 (k=10, mid-edge nodes 01 12 20 03 13 23), hex8 (k=8).
+regions  (m,) int64, index of each cell into ``region_names``.
+node_sets / face_sets  named integer arrays: node indices, and outward-oriented boundary faces
+         (3, 6 or 4 nodes each, in VTK order).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import ProblemError
+
+CELL_NODES = {"tet4": 4, "tet10": 10, "hex8": 8}
+VTK_CELL = {"tet4": 10, "tet10": 24, "hex8": 12}
+TET10_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
+TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # outward for positive volume
+TRI6_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """An immutable volume mesh; see the module docstring for the arrays."""
+
+    points: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    cell_type: str
+    regions: NDArray[np.int64]
+    region_names: tuple[str, ...]
+    node_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    face_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.cell_type not in CELL_NODES:
+            raise ProblemError(f"unknown cell type {self.cell_type!r}; use one of {sorted(CELL_NODES)}")
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ProblemError(f"mesh points have shape {self.points.shape}, not (n, 3)")
+        if self.cells.ndim != 2 or self.cells.shape[1] != CELL_NODES[self.cell_type]:
+            raise ProblemError(f"{self.cell_type} cells have shape {self.cells.shape}")
+        if len(self.regions) != len(self.cells):
+            raise ProblemError(f"{len(self.regions)} region indices for {len(self.cells)} cells")
+
+    @property
+    def corners(self) -> NDArray[np.int64]:
+        """Corner nodes of each cell: (m, 4) for tetrahedra, (m, 8) for hexahedra."""
+        return self.cells[:, : 4 if self.cell_type.startswith("tet") else 8]
+
+    def with_points(self, points: NDArray[np.float64]) -> Mesh:
+        return replace(self, points=points)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        points: ArrayLike,
+        cells: ArrayLike,
+        regions: ArrayLike | None = None,
+        names: Mapping[int, str] | None = None,
+    ) -> Mesh:
+        """A mesh of one's own: points (n, 3) in mm, cells (m, 4), (m, 10) or (m, 8) in VTK's order.
+
+        Points of no cell are dropped, and cells whose corners run the other way round are turned.
+
+        Parameters
+        ----------
+        regions : (m,) the tissue of each cell, as names or as numbers; none: all are ``tissue``.
+        names : the tissue of each number; by default ``region 1`` for number 1.
+
+        Raises
+        ------
+        ProblemError
+            For cells that are not solved, not finite or flat, and regions that do not fit them.
+        """
+        return _from_arrays(np.asarray(points, dtype=float), np.asarray(cells), regions, names)
+
+    @classmethod
+    def from_pyvista(cls, grid: Any, region: str = "") -> Mesh:
+        """The tetrahedra or hexahedra of a ``pyvista.UnstructuredGrid``.
+
+        ``region``: the cell array of tissues. Cells of fewer dimensions, as surfaces and edges, are left out.
+        See `from_arrays`.
+        """
+        blocks = [(_VTK_NAMES.get(int(k), f"VTK type {k}"), v) for k, v in grid.cells_dict.items()]
+        tissues = _cell_array(grid.cell_data, region) if region else None
+        kind, cells = _one_kind(blocks)
+        if tissues is not None:
+            tissues = np.asarray(tissues)[np.asarray(grid.celltypes) == VTK_CELL[kind]]
+        return cls.from_arrays(grid.points, cells, tissues)
+
+    @classmethod
+    def from_meshio(cls, mesh: Any, region: str = "") -> Mesh:
+        """The tetrahedra or hexahedra of a ``meshio.Mesh``; ``region``: the cell data of tissues.
+
+        By default Gmsh's physical groups, with their names, or Medit's references, where there are any.
+        Cells of fewer dimensions are left out. See `from_arrays`.
+        """
+        kind, cells = _one_kind([(_MESHIO_NAMES.get(b.type, b.type), b.data) for b in mesh.cells])
+        known = [name for name in _MESHIO_REGIONS if name in mesh.cell_data]
+        data = _cell_array(mesh.cell_data, region) if region else mesh.cell_data[known[0]] if known else None
+        chosen = [k for k, block in enumerate(mesh.cells) if _MESHIO_NAMES.get(block.type) == kind]
+        tissues = None if data is None else np.concatenate([np.asarray(data[k]) for k in chosen])
+        names = {int(number): name for name, (number, dim) in mesh.field_data.items() if dim == 3}
+        return cls.from_arrays(mesh.points, cells, tissues, names)
+
+    def nodes_where(self, where: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
+        """Numbers (k,) of the nodes at which ``where(points)`` holds: ``lambda p: p[:, 2] < -19.9``."""
+        found = np.flatnonzero(where(self.points))
+        if not len(found):
+            raise ProblemError("no node is there", remedy=f"the mesh spans {_extent(self.points)}")
+        return found
+
+    def faces_where(self, where: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
+        """Outward boundary faces (k, 3, 6 or 4) at all of whose nodes ``where(points)`` holds."""
+        faces = boundary_faces(self)
+        found = faces[np.asarray(where(self.points))[faces].all(axis=1)]
+        if not len(found):
+            raise ProblemError("no boundary face is there", remedy=f"the mesh spans {_extent(self.points)}")
+        return found
+
+
+def node_jacobians(mesh: Mesh) -> NDArray[np.float64]:
+    """Jacobian determinant (m, k) of each cell at its own nodes, for unit reference cells, in mm3."""
+    gradients = _shape_gradients(mesh.cell_type, _REFERENCE_NODES[mesh.cell_type])
+    return _determinants(mesh, gradients)
+
+
+def cell_volumes(mesh: Mesh) -> NDArray[np.float64]:
+    """Volumes (m,) of the cells, curved edges included, in mm3."""
+    where, weights = _QUADRATURE[mesh.cell_type]
+    return _determinants(mesh, _shape_gradients(mesh.cell_type, where)) @ weights
+
+
+def _determinants(mesh: Mesh, gradients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """det(dx/dxi) (m, q) for shape gradients (q, k, 3)."""
+    return np.linalg.det(np.einsum("mki,qkj->mqij", mesh.points[mesh.cells], gradients))
+
+
+def _shape_gradients(cell_type: str, where: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gradients (q, k, 3) of the shape functions at reference coordinates (q, 3)."""
+    if cell_type == "hex8":
+        signs = 2.0 * _REFERENCE_NODES["hex8"] - 1.0
+        terms = 0.5 + signs * (where[:, None, :] - 0.5)
+        return np.stack(
+            [signs[:, i] * terms[..., (i + 1) % 3] * terms[..., (i + 2) % 3] for i in range(3)], axis=-1
+        )
+    slope = np.array([[-1.0, -1.0, -1.0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    if cell_type == "tet4":
+        return np.broadcast_to(slope, (len(where), 4, 3))
+    L = np.column_stack([1.0 - where.sum(axis=1), where])
+    corner = (4.0 * L - 1.0)[:, :, None] * slope
+    a, b = TET10_EDGES.T
+    edge = 4.0 * (L[:, a, None] * slope[b] + L[:, b, None] * slope[a])
+    return np.concatenate([corner, edge], axis=1)
+
+
+_TET_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+_REFERENCE_NODES = {
+    "tet4": _TET_NODES,
+    "tet10": np.vstack([_TET_NODES, _TET_NODES[TET10_EDGES].mean(axis=1)]),
+    "hex8": np.array(
+        [[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+    ),
+}
+
+
+def _quadrature() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Rules that integrate the Jacobian of each cell exactly (tet10: cubic; Keast's 5 points)."""
+    keast = np.full((5, 3), 1 / 6)
+    keast[0] = 0.25
+    keast[1:4] += np.eye(3) / 3
+    gauss = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+    grid = np.stack(np.meshgrid(gauss, gauss, gauss), axis=-1).reshape(-1, 3)
+    return {
+        "tet4": (np.full((1, 3), 0.25), np.array([1 / 6])),
+        "tet10": (keast, np.array([-0.8, 0.45, 0.45, 0.45, 0.45]) / 6),
+        "hex8": (grid, np.full(8, 1 / 8)),
+    }
+
+
+_QUADRATURE = _quadrature()
+
+
+def check(mesh: Mesh) -> None:
+    """Raise ``ProblemError`` when a mesh cannot be computed with: inverted, doubled or dangling cells."""
+    if not np.isfinite(mesh.points).all():
+        raise ProblemError("mesh points are not finite")
+    if len(mesh.cells) == 0:
+        raise ProblemError("the mesh has no cells")
+    if mesh.cells.min() < 0 or mesh.cells.max() >= len(mesh.points):
+        raise ProblemError("cells name nodes that do not exist")
+    if len(np.unique(mesh.cells)) != len(mesh.points):
+        raise ProblemError("some mesh points belong to no cell", remedy="drop unused points")
+    corners = np.sort(mesh.corners, axis=1)
+    corners = corners[np.lexsort(corners.T)]
+    if (corners[1:] == corners[:-1]).all(axis=1).any():
+        raise ProblemError("some cells are there twice")
+    inverted = int((node_jacobians(mesh).min(axis=1) <= 0).sum())
+    if inverted:
+        raise ProblemError(f"{inverted} of {len(mesh.cells)} cells are inverted", remedy="mesh again, finer")
+
+
+def boundary_faces(mesh: Mesh) -> NDArray[np.int64]:
+    """Outward faces (k, 3, 6 or 4) that belong to one cell only.
+
+    Raises
+    ------
+    ProblemError
+        When a face belongs to more than two cells.
+    """
+    faces = mesh.cells[:, _CELL_FACES[mesh.cell_type]]
+    faces = faces.reshape(-1, faces.shape[2])
+    # Three of its corners tell a face of a conforming mesh, quadrilaterals included.
+    low, middle, high = np.sort(faces[:, : _FACE_CORNERS[mesh.cell_type]], axis=1)[:, :3].T
+    count = len(mesh.points)
+    _, first, counts = np.unique((low * count + middle) * count + high, return_index=True, return_counts=True)
+    if counts.max() > 2:
+        raise ProblemError("a face of the mesh belongs to more than two cells")
+    return faces[np.sort(first[counts == 1])]
+
+
+_TET10_FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
+_HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+_CELL_FACES = {"tet4": TET_FACES, "tet10": _TET10_FACES, "hex8": _HEX_FACES}
+_FACE_CORNERS = {"tet4": 3, "tet10": 3, "hex8": 4}
+
+
+def to_tet10(mesh: Mesh) -> Mesh:
+    """A straight-sided tet10 mesh from a tet4 mesh; the corner nodes keep their numbers.
+
+    A mid-edge node joins a node set when it lies on a boundary face whose three corners are in the set.
+    """
+    if mesh.cell_type != "tet4":
+        raise ProblemError(f"only tet4 meshes can be promoted to tet10, not {mesh.cell_type}")
+    count = len(mesh.points)
+    ends = np.sort(mesh.cells[:, TET10_EDGES], axis=2)
+    keys, inverse = np.unique(ends[..., 0] * count + ends[..., 1], return_inverse=True)
+    edges = np.stack(np.divmod(keys, count), axis=1)
+
+    def with_mid_nodes(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+        pairs = np.sort(faces[:, TRI6_EDGES], axis=2)
+        middle = count + np.searchsorted(keys, pairs[..., 0] * count + pairs[..., 1])
+        return np.hstack([faces, middle])
+
+    boundary = with_mid_nodes(boundary_faces(mesh))
+    return replace(
+        mesh,
+        points=np.vstack([mesh.points, mesh.points[edges].mean(axis=1)]),
+        cells=np.hstack([mesh.cells, count + inverse.reshape(-1, 6)]),
+        cell_type="tet10",
+        node_sets={name: _promoted_set(nodes, boundary) for name, nodes in mesh.node_sets.items()},
+        face_sets={name: with_mid_nodes(faces) for name, faces in mesh.face_sets.items()},
+    )
+
+
+def _promoted_set(nodes: NDArray[np.int64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:
+    inside = np.isin(boundary[:, :3], nodes).all(axis=1)
+    return np.union1d(nodes, boundary[inside, 3:].ravel()).astype(np.int64)
+
+
+_VTK_NAMES = {number: name for name, number in VTK_CELL.items()} | {
+    1: "", 2: "", 3: "", 4: "", 5: "", 6: "", 7: "", 8: "", 9: "", 21: "", 22: "", 23: "", 28: "",
+    11: "voxels", 13: "wedges", 14: "pyramids", 25: "quadratic hexahedra", 29: "quadratic hexahedra",
+}  # fmt: skip
+_MESHIO_NAMES = {"tetra": "tet4", "tetra10": "tet10", "hexahedron": "hex8"} | dict.fromkeys(
+    ("vertex", "line", "line3", "triangle", "triangle6", "quad", "quad8", "quad9"), ""
+)
+_MESHIO_REGIONS = ("gmsh:physical", "medit:ref", "region")
+# The same cell with its corners the other way round.
+_TURNED = {
+    "tet4": [0, 2, 1, 3],
+    "tet10": [0, 2, 1, 3, 6, 5, 4, 7, 9, 8],
+    "hex8": [4, 5, 6, 7, 0, 1, 2, 3],
+}
+
+
+def _one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]]:
+    """The one supported kind of volume cells among named blocks, and its cells; surfaces are named ``""``."""
+    solid: dict[str, list[Any]] = {}
+    for name, cells in blocks:
+        if name and len(cells):
+            solid.setdefault(name, []).append(np.asarray(cells))
+    if not solid:
+        raise ProblemError("the mesh has no volume cells", remedy="mesh the inside, not the surface alone")
+    if len(solid) > 1 or not solid.keys() <= CELL_NODES.keys():
+        raise ProblemError(
+            f"the mesh has {' and '.join(sorted(solid))}, not one kind of tetrahedra or linear hexahedra",
+            remedy="make tetrahedra of it, in pyvista by grid.triangulate()",
+        )
+    ((kind, cells),) = solid.items()
+    return kind, np.concatenate(cells).astype(np.int64)
+
+
+def _cell_array(data: Mapping[str, Any], name: str) -> Any:
+    if name not in data:
+        known = ", ".join(map(str, data)) or "none"
+        raise ProblemError(f"no cell data {name!r}", remedy=f"there is {known}")
+    return data[name]
+
+
+def _from_arrays(
+    points: NDArray[np.float64],
+    cells: NDArray[Any],
+    regions: ArrayLike | None,
+    names: Mapping[int, str] | None,
+) -> Mesh:
+    width = cells.shape[1] if cells.ndim == 2 else 0
+    kinds = {n: kind for kind, n in CELL_NODES.items()}
+    if width not in kinds or not len(cells):
+        raise ProblemError(
+            f"cells have shape {cells.shape}, not (m, 4), (m, 10) or (m, 8)",
+            remedy="give tetrahedra or linear hexahedra",
+        )
+    if cells.min() < 0 or cells.max() >= len(points):
+        raise ProblemError("cells name nodes that do not exist", remedy="count nodes from 0")
+    numbers, tissues = _tissues(regions, len(cells), names or {})
+    used, inverse = np.unique(cells, return_inverse=True)
+    mesh = Mesh(points[used], inverse.reshape(cells.shape), kinds[width], numbers, tissues)
+    turned = cell_volumes(mesh) < 0.0
+    mesh.cells[turned] = mesh.cells[turned][:, _TURNED[mesh.cell_type]]
+    check(mesh)
+    return mesh
+
+
+def _tissues(
+    regions: ArrayLike | None, count: int, names: Mapping[int, str]
+) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """The number of each cell's tissue (m,) and the tissues, in the order of their names or numbers."""
+    if regions is None:
+        return np.zeros(count, dtype=np.int64), ("tissue",)
+    values = np.asarray(regions)
+    if values.shape != (count,):
+        raise ProblemError(f"regions have shape {values.shape}, not one for each of {count} cells")
+    kinds, numbers = np.unique(values, return_inverse=True)
+    if values.dtype.kind in "US":
+        return numbers.astype(np.int64), tuple(map(str, kinds))
+    if not np.array_equal(kinds, np.round(kinds)):
+        raise ProblemError("regions are neither names nor whole numbers")
+    return numbers.astype(np.int64), tuple(names.get(int(k), f"region {int(k)}") for k in kinds)
+
+
+def _extent(points: NDArray[np.float64]) -> str:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return ", ".join(f"{axis} {a:g} to {b:g} mm" for axis, a, b in zip("xyz", low, high))

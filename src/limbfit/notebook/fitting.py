@@ -1,0 +1,238 @@
+"""Tissue parameters from measured curves of one's own problems, with what the curves cannot tell of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from functools import cached_property
+from typing import cast
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import ProblemError
+from ..fe import Material, Problem, StepControl, System
+from ..fe import solve as simulate
+from ..identify import (
+    CalibrationSettings,
+    Measured,
+    SiteResponse,
+    Uncertainty,
+    Unknowns,
+    error_percent,
+    estimate_uncertainty,
+    separate,
+)
+from ..identify import calibrate as search
+from .solution import Solution, announce_compilation, solve
+
+Array = NDArray[np.float64]
+Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s, force (n,) N
+WIDEST = 100.0  # of default bounds, over the start
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fitted parameters, by ``region.parameter``; mm, N, s, MPa.
+
+    ``problems`` have the fitted materials; ``error_percent`` is the mean difference of each curve over its
+    largest force. ``converged`` and ``reason`` say how the search ended.
+    """
+
+    parameters: Mapping[str, float]
+    error_percent: tuple[float, ...]
+    converged: bool
+    reason: str
+    simulations: int
+    problems: tuple[Problem, ...]
+    curves: tuple[tuple[Array, Array], ...]
+    responses: tuple[SiteResponse, ...]
+    unknowns: Unknowns
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """What the curves tell: 95 % intervals, verdicts, correlations.
+
+        Noise is taken from how neighbouring differences scatter, smooth misfit from their size.
+        """
+        measured = _measured(self.curves)
+        best = np.array(list(self.parameters.values()))
+        return estimate_uncertainty(best, self.responses, measured, self.unknowns)
+
+    def table(self) -> str:
+        """Parameters, 95 % intervals and verdicts as text."""
+        known = self.uncertainty
+        rows = [("parameter", "value", "95 % interval", "")]
+        for name, value, (low, high), verdict in zip(
+            known.names, self.parameters.values(), known.intervals_95, known.verdicts, strict=True
+        ):
+            rows.append((name, f"{value:.4g}", f"{low:.4g} to {high:.4g}", verdict))
+        widths = [max(len(row[k]) for row in rows) for k in range(4)]
+        return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows)
+
+    def solve(self, number: int = 0) -> Solution:
+        """Simulate a problem with what was found."""
+        return solve(self.problems[number])
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the curves as measured (dots) and as fitted (lines) over time."""
+        if axes is None:
+            axes = Figure(figsize=(5, 4), layout="constrained").subplots()
+        for number, ((times, force), response) in enumerate(zip(self.curves, self.responses, strict=True)):
+            axes.plot(times, force, ".", color=f"C{number}", label=f"curve {number + 1}")
+            axes.plot(times, response.force_N, color=f"C{number}")
+        axes.set(xlabel="time, s", ylabel="force, N")
+        axes.legend()
+        return axes
+
+
+def calibrate(
+    problems: Problem | Sequence[Problem],
+    curves: Curve | Sequence[Curve],
+    start: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    steps: StepControl | None = None,
+    listener: Callable[[str], None] | None = None,
+) -> Fit:
+    """Fit parameters of tissues to measured forces, with exact derivatives of the solver.
+
+    Parameters
+    ----------
+    problems, curves : for each problem the times (n,) s and forces (n,) N that were measured; all curves
+        count alike, whatever their size or number of points.
+    start : where the search begins, by ``region.parameter`` as in ``problem.parameter_names``
+        (``"skin.c"``, MPa); all other parameters stay as the problems have them.
+    bounds : smallest and largest value of some of them; by default a hundredth of the start and a hundred
+        times it.
+    steps : how simulations step; the contact penalty is that of the first one throughout.
+    listener : called with one line for each simulation of all problems.
+
+    Raises
+    ------
+    ProblemError
+        For parameters that the problems do not have, and curves that do not fit them.
+    CalibrationError
+        Where no simulation completes at the start.
+    """
+    cases = (problems,) if isinstance(problems, Problem) else tuple(problems)
+    given = _paired(cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves), cases)
+    unknowns = _unknowns(cases, start, bounds or {})
+    announce_compilation()
+    model = _Model(cases, given, unknowns.names, steps or StepControl(), listener)
+    measured = _measured(given)
+    found = search(model, measured, unknowns, CalibrationSettings(), stages=[separate(unknowns.names)])
+    names, best = unknowns.names, found.parameters
+    return Fit(
+        parameters=dict(zip(names, best.tolist(), strict=True)),
+        error_percent=tuple(
+            error_percent(r.force_N, one.force_N) for r, one in zip(found.responses, measured, strict=True)
+        ),
+        converged=found.stages[-1].converged,
+        reason=found.stages[-1].reason,
+        simulations=found.evaluations * len(cases),
+        problems=tuple(with_parameters(case, dict(zip(names, best, strict=True))) for case in cases),
+        curves=given,
+        responses=tuple(found.responses),
+        unknowns=unknowns,
+    )
+
+
+def with_parameters(problem: Problem, values: Mapping[str, float]) -> Problem:
+    """The problem with other values of its parameters, by ``region.parameter``."""
+    materials = dict(problem.materials)
+    for name, value in values.items():
+        region, parameter = name.rsplit(".", 1)
+        if region in materials:
+            materials[region] = replace(materials[region], **{parameter: float(value)})  # type: ignore[type-var]
+    return problem.with_materials(materials)
+
+
+class _Model:
+    """Forces and derivatives of all problems at the free parameters (p,)."""
+
+    def __init__(
+        self,
+        problems: tuple[Problem, ...],
+        curves: tuple[tuple[Array, Array], ...],
+        names: tuple[str, ...],
+        steps: StepControl,
+        listener: Callable[[str], None] | None,
+    ) -> None:
+        self.problems, self.curves, self.names, self.listener = problems, curves, names, listener
+        self.systems = [System(problem, steps.threads) for problem in problems]
+        self.steps = [steps] * len(problems)
+        self.calls = 0
+
+    def __call__(self, parameters: Array) -> list[SiteResponse]:
+        self.calls += 1
+        values = dict(zip(self.names, parameters, strict=True))
+        answers = [self._one(k, values) for k in range(len(self.problems))]
+        if self.listener is not None:
+            told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+            self.listener(f"simulation {self.calls}: {told}")
+        return answers
+
+    def _one(self, number: int, values: Mapping[str, float]) -> SiteResponse:
+        problem, (times, _) = with_parameters(self.problems[number], values), self.curves[number]
+        found = simulate(problem, self.steps[number], sensitivities=True, system=self.systems[number])
+        if not self.steps[number].hold_penalty and found.completed:
+            penalty = found.statistics["penalty_per_mm"]
+            self.steps[number] = replace(self.steps[number], penalty=penalty, hold_penalty=True)
+        known = [f"{region}.{parameter}" for region, parameter in found.parameter_names]
+        full = found.sensitivity_at(times)
+        absent = np.zeros(len(times))
+        columns = [full[:, known.index(name)] if name in known else absent for name in self.names]
+        force, kinds = found.force_at(times), {doubt.kind: doubt.text for doubt in found.doubts}
+        return SiteResponse(
+            force, np.stack(columns, axis=1), found.completed, found.reason, f"curve {number + 1}",
+            found.warnings, kinds.get("slipped", ""), kinds.get("folded", ""),
+        )  # fmt: skip
+
+
+def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple[Array, Array], ...]:
+    if len(curves) != len(problems):
+        raise ProblemError(f"{len(curves)} curves for {len(problems)} problems", remedy="give one for each")
+    found = []
+    for number, (curve, problem) in enumerate(zip(curves, problems), start=1):
+        times, force = (np.asarray(values, dtype=float) for values in curve)
+        end = float(problem.history.times[-1])
+        if times.ndim != 1 or times.shape != force.shape or not (np.diff(times) > 0).all():
+            raise ProblemError(
+                f"curve {number} has times {times.shape} and forces {force.shape}",
+                remedy="give (times, forces), both (n,), times growing",
+            )
+        if times[0] < 0.0 or times[-1] > end * (1.0 + 1e-9):
+            raise ProblemError(
+                f"curve {number} lasts from {times[0]:g} to {times[-1]:g} s, the indentation to {end:g} s",
+                remedy="count time from touch-down, and cut what lies outside",
+            )
+        found.append((times, force))
+    return tuple(found)
+
+
+def _unknowns(
+    problems: Sequence[Problem], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> Unknowns:
+    known = {f"{r}.{p}": one.materials[r] for one in problems for r, p in one.parameter_names}
+    for name in (*start, *bounds):
+        if name not in known:
+            raise ProblemError(f"no parameter {name!r}", remedy=f"there are {', '.join(known)}")
+        if not _can_replace(known[name], name.rsplit(".", 1)[1]):
+            raise ProblemError(f"{name!r} is no field of {type(known[name]).__name__}", remedy="use OgdenQLV")
+    if not start or not bounds.keys() <= start.keys():
+        raise ProblemError("a parameter to be fitted has no start", remedy="name each in start")
+    values = np.array([float(value) for value in start.values()])
+    limits = [bounds.get(name, (value / WIDEST, value * WIDEST)) for name, value in start.items()]
+    low, high = np.array(limits, dtype=float).T
+    return Unknowns(tuple(start), values, low, high)
+
+
+def _can_replace(material: Material, parameter: str) -> bool:
+    return is_dataclass(material) and parameter in material.__dataclass_fields__
+
+
+def _measured(curves: Sequence[tuple[Array, Array]]) -> list[Measured]:
+    return [Measured(f"curve {k + 1}", force) for k, (_, force) in enumerate(curves)]

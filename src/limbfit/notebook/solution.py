@@ -1,0 +1,115 @@
+"""A simulation that shows itself: its curve as a plot, its steps as grids of pyvista."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pyvista as pv
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..errors import ProblemError
+from ..fe import Problem, Result, State, Step, StepControl, System
+from ..fe import solve as simulate
+from ..fe.history import Memory
+from ..fe.kernel.assembly import is_compiled
+from ..fe.kernel.laws import Laws
+from ..fields import state_fields
+from ..mesh import VTK_CELL
+
+COMPILING = "limbfit compiles its kernels: half a minute, once on this machine"
+
+
+@dataclass(frozen=True, repr=False)
+class Solution(Result):
+    """A `Result` that shows itself; ``frames`` are rest and every step, stresses included."""
+
+    frames: tuple[State, ...] = ()
+
+    def __repr__(self) -> str:
+        ended = "complete" if self.completed else f"incomplete: {self.reason}"
+        steps, end = len(self.times) - 1, self.times[-1]
+        return f"<Solution: {steps} steps to {end:g} s, {self.peak_force:.3g} N at most, {ended}>"
+
+    def to_pyvista(self, step: int | None = None) -> pv.UnstructuredGrid:
+        """The mesh at rest with the fields of a step; ``grid.warp_by_vector("displacement_mm")`` moves it.
+
+        ``step``: 0 is rest, -1 the last; by default the deepest of the loading. Fields and units are those of
+        ``docs/fields.md``: stress, stretch, contact pressure.
+        """
+        if step is None:
+            frame = self.deepest
+        else:
+            frame = self.frames[step] if -len(self.frames) <= step < len(self.frames) else None
+        if frame is None:
+            has = f"there are {len(self.frames)}" if self.frames else "it was solved without frames"
+            raise ProblemError(f"no step {step}: {has}", remedy="count from 0, which is rest")
+        mesh = self.problem.mesh
+        grid = pv.UnstructuredGrid({VTK_CELL[mesh.cell_type]: mesh.cells}, mesh.points)
+        system = self.system or System(self.problem)
+        point_data, cell_data = state_fields(system, self.problem, frame)
+        for data, arrays in ((grid.point_data, point_data), (grid.cell_data, cell_data)):
+            for name, values in arrays.items():
+                data[name] = values
+        grid.cell_data["region"] = mesh.regions
+        return grid
+
+    def plot(self, axes: Axes | None = None, label: str = "") -> Axes:
+        """Draw force (N) against displacement (mm), on new axes where none are given."""
+        if axes is None:
+            axes = Figure(figsize=(5, 4), layout="constrained").subplots()
+        times = np.linspace(0.0, self.times[-1], 400)
+        axes.plot(self.problem.history.at(times), self.force_at(times), label=label or "simulated")
+        axes.plot(self.displacement, self.force, ".", color=axes.lines[-1].get_color())
+        axes.set(xlabel="displacement, mm", ylabel="force, N")
+        return axes
+
+
+def solve(
+    problem: Problem,
+    steps: StepControl | None = None,
+    *,
+    sensitivities: bool = False,
+    frames: bool = True,
+    listener: Callable[[Step], None] | None = None,
+) -> Solution:
+    """Simulate an indentation.
+
+    Parameters
+    ----------
+    steps : how it steps, and on how many threads; the defaults need no change.
+    sensitivities : also the derivative of the force with respect to every material parameter.
+    frames : keep every step with its stresses, for `Solution.to_pyvista`; without, the deepest alone.
+    listener : called with every step.
+
+    Raises
+    ------
+    ProblemError
+        Before anything is solved, where the problem is impossible as stated. A simulation that cannot go on
+        is no error: the solution says ``completed = False`` and why.
+    """
+    announce_compilation()
+    kept: list[State] = []
+
+    def keep(step: Step) -> None:
+        if frames:
+            kept.append(step.state)
+        if listener is not None:
+            listener(step)
+
+    found = simulate(problem, steps or StepControl(), sensitivities=sensitivities, on_step=keep)
+    if frames:
+        laws = Laws.build([problem.materials[region] for region in problem.mesh.region_names])
+        memory = Memory.rest(found.system, laws)
+        rest = np.zeros_like(problem.mesh.points)
+        kept.insert(0, State(0.0, float(problem.history.at(0.0)), rest, 0.0, memory=memory))
+    return Solution(**{f.name: getattr(found, f.name) for f in fields(Result)}, frames=tuple(kept))
+
+
+def announce_compilation() -> None:
+    """Say so on standard error where the kernels are not compiled yet: a first run seems to hang."""
+    if not is_compiled():
+        sys.stderr.write(COMPILING + "\n")

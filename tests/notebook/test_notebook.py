@@ -1,0 +1,184 @@
+"""Own meshes, solutions that show themselves, and own curves fitted, as a notebook has them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import meshio
+import numpy as np
+import pytest
+import pyvista as pv
+
+import limbfit
+from limbfit import History, Indenter, Mesh, OgdenQLV, Problem, StepControl
+from limbfit.errors import ProblemError
+from limbfit.fe import solve
+from limbfit.mesh import cell_volumes, to_tet10
+
+TISSUE = OgdenQLV(c=0.005, m=4.0, gamma=1.0, tau=0.6)
+RAMP = History([0.0, 2.0, 4.0], [0.0, 2.0, 0.0])
+STEPS = StepControl(load_steps=4, unload_steps=3)
+
+
+def block(divisions: int = 5) -> pv.UnstructuredGrid:
+    """30 x 30 x 12 mm of hexahedra, top at z = 0; the upper third is skin."""
+    side, depth = np.linspace(-15.0, 15.0, divisions), np.linspace(-12.0, 0.0, 4)
+    grid = pv.RectilinearGrid(side, side, depth).cast_to_unstructured_grid()
+    cells = grid.cells.reshape(-1, 9)[:, 1:]
+    if grid.celltypes[0] == 11:  # voxels to hexahedra
+        cells = cells[:, [0, 1, 3, 2, 4, 5, 7, 6]]
+    found = pv.UnstructuredGrid({12: cells}, grid.points)
+    found.cell_data["tissue"] = np.where(found.cell_centers().points[:, 2] > -4.0, "skin", "muscle")
+    return found
+
+
+def problem_of(mesh: Mesh, **materials) -> Problem:
+    bottom, top = mesh.nodes_where(lambda p: p[:, 2] < -11.9), mesh.faces_where(lambda p: p[:, 2] > -0.1)
+    punch = Indenter("sphere", width=20.0, centre=(0, 0, 0), axis=(0, 0, -1))
+    known = {region: materials.get(region, TISSUE) for region in mesh.region_names}
+    return Problem(mesh, known, bottom, top, punch, RAMP)
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return limbfit.solve(problem_of(Mesh.from_pyvista(block(), "tissue")), STEPS, sensitivities=True)
+
+
+def test_a_pyvista_grid_becomes_a_mesh_with_its_tissues():
+    mesh = Mesh.from_pyvista(block(), "tissue")
+    assert mesh.cell_type == "hex8"
+    assert mesh.region_names == ("muscle", "skin")
+    assert cell_volumes(mesh).sum() == pytest.approx(30 * 30 * 12)
+    assert cell_volumes(mesh)[mesh.regions == 1].sum() == pytest.approx(30 * 30 * 4)
+
+
+def test_surfaces_beside_the_cells_and_points_of_no_cell_are_left_out():
+    grid = block().triangulate()
+    shell = pv.UnstructuredGrid({5: np.array([[0, 1, 2]])}, grid.points)
+    both = grid.merge(shell, merge_points=False)
+    mesh = Mesh.from_pyvista(both)
+    assert mesh.cell_type == "tet4"
+    assert len(mesh.cells) == grid.n_cells
+    more = np.vstack([mesh.points, [[99.0, 99.0, 99.0]]])
+    assert len(Mesh.from_arrays(more, mesh.cells).points) == len(mesh.points)
+
+
+@pytest.mark.parametrize("kind", ["tet4", "tet10", "hex8"])
+def test_cells_that_run_the_other_way_round_are_turned(kind):
+    mesh = Mesh.from_pyvista(block() if kind == "hex8" else block().triangulate())
+    mesh = to_tet10(mesh) if kind == "tet10" else mesh
+    mirrored = Mesh.from_arrays(mesh.points * [1.0, 1.0, -1.0], mesh.cells)
+    assert (cell_volumes(mirrored) > 0).all()
+    assert np.sort(cell_volumes(mirrored)) == pytest.approx(np.sort(cell_volumes(mesh)))
+    if kind == "tet10":  # every mid-edge node still lies between its own corners
+        ends = mirrored.points[mirrored.cells[:, [[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]]]]
+        assert mirrored.points[mirrored.cells[:, 4:]] == pytest.approx(ends.mean(axis=2))
+
+
+def test_a_gmsh_file_read_by_meshio_keeps_its_named_groups(tmp_path):
+    grid = block().triangulate()
+    numbers = np.where(grid.cell_centers().points[:, 2] > -4.0, 7, 3)
+    cells = [("triangle", np.array([[0, 1, 2]])), ("tetra", grid.cells_dict[10])]
+    data = {"gmsh:physical": [np.array([1]), numbers], "gmsh:geometrical": [np.array([1]), numbers]}
+    groups = {"skin": np.array([7, 3]), "muscle": np.array([3, 3]), "top": np.array([1, 2])}
+    file = tmp_path / "block.msh"
+    meshio.Mesh(grid.points, cells, cell_data=data, field_data=groups).write(file, file_format="gmsh22")
+    mesh = Mesh.from_meshio(meshio.read(file))
+    assert mesh.region_names == ("muscle", "skin")
+    assert cell_volumes(mesh)[mesh.regions == 1].sum() == pytest.approx(30 * 30 * 4)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Mesh.from_pyvista(pv.Sphere().cast_to_unstructured_grid()), "no volume cells"),
+        (lambda: Mesh.from_pyvista(pv.UnstructuredGrid({13: np.arange(6)}, np.eye(6, 3))), "wedges"),
+        (lambda: Mesh.from_pyvista(block(), "label"), "no cell data 'label'.*there is tissue"),
+        (lambda: Mesh.from_arrays(np.zeros((4, 3)), [[0, 1, 2]]), r"shape \(1, 3\)"),
+        (lambda: Mesh.from_arrays(np.eye(4, 3), [[1, 2, 3, 4]]), "count nodes from 0"),
+        (lambda: Mesh.from_arrays(np.zeros((4, 3)), [[0, 1, 2, 3]]), "inverted"),
+        (lambda: Mesh.from_arrays(np.eye(4, 3), [[0, 1, 2, 3]], [1, 2]), "one for each of 1"),
+        (lambda: Mesh.from_pyvista(block()).nodes_where(lambda p: p[:, 2] > 5), "z -12 to 0 mm"),
+        (lambda: Mesh.from_pyvista(block()).faces_where(lambda p: p[:, 2] == -4.0), "no boundary face"),
+    ],
+)
+def test_what_is_no_mesh_is_refused_with_a_remedy(make, text):
+    with pytest.raises(ProblemError, match=text):
+        make()
+
+
+def test_a_solution_is_a_result_and_a_grid_of_every_step(solution):
+    assert solution.completed
+    assert solution.force == pytest.approx(
+        solve(solution.problem, STEPS).force, abs=1e-4 * solution.peak_force
+    )
+    deepest, rest, last = solution.to_pyvista(), solution.to_pyvista(0), solution.to_pyvista(-1)
+    assert -4.0 < deepest["displacement_mm"][:, 2].min() < -1.9
+    assert not rest["displacement_mm"].any()
+    assert deepest["contact_pressure_kPa"].max() > 1.0
+    assert last["contact_pressure_kPa"].max() == 0.0
+    assert {"cauchy_kPa", "largest_stretch", "region"} <= set(deepest.cell_data.keys())
+    assert deepest["von_mises_kPa"].max() > 5 * last["von_mises_kPa"].max()
+    assert len(solution.frames) == len(solution.times)
+    assert repr(solution) == f"<Solution: {len(solution.times) - 1} steps to 4 s, {solution.peak_force:.3g} N at most, complete>"
+    with pytest.raises(ProblemError, match="no step 99"):
+        solution.to_pyvista(99)
+
+
+def test_the_plot_shows_the_curve_with_units(solution):
+    axes = solution.plot()
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("displacement, mm", "force, N")
+    curve, points = axes.lines
+    assert curve.get_ydata().max() == pytest.approx(solution.peak_force, rel=1e-2)
+    assert len(points.get_xdata()) == len(solution.times)
+
+
+def test_own_curves_tell_their_tissue_and_how_well(solution):
+    """From a record made on finer steps, with noise: the truth within every interval."""
+    skin = replace(TISSUE, c=0.012)
+    true = problem_of(solution.problem.mesh, skin=skin)
+    times = np.linspace(0.05, 4.0, 60)
+    record = limbfit.solve(true, StepControl(load_steps=16, unload_steps=16), frames=False).force_at(times)
+    noisy = record + 0.01 * record.max() * np.random.default_rng(1).standard_normal(60)
+    said: list[str] = []
+    start = {"skin.c": 0.005, "skin.gamma": 2.0}
+    fit = limbfit.calibrate(solution.problem, (times, noisy), start, listener=said.append)
+    assert fit.converged, fit.reason
+    assert len(said) == fit.simulations
+    assert fit.error_percent[0] < 1.5
+    for value, (low, high) in zip((skin.c, skin.gamma), fit.uncertainty.intervals_95, strict=True):
+        assert low < value < high
+    assert fit.parameters["skin.c"] == pytest.approx(skin.c, rel=0.1)
+    assert fit.problems[0].materials["skin"].c == fit.parameters["skin.c"]
+    assert fit.problems[0].materials["muscle"] == TISSUE
+    assert "skin.gamma" in fit.table()
+    assert fit.plot().get_ylabel() == "force, N"
+
+
+@pytest.mark.parametrize(
+    ("start", "bounds", "times", "text"),
+    [
+        ({"skin.k": 1.0}, {}, [0.0, 4.0], "no parameter 'skin.k'.*skin.c"),
+        ({"skin.c": 1.0}, {"skin.m": (1, 2)}, [0.0, 4.0], "has no start"),
+        ({"skin.c": 1.0}, {"skin.c": (2, 3)}, [0.0, 4.0], "skin.c"),
+        ({"skin.c": 1.0}, {}, [0.0, 9.0], "cut what lies outside"),
+        ({"skin.c": 1.0}, {}, [0.0, 2.0, 4.0], r"both \(n,\)"),
+    ],
+)
+def test_a_fit_that_cannot_be_meant_is_refused(solution, start, bounds, times, text):
+    with pytest.raises(ProblemError, match=text):
+        limbfit.calibrate(solution.problem, (times, [0.0, 1.0]), start, bounds)
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_first_compilation_is_announced(solution, tmp_path, warm):
+    """Where nothing is compiled yet a first run seems to hang."""
+    code = "from limbfit.notebook.solution import announce_compilation; announce_compilation()"
+    environment = dict(os.environ) if warm else {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    shown = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
+    assert ("compiles" in shown.stderr) is not warm
