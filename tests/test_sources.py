@@ -56,9 +56,10 @@ def test_it_is_no_wider():
         return {file for file in names(name) if file.startswith(rooms)}
 
     mechanics = ("fe/", "identify/", "indentation", "report/", "phantom/")
-    assert not within("segment", *mechanics, "traces/", "anatomy/meshing", "anatomy/layer")
+    assert within("segment", *mechanics, "traces/", "anatomy/meshing") == {"report/drawing/sheet.py"}
+    amputation = {f"anatomy/segmentation/{part}.py" for part in ("__init__", "amputation", "voxels")}
     for name in ("surfaces", "sites", "mesh"):
-        assert not within(name, *mechanics, "anatomy/segmentation")
+        assert within(name, *mechanics, "anatomy/segmentation") <= amputation
     assert not within("sites", "anatomy/meshing")
     assert not within("traces", "anatomy/", "report/", "phantom/")
     assert not within("calibrate", "report/", "phantom/", "anatomy/segmentation")
@@ -67,11 +68,11 @@ def test_it_is_no_wider():
 
 
 def test_it_holds_what_lists_by_hand_forgot():
-    assert "identify/parameters.py" in names("design")
+    assert "identify/fit/parameters.py" in names("design")
     assert "bench/blocks.py" in names("cube")
     web = {"web/static/viewer.js", "web/static/web.css", "web/static/vendor/three.min.js"}
     assert web | {"report/templates/report.css", "report/templates/blocks.html.j2"} <= names("report")
-    assert {"anatomy/_mmg_worker.py", "anatomy/_worker.py"} <= names("mesh")
+    assert {"anatomy/meshing/_mmg_worker.py", "anatomy/meshing/_worker.py"} <= names("mesh")
 
 
 DIGESTS = """
@@ -102,6 +103,6 @@ def test_a_changed_file_changes_what_it_decides_and_nothing_else(tmp_path):
         return {stage for stage, value in digests().items() if value != before[stage]}
 
     assert changed_by("report/templates/report.css", "/* */\n") == {"report", "cube"}
-    meshed = changed_by("anatomy/smoothing.py", "\n# a remark\n")
+    meshed = changed_by("anatomy/meshing/smoothing.py", "\n# a remark\n")
     assert "mesh" in meshed
     assert not meshed & {"segment", "surfaces", "sites", "traces", "calibrate", "predict", "report"}

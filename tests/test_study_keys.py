@@ -157,9 +157,9 @@ ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
 }
 # Of no stage: what reads them instead.
 READ: dict[str, str] = {
-    **dict.fromkeys(("solver.solver", "febio.program", "febio.penalty"), "pipeline/simulate.py"),
-    **dict.fromkeys(("febio.threads", "febio.time_limit_s"), "pipeline/simulate.py"),
-    **{key: "pipeline/context.py" for key in KEYS if key.startswith("execution.")},
+    **dict.fromkeys(("solver.solver", "febio.program", "febio.penalty"), "pipeline/verbs/simulate.py"),
+    **dict.fromkeys(("febio.threads", "febio.time_limit_s"), "pipeline/verbs/simulate.py"),
+    **{key: "pipeline/shared/context.py" for key in KEYS if key.startswith("execution.")},
     **{key: "acquire/" for key in KEYS if key.startswith("acquire.")},
     "acquire.key_gap_ms": "cli/acquire.py",
     **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},

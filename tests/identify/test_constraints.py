@@ -18,12 +18,12 @@ from limbfit.identify import (
     SiteResponse,
     calibrate,
     constrained,
+    multistart,
     random_starts,
     separate,
     shared,
     two_stages,
 )
-from limbfit.identify.fit import multistart
 from limbfit.identify.fit.multistart import describe
 
 GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
