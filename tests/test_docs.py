@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import limbfit
+from limbfit.cli.reference import command_page
 from limbfit.study import Study
 
 ROOT = Path(__file__).parents[1]
@@ -93,6 +94,22 @@ def python_in(page: str) -> list[str]:
 def test_python_of_the_pages_runs(page: str) -> None:
     for code in python_in(page):
         exec(compile(code, page, "exec"), {"__name__": "example"})
+
+
+def test_the_page_of_commands_is_what_they_say() -> None:
+    """Made anew by  python -m limbfit.cli.reference > docs/commands.md"""
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == command_page()
+
+
+def test_every_page_is_in_the_site() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8").splitlines()
+    assert {page.stem for page in (ROOT / "docs").glob("*.md")} - {"index"} <= set(index)
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"limbfit\.(\w+)", text)) | {"InputError", "LimbfitError", "__version__"}
+    assert set(limbfit.__all__) <= named
 
 
 def test_python_of_the_readme_runs(study: Path, coarse_settings: str) -> None:
