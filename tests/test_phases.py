@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit.fe import History
-from limbfit.fe.solution.stepping import StepControl, schedule
+from limbfit.fe.solution.control import StepControl, schedule
 from limbfit.phases import boundaries, find_phases, in_words, loading_end
 
 

@@ -9,7 +9,8 @@ from blocks import block
 from limbfit.fe import ELEMENTS, History, OgdenQLV, Problem, Support, System
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import element_fields
-from limbfit.fe.solution.stepping import StepControl, iterate
+from limbfit.fe.solution.control import StepControl
+from limbfit.fe.solution.stepping import iterate
 from limbfit.fe.system import Increment
 
 NAMES = sorted(ELEMENTS)

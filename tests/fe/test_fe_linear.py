@@ -16,7 +16,7 @@ from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.solution.factor import Factor
 from limbfit.fe.solution.linear import SOLVERS, NotPositiveDefiniteError, linear_solver, symmetric_product
 from limbfit.fe.solution.multigrid import Multigrid
-from limbfit.fe.solution.stepping import Simulation
+from limbfit.fe.solution.simulation import Simulation
 
 
 def system(n: int = 200) -> tuple[sp.csr_matrix, np.ndarray]:

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, StepControl, iterate, solve
-from limbfit.fe.solution.stepping import schedule
+from limbfit.fe.solution.control import schedule
 
 
 @pytest.fixture(scope="module")

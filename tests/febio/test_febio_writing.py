@@ -12,7 +12,7 @@ import pytest
 from limbfit.bench.blocks import punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, Ogden, OgdenQLV, RigidSurface, StepControl, System, solve
-from limbfit.fe.solution.stepping import schedule
+from limbfit.fe.solution.control import schedule
 from limbfit.febio import (
     FebSettings,
     Range,

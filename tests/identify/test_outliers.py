@@ -9,7 +9,8 @@ import pytest
 from bars import PAPER, TRUTH, Bars
 
 from limbfit.identify import Measured, calibrate
-from limbfit.identify.checks.outliers import FirstOrder, as_driven, find_outliers, leave_one_out, unit_of
+from limbfit.identify.checks.first_order import FirstOrder
+from limbfit.identify.checks.outliers import as_driven, find_outliers, leave_one_out, unit_of
 
 MISFIT = 0.03  # of amplitude and of shape, as a model's own error
 

@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from limbfit.report.tables import duration, fixed, flatten, number
+from limbfit.report.formats import duration, fixed, number
+from limbfit.report.tables import flatten
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..fe import History, StepControl
 from ..fe.history import Memory
 from ..fe.interpolation import interpolate
+from ..fe.solution.control import schedule
 from ..fe.solution.schedule import foresee
-from ..fe.solution.stepping import schedule
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,8 @@ from .kernel.elements import ELEMENTS
 from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from .problem import History, Problem, Support
 from .result import Result, State, Step
-from .solution.stepping import StepControl, iterate, solve
+from .solution.control import StepControl
+from .solution.stepping import iterate, solve
 from .system import System
 
 __all__ = [

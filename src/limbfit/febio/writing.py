@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError, RunError
 from ..fe import Material, Problem, StepControl, System
-from ..fe.solution.stepping import schedule
+from ..fe.solution.control import schedule
 from .faceting import Tool, blunt, tool_mesh
 from .model import Contact
 from .penalty import explicit_penalty, mean_stiffness

@@ -1,6 +1,6 @@
 """Identification: calibration, uncertainty and prediction on callables that are handed in."""
 
-from .fit.calibration import Calibration, CalibrationSettings, Iterate, StageResult, State, calibrate
+from .fit.calibration import calibrate
 from .fit.fidelity import Corrected, FidelitySettings, calibrate_corrected
 from .fit.multistart import Multistart, Started, multistart, random_starts
 from .fit.objective import Measured, SiteResponse
@@ -16,6 +16,7 @@ from .fit.parameters import (
     two_stages,
 )
 from .fit.prediction import Summary, error_percent, prediction_sd, summarise
+from .fit.state import Calibration, CalibrationSettings, Iterate, StageResult, State
 from .uncertainty.discrepancy import ResidualModel, estimate_discrepancy
 from .uncertainty.emulator import Emulator
 from .uncertainty.noise import SiteNoise, curve_noise, record_noise

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from .formats import NOTHING, duration, fixed, heading, number, numeric, vector
 from .page import Cell, Row, Table
 from .store import PARAMETERS, Json, Store
 
-NOTHING = "–"
 SYMBOLS = {"c_kPa": "c", "m": "m", "gamma": "γ", "tau_s": "τ"}
 UNITS = {"c_kPa": "kPa", "m": NOTHING, "gamma": NOTHING, "tau_s": "s"}
 MEANING = {
@@ -18,51 +18,6 @@ MEANING = {
     "tau_s": "relaxation time",
 }
 PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}  # where fat is no tissue of its own
-
-
-def number(value: Any, digits: int = 3) -> str:
-    """A number to so many significant digits, without an exponent where a person can do without."""
-    if not isinstance(value, int | float) or value != value:
-        return NOTHING
-    if value in (float("inf"), float("-inf")):
-        return "∞" if value > 0 else "−∞"
-    if value == 0 or 1e-3 <= abs(value) < 1e5:
-        text = f"{value:#.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}".replace(",", " ")
-        return text.rstrip(".").replace("-", "−")
-    return f"{value:.{digits - 1}e}".replace("-", "−")
-
-
-def fixed(value: Any, decimals: int = 1) -> str:
-    """A number to so many decimals."""
-    if not isinstance(value, int | float) or value != value:
-        return NOTHING
-    return f"{value:.{decimals}f}".replace("-", "−")
-
-
-def duration(seconds: Any) -> str:
-    """Seconds as a person says them."""
-    if not isinstance(seconds, int | float):
-        return NOTHING
-    if seconds < 90:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 90:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def vector(values: Any) -> str:
-    return ", ".join(fixed(value) for value in values) if values else NOTHING
-
-
-def numeric(text: str, share: float | None = None) -> Cell:
-    """A cell that holds a number."""
-    return Cell(text, number=True, share=share)
-
-
-def heading(text: str) -> Cell:
-    """The cell that a row begins with."""
-    return Cell(text, header=True)
 
 
 def interval(store: Store, tissue: str, name: str) -> list[float] | None:

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError
-from ..fit.calibration import CalibrationSettings, calibrate
+from ..fit.calibration import calibrate
 from ..fit.objective import Measured, Simulate, SiteResponse
 from ..fit.parameters import Unknowns, separate
 from ..fit.prediction import Summary, error_percent, summarise
+from ..fit.state import CalibrationSettings
 
 Array = NDArray[np.float64]
 Choice = tuple[int, ...]

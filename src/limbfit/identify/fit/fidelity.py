@@ -13,18 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import (
-    Calibration,
-    CalibrationSettings,
-    Iterate,
-    StageResult,
-    State,
-    calibrate,
-    iterate_at,
-)
+from .calibration import calibrate, iterate_at
 from .correction import CoarseToFine
 from .objective import Measured, Simulate, SiteResponse, check_responses, new_doubts
 from .parameters import Grouping, Unknowns, search_space, two_stages
+from .state import Calibration, CalibrationSettings, Iterate, StageResult, State
 from .trust_region import FIRST_RADIUS
 
 Array = NDArray[np.float64]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError
-from .calibration import Calibration
 from .parameters import Unknowns, search_space, shared
+from .state import Calibration
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration
 from .objective import Measured, Simulate
 from .parameters import Unknowns
 from .prediction import error_percent
+from .state import Calibration
 
 Array = NDArray[np.float64]
 Identify = Callable[[Unknowns], Calibration]

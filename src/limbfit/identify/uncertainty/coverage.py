@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtr
 
-from ..fit.calibration import CalibrationSettings, calibrate
+from ..fit.calibration import calibrate
 from ..fit.objective import Measured
 from ..fit.parameters import Unknowns, search_space, separate
+from ..fit.state import CalibrationSettings
 from .intervals import Kept, restated, sampled_uncertainty
 from .likelihood import Likelihood, StandIn
 from .noise import SiteNoise

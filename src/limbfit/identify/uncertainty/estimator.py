@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fit.calibration import CalibrationSettings
 from ..fit.objective import Measured, curvature
+from ..fit.state import CalibrationSettings
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
 
-from ..fit.calibration import CalibrationSettings
 from ..fit.objective import Measured, SiteResponse
 from ..fit.parameters import Grouping, Space, Unknowns, search_space, separate
+from ..fit.state import CalibrationSettings
 from .discrepancy import ResidualModel, estimate_discrepancy
 from .estimator import Estimator
 from .noise import SiteNoise, curve_noise

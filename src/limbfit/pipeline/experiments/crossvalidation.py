@@ -27,10 +27,10 @@ from ...identify.checks.crossvalidation import (
     without_regions,
 )
 from ...identify.checks.spread import spread_points
-from ...identify.fit.calibration import CalibrationSettings
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import error_percent
+from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
 from ...indentation import to_vector
 from ..shared.context import Context

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, StudyError
-from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.regions import Region, RegionFit, fit_regions, mean_percent
+from ...identify.fit.state import Calibration
 from ...indentation import flat_names, to_parameters, to_vector
 from ...study import Site
 from ..shared.context import Context

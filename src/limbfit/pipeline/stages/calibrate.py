@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import StudyError
-from ...identify.fit.calibration import Calibration
 from ...identify.fit.fidelity import Round
 from ...identify.fit.multistart import Multistart, describe, multistart
 from ...identify.fit.parameters import Unknowns
+from ...identify.fit.state import Calibration
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters, flat_names, to_parameters
 from ..shared.context import Context

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...fe import Doubt
-from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import SiteResponse
+from ...identify.fit.state import Calibration
 from ...indentation import Simulation
 
 

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RunError
-from ...identify.fit.calibration import Calibration, CalibrationSettings, State, calibrate
+from ...identify.fit.calibration import calibrate
 from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
+from ...identify.fit.state import Calibration, CalibrationSettings, State
 from ...identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.checks.outliers import Exchange, FirstOrder, as_driven, find_outliers
+from ...identify.checks.first_order import FirstOrder
+from ...identify.checks.outliers import Exchange, as_driven, find_outliers
 from ...identify.checks.plausibility import explained
 from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.objective import Measured, SiteResponse

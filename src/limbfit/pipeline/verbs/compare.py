@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ...fe import Problem, Result, System, solve
-from ...fe.solution.stepping import schedule
+from ...fe.solution.control import schedule
 from ...febio import (
     SLACK,
     FaceWise,

@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from ..formats import fixed, number
 from ..page import Figure
 from ..store import PARAMETERS, Curves, Json, Store
-from ..tables import SYMBOLS, UNITS, fixed, interval, number
+from ..tables import SYMBOLS, UNITS, interval
 from .ink import (
     FITTED,
     HELD_OUT,

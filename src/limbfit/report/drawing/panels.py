@@ -26,7 +26,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from ..tables import number
+from ..formats import number
 
 PAPER, INK = "#f6f5f1", "#222222"
 FIELD_MAP = "viridis"

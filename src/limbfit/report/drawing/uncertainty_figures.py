@@ -9,9 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
+from ..formats import fixed
 from ..page import Figure
 from ..store import Json, Store
-from ..tables import SYMBOLS, fixed
+from ..tables import SYMBOLS
 from .ink import (
     INK,
     MEASURED,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from ..drawing import figures
+from ..formats import fixed
 from ..page import Block, Cell, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import fixed
 
 
 def comparison(store: Store) -> Section:

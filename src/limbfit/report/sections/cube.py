@@ -21,9 +21,9 @@ from ..drawing.ink import (
     standalone,
     svg,
 )
+from ..formats import fixed, heading, number, numeric
 from ..page import Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import fixed, heading, number, numeric
 
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))

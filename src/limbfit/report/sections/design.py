@@ -6,9 +6,10 @@ import matplotlib
 import numpy as np
 
 from ..drawing.ink import INK, MUTED, ONE_MATERIAL, SIMULATED, STYLE, THIRD, legend_above, panels, svg
+from ..formats import fixed, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import SYMBOLS, fixed, heading, number, numeric
+from ..tables import SYMBOLS
 
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))
 _WIDEST = 100.0  # factor that is drawn

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
+from ..formats import fixed, heading, numeric
 from ..page import Bullets, Cell, Row, Table
 from ..store import Json, Store
-from ..tables import fixed, heading, numeric
 
 _WORDS = {
     "folded": "elements inside out",

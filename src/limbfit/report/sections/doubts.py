@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ..formats import fixed, heading, number, numeric
 from ..page import Bullets, Cell, Note, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import NOTHING, fixed, heading, number, numeric
+from ..tables import NOTHING
 
 _LARGE = 4.0  # standardised errors from here on are marked
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from ..formats import fixed, number
 from ..page import Prose, Section
 from ..store import PARAMETERS, Json, Store
-from ..tables import NOTHING, SYMBOLS, UNITS, fixed, flatten, mean_and_deviation, number
+from ..tables import NOTHING, SYMBOLS, UNITS, flatten, mean_and_deviation
 
 Part = tuple[str, str]  # a heading and its paragraph
 

@@ -7,9 +7,10 @@ from matplotlib.axes import Axes
 
 from ..drawing.figures import thin
 from ..drawing.ink import GRID, INK, MUTED, SIMULATED, STYLE, legend_above, panels, svg
+from ..formats import fixed, heading, numeric
 from ..page import Cell, Figure, Row, Table
 from ..store import Curves, Json, Store
-from ..tables import NOTHING, fixed, heading, numeric
+from ..tables import NOTHING
 
 MOST_NAMED = 6  # phases whose names have room in a panel
 

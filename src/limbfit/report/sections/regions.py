@@ -6,9 +6,10 @@ import matplotlib
 from matplotlib.axes import Axes
 
 from ..drawing.ink import HELD_OUT, INK, SIMULATED, STYLE, panels, svg, tissue_style
+from ..formats import fixed, heading, number, numeric
 from ..page import Bullets, Cell, Figure, Prose, Row, Section, Table
 from ..store import PARAMETERS, Json, Store
-from ..tables import MEANING, SYMBOLS, UNITS, fixed, heading, number, numeric, tissue_name
+from ..tables import MEANING, SYMBOLS, UNITS, tissue_name
 
 WIDEST = 1e3  # of an interval over its value, in the figure
 

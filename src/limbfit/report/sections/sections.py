@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Sequence
 
 from .. import tables
 from ..drawing import figures, pictures
 from ..drawing.interactive import convergence_curves, explorer, record_curves
 from ..drawing.slices import slices_figure
-from ..page import Block, Bullets, Figure, KeyNumber, Note, Page, Prose, Section, Table
-from ..store import PARAMETERS, Json, Store
+from ..formats import fixed
+from ..page import Block, Bullets, Figure, Note, Page, Prose, Section, Table
+from ..store import Json, Store
 from .comparison import comparison
 from .doubted import search_doubts
 from .doubts import doubts
 from .experiments import experiment_sections
 from .methods import method_section
 from .records import record_figure, trace_table
+from .summary import _combinations, key_numbers, summary
 
 PRIVACY = (
     "This report holds no name, date of birth or other identity from the images. It does show the shape of "
@@ -71,139 +72,6 @@ def _blocks(*blocks: Block | None, otherwise: str) -> tuple[Block, ...]:
     """The blocks that exist, or a note that says what is missing."""
     found = tuple(block for block in blocks if block is not None)
     return found or (Note(otherwise),)
-
-
-def key_numbers(store: Store) -> tuple[KeyNumber, ...]:
-    """The numbers that a reader looks for first."""
-    found = []
-    if store.predict:
-        heldout, fitted = (tables.mean_and_deviation(store, which) for which in ("heldout", "fitted"))
-        found.append(KeyNumber(heldout, "%", "mean force error at the held-out sites"))
-        found.append(KeyNumber(fitted, "%", "mean force error at the fitted sites"))
-    for tissue in store.tissues:
-        last = store.stages[-1].get("parameters", {}).get(tissue) if store.stages else None
-        if last:
-            found.append(KeyNumber(tables.number(last.get("c_kPa")), "kPa", _with_interval(store, tissue)))
-    seconds = [stage.get("seconds", 0.0) for stage in (store.run.get("stages") or {}).values()]
-    if seconds:
-        found.append(KeyNumber(*_short_time(sum(seconds)), "computing time, all stages"))
-    return tuple(found)
-
-
-def _short_time(seconds: float) -> tuple[str, str]:
-    return (f"{seconds:.0f}", "s") if seconds < 120 else (f"{seconds / 60:.0f}", "min")
-
-
-def _with_interval(store: Store, tissue: str) -> str:
-    limits = tables.interval(store, tissue, "c_kPa")
-    text = f"{tissue}, long-term shear modulus c"
-    return f"{text} ({tables.number(limits[0])} to {tables.number(limits[1])} kPa)" if limits else text
-
-
-def summary(store: Store) -> tuple[Block, ...]:
-    """One paragraph in plain words, then the verdict."""
-    sentences = [_what_was_done(store), _how_well(store), _one_or_two(store)]
-    blocks: list[Block] = [Prose(" ".join(sentence for sentence in sentences if sentence))]
-    words = _verdict(store)
-    return (*blocks, Bullets(words)) if words else tuple(blocks)
-
-
-def _what_was_done(store: Store) -> str:
-    names, fitted = store.site_names, store.fitted
-    if not names:
-        return "Nothing has been computed yet for this study."
-    if not store.stages:
-        sites = f"{len(names)} indentation site{'s' if len(names) > 1 else ''}"
-        simulated = ", each simulated with the parameters of the study" if store.predicted else ""
-        return f"The study has {sites}{simulated}; no parameters have been identified."
-    start = (
-        f"The soft tissue of this limb was identified from robotic indentations at {len(fitted)} of "
-        f"{len(names)} sites ({', '.join(fitted)})"
-    )
-    if len(store.stages) == 1:
-        return f"{start} as one material."
-    paper = store.tissues == tuple(tables.PAPER_TISSUES)
-    parts = "a skin–adipose layer and the muscle–soft tissue beneath it"
-    return f"{start}: first as one material, then as {parts if paper else _listed(store.tissues)}."
-
-
-def _listed(words: Sequence[str]) -> str:
-    """``skin, fat and muscle``."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-
-
-def _how_well(store: Store) -> str:
-    held = [row for row in store.predicted if not row.get("fitted")]
-    if not store.predict:
-        return ""
-    if not held:
-        return f"At the fitted sites the force error is {tables.mean_and_deviation(store, 'fitted')} %."
-    places = "the one site that was" if len(held) == 1 else f"the {len(held)} sites that were"
-    errors = [row["error_percent"] for row in held if row.get("error_percent") is not None]
-    worst = f" (largest {tables.fixed(max(errors))} %)" if errors else ""
-    return (
-        f"At {places} not used, the model predicts the force with a mean error of "
-        f"{tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted sites "
-        f"it is {tables.mean_and_deviation(store, 'fitted')} %."
-    )
-
-
-def _one_or_two(store: Store) -> str:
-    held = [row for row in store.predicted if not row.get("fitted")]
-    pairs = [(row.get("error_one_material_percent"), row.get("error_percent")) for row in held]
-    known = [(one, two) for one, two in pairs if one is not None and two is not None]
-    if not known:
-        return ""
-    first, second = (statistics.fmean(column) for column in zip(*known, strict=True))
-    start = f"With one material for all soft tissue the held-out error is {tables.fixed(first)} %: "
-    if abs(first - second) < 0.1 * max(first, second):
-        return start + f"here {store.materials} predict no better than one."
-    return start + f"{store.materials} predict {'better' if second < first else 'worse'}."
-
-
-def _verdict(store: Store) -> tuple[str, ...]:
-    """Which parameters the data determine, best first, and how many combinations of them."""
-    uncertainty = store.calibration.get("uncertainty") or {}
-    stored = uncertainty.get("verdict") or {}
-    if not stored:
-        return ()
-    symbols = _symbols(store)
-    groups: dict[str, list[str]] = {}
-    for name, word in stored.items():
-        groups.setdefault(str(word), []).append(symbols.get(name, name))
-    best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
-    words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
-    combinations = [str(sentence) for sentence in uncertainty.get("combinations") or ()]
-    known = sum(sentence.endswith(": determined") for sentence in combinations)
-    if not known:
-        return tuple(words)
-    return (*words, f"Determined together: {known} of {len(combinations)} products of them (see Parameters).")
-
-
-_RANKS = {"determined": 0, "weakly": 1, "not": 2}
-
-
-def _symbols(store: Store) -> dict[str, str]:
-    """Each parameter's name as people read it: ``muscle.tau_s`` is muscle τ."""
-    return {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
-
-
-def _combinations(store: Store) -> tuple[Block, ...]:
-    """What the data determine of several parameters together, best determined first."""
-    sentences = (store.calibration.get("uncertainty") or {}).get("combinations") or ()
-    if not sentences:
-        return ()
-    told = []
-    for sentence in map(str, sentences):
-        for name, symbol in _symbols(store).items():
-            sentence = sentence.replace(name, symbol)
-        told.append(sentence)
-    lead = (
-        "Products of powers of the parameters, the best determined by the data first. They and the intervals "
-        "are those of the records alone, sampled on what the calibration simulated; limbfit uncertainty adds "
-        "geometry, contact and mesh."
-    )
-    return Prose(lead), Bullets(tuple(told))
 
 
 def model(store: Store) -> Section:
@@ -304,18 +172,18 @@ def _residuals(store: Store) -> str:
     if not rows:
         return ""
     sites = ", ".join(
-        f"{name} {tables.fixed(site['noise_sd_N'], 3)} N and {tables.fixed(site['misfit_sd_N'], 3)} N"
+        f"{name} {fixed(site['noise_sd_N'], 3)} N and {fixed(site['misfit_sd_N'], 3)} N"
         for name, site in rows.items()
     )
     meshes = ", ".join(
-        f"{name} {tables.fixed(100 * site['mesh_share'], 1)} %"
+        f"{name} {fixed(100 * site['mesh_share'], 1)} %"
         for name, site in rows.items()
         if site.get("mesh_share") is not None
     )
     return (
         "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
         f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
-        f"{tables.fixed(100 * found['correlation'], 0)} % of a record. "
+        f"{fixed(100 * found['correlation'], 0)} % of a record. "
         + (
             f"To these comes the error of the meshes, from others, in percent of the largest force: {meshes}."
             if meshes
@@ -411,7 +279,7 @@ def timing(store: Store) -> Section:
     machine = store.run.get("machine") or {}
     words = [
         f"{machine['cores']} cores" if "cores" in machine else "",
-        f"{tables.fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
+        f"{fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
         f"Python {machine['python']}" if "python" in machine else "",
     ]
     known = ", ".join(word for word in words if word)

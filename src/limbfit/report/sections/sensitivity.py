@@ -22,9 +22,10 @@ from ..drawing.ink import (
     svg,
     tissue_style,
 )
+from ..formats import fixed, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import NOTHING, fixed, heading, number, numeric
+from ..tables import NOTHING
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")

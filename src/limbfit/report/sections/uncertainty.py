@@ -8,9 +8,10 @@ from matplotlib.axes import Axes
 
 from ..drawing.ink import MUTED, SIMULATED, STYLE, legend_above, panels, svg
 from ..drawing.uncertainty_figures import pairs_figure, prediction_figure, true_values
+from ..formats import fixed, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import SYMBOLS, fixed, heading, number, numeric
+from ..tables import SYMBOLS
 
 _MOST_PANELS_IN_A_ROW = 4
 

@@ -6,9 +6,10 @@ import matplotlib
 import numpy as np
 
 from ..drawing.ink import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED, STYLE, legend_above, panels, svg
+from ..formats import fixed, heading, numeric
 from ..page import Block, Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Store
-from ..tables import NOTHING, fixed, heading, numeric
+from ..tables import NOTHING
 
 
 def validation_section(store: Store, content: Json) -> Section:

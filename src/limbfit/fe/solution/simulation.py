@@ -1,0 +1,287 @@
+"""One run: the system, its materials, and the steps that are accepted one by one."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contact.contact import ContactSurface
+from ..contact.indenter import Indenter
+from ..contact.sticky import Anchors
+from ..history import Memory, elastic_stresses
+from ..kernel.laws import Laws
+from ..problem import Problem
+from ..result import Result, State, Step
+from ..system import Evaluation, Increment, System
+from ..threads import single_threaded_numpy
+from .control import StepControl, schedule
+from .direction import renew
+from .factor import Factor
+from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
+from .pace import Pace
+from .schedule import foresee
+from .sensitivity import Explicit, MemoryDerivative, solve_with_adjoint
+
+Array = NDArray[np.float64]
+
+# Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
+TOO_DEEP, MOST_RAISES = 1.2, 5
+# Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
+STEEP_PRESSURE = 15.0
+
+
+class Simulation:
+    """One run: the system, its materials, and the step that was reached last."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        control: StepControl,
+        sensitivities: bool,
+        warm_start: Result | None,
+        system: System | None = None,
+    ) -> None:
+        started = time.perf_counter()
+        self.problem, self.control = problem, control
+        self.system = _system(problem, warm_start, system, control.threads)
+        self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        self.factor = Factor(self.system, self.laws.moduli, control.linear_solver, control.threads)
+        # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
+        apart = sensitivities and not self.factor.lasting
+        self.slopes = self.factor
+        if apart:
+            self.slopes = Factor(self.system, self.laws.moduli, threads=control.threads, lasting=True)
+        self.counts: Counter[str] = Counter()
+        self.memory = Memory.rest(self.system, self.laws)
+        self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
+        self.damping = 0.0  # to begin a step with, after one that needed it
+        self.anchors: Anchors | None = None
+        if problem.friction == "sticky" and self.system.surface is not None:
+            self.anchors = Anchors.none(self.system.surface, self.laws.count if sensitivities else 0)
+        self.warm = _warm_states(problem, warm_start)
+        self.floor, self.pushing = 0.0, False
+        width = problem.indenter.width if problem.indenter is not None else 1.0
+        self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
+        self.deepest = control.penetration * float(np.abs(problem.history.displacement).max())
+        rest = np.zeros_like(self.system.points)
+        still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
+        self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness, still)]
+        self.reason = ""
+        self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
+        self.seconds["setup"] = time.perf_counter() - started
+
+    def run(self) -> Iterator[Step]:
+        """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
+        planned = schedule(self.problem.history, self.control)
+        targets = list(planned)
+        pace, why = Pace(self.control.max_iterations), ""
+        times, forces = [0.0], [0.0]
+        while targets:
+            now, spent = (
+                self.states[-1].time,
+                self.counts["newton_iterations"] >= self.control.most_iterations,
+            )
+            if spent:
+                bound = f"no more than {self.control.most_iterations} Newton iterations were allowed"
+                why = f"{why}; {bound}" if why else bound
+            if spent or pace.cuts > self.control.max_cuts:
+                self.reason = f"stopped at {now:.4g} s of {targets[-1]:.4g} s: {why}"
+                return
+            t = pace.next_time(now, targets[0])
+            before = self.counts["newton_iterations"]
+            with single_threaded_numpy():
+                found = self._attempt(t, pace.patience)
+            if isinstance(found, str):
+                self.counts["cuts"] += 1
+                pace.cut(now, t)
+                why = found
+                continue
+            pace.done(now, t, self.counts["newton_iterations"] - before)
+            why = ""
+            times.append(t)
+            forces.append(found.force)
+            if t == targets[0]:
+                targets = targets[1:]
+                if self.control.times is None:
+                    targets = foresee(self.problem.history, planned, targets, times, forces)
+            yield found
+
+    def _attempt(self, t: float, patience: int) -> Step | str:
+        """The step to time ``t``, or why there is none; nothing is changed unless it is accepted.
+
+        ``patience``: iterations that are allowed for one equilibrium.
+        """
+        before = self.states[-1]
+        displacement, dt = float(self.problem.history.at(t)), t - before.time
+        stiffness, u = self.stiffness, self._predict(t, displacement)
+        anchors = self.anchors
+        for raises in range(MOST_RAISES, -1, -1):
+            may_rise = raises > 0 and not self.control.hold_penalty
+            increment = self.memory.increment(
+                self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
+            )
+            increment = replace(increment, anchors=anchors, flat_from=STEEP_PRESSURE / stiffness)
+            control = replace(
+                self.control.newton, damping=self.damping, max_iterations=patience,
+                bearable=TOO_DEEP * self.deepest if may_rise else np.inf,
+            )  # fmt: skip
+            found = self._equilibrate(increment, u, control)
+            if found.reason:
+                return found.reason
+            kept, deep = anchors, may_rise and found.at.penetration > self.deepest
+            if anchors is not None and not deep:
+                kept = anchors.let_go(*self._tool(increment), found.u)
+            if raises == 0 or (kept is anchors and not deep):
+                break
+            stiffness, anchors, u = (3.0 if deep else 1.0) * stiffness, kept, found.u
+        return self._accept(found, increment, dt, stiffness)
+
+    def _tool(self, increment: Increment) -> tuple[ContactSurface, Indenter]:
+        """The contact surface and the indenter where it is in a step."""
+        assert self.system.surface is not None
+        assert self.system.indenter is not None
+        return self.system.surface, self.system.indenter.moved(increment.displacement)
+
+    def _equilibrate(self, increment: Increment, guess: Array, control: NewtonControl) -> Equilibrium:
+        """From the predicted displacement or the last one; from the last one where that fails."""
+        guesses = [self.system.impose(u, increment.displacement) for u in (guess, self.states[-1].u)]
+        found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
+        for tried in (guesses, guesses[1:]):
+            found = equilibrate(
+                self.system,
+                self.laws,
+                increment,
+                tried,
+                self.factor,
+                control,
+                self.floor,
+                self.deepest,
+                self.seconds,
+            )
+            self.counts["newton_iterations"] += found.iterations
+            if not found.reason or found.iterations >= control.max_iterations:
+                break  # from elsewhere it would take as many
+        return found
+
+    def _predict(self, t: float, displacement: float) -> Array:
+        warm, last = self.warm.get(round(t, 9)), self.warm.get(round(self.states[-1].time, 9))
+        if warm is not None:  # what it missed by in the step before, it will miss by in this one
+            return warm.u if last is None else warm.u + (self.states[-1].u - last.u)
+        weights = extrapolation(self.states, displacement)
+        return np.asarray(sum(w * state.u for w, state in zip(weights, self.states)))
+
+    def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
+        started = time.perf_counter()
+        u, at = found.u, found.at
+        worn = self.slopes.worn()
+        inexact = at.data is None or at.penetration > increment.flat_from
+        if inexact and (worn or self.slope is not None):
+            at = self.system.evaluate(u, self.laws, replace(increment, flat_from=np.inf))
+            found = replace(found, at=at)
+        if worn:
+            renew(at, self.slopes)
+        self.slopes.next_step()
+        du = force_slope = None
+        if self.slope is None:
+            stress = elastic_stresses(self.system, self.laws, u)
+        else:
+            explicit = self.slope.explicit(self.system, self.laws, self.memory, increment, u, dt)
+            stress = explicit.stress
+            du, force_slope = self._differentiate(explicit, found, increment)
+            self.slope = self.slope.advanced(self.system, self.laws, self.memory, explicit, du, dt)
+        after = self.memory.advanced(self.system, self.laws, stress, dt)
+        if self._turns(increment.time, at.force):
+            after, self.slope = after.turned(), None if self.slope is None else self.slope.turned()
+        if increment.anchors is not None:
+            self.anchors = increment.anchors.after(*self._tool(increment), u, du)
+        self.memory, self.stiffness = after, stiffness
+        self.damping = FIRST_DAMPING if found.damped else 0.0
+        self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
+        state = State(increment.time, increment.displacement, u, stiffness, du, after.turned())
+        self.states = [*self.states[-2:], state]
+        if found.residual > self.control.tolerance:
+            self.unbalanced.append((increment.displacement, found.residual))
+        self.counts["steps"] += 1
+        self.seconds["accept"] += time.perf_counter() - started
+        return Step(
+            increment.time, increment.displacement, at.force, at.penetration, at.contact_area,
+            found.iterations, force_slope, state,
+        )  # fmt: skip
+
+    def _turns(self, t: float, force: float) -> bool:
+        """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
+        contact began or ended."""
+        met, self.pushing = (force > 0.0) != self.pushing, force > 0.0
+        if self.control.stress == "linear" or (met and len(self.states) > 1):
+            return True
+        return bool(np.isclose(t, self.problem.history.kinks, rtol=1e-9, atol=0.0).any())
+
+    def _differentiate(
+        self, explicit: Explicit, found: Equilibrium, increment: Increment
+    ) -> tuple[Array, Array]:
+        """Derivatives (n, 3, p) of the displacement and (p,) of the force at equilibrium."""
+        system, laws, at, u = self.system, self.laws, found.at, found.u
+        d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
+        change = explicit.forces + system.contact_force(u, increment)[..., None] * d_penalty
+        d_reaction = np.zeros(laws.count)
+        if increment.anchors is not None:
+            forces, d_reaction = increment.anchors.explicit(*self._tool(increment), u, increment.penalty)
+            change += forces
+        b = -change.reshape(-1, laws.count)[system.free]
+        weights = extrapolation(self.states, increment.displacement)
+        guess = sum(w * s.sensitivity for w, s in zip(weights, self.states) if s.sensitivity is not None)
+        x = np.asarray(guess).reshape(-1, laws.count)[system.free]
+        advance = np.zeros(u.size) if at.advance is None else at.advance.ravel()
+        du = np.zeros((u.size, laws.count))
+        du[system.free], advanced = solve_with_adjoint(at, self.slopes, b, x, advance[system.free])
+        d_force = at.force * d_penalty + d_reaction - advanced
+        return du.reshape(*u.shape, laws.count), d_force
+
+
+def extrapolation(states: Sequence[State], displacement: float) -> Array:
+    """Weights (k,) of the last states' fields that foresee the field at an advance of the indenter.
+
+    Quadratic in the advance while it goes on steadily; linear where it has just turned or leaps.
+    """
+    weights = np.zeros(len(states))
+    weights[-1] = 1.0
+    d = np.array([state.displacement for state in states])
+    moved = np.diff(d)
+    if len(states) < 2 or moved[-1] == 0.0:
+        return weights
+    slope = float(np.clip((displacement - d[-1]) / moved[-1], -2.0, 8.0))
+    step = slope * moved[-1]
+    weights[-2:] += -slope, slope
+    if len(states) > 2 and 0.0 < slope <= 2.0 and moved[0] * moved[1] > 0.0:
+        bend = step * (step + moved[1]) / (d[2] - d[0])
+        weights += bend * np.array([1.0 / moved[0], -1.0 / moved[0] - 1.0 / moved[1], 1.0 / moved[1]])
+    return weights
+
+
+def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
+    for known in (system, warm_start.system if warm_start is not None else None):
+        if known is not None and known.fits(problem):
+            return known
+    return System(problem, threads)
+
+
+def _warm_states(problem: Problem, warm_start: Result | None) -> dict[float, State]:
+    """States of an earlier run by time, moved to the new parameters along their sensitivities."""
+    if warm_start is None or not len(warm_start.states):
+        return {}
+    if warm_start.states[0].u.shape != problem.mesh.points.shape:
+        return {}
+    new, old = problem.parameters, warm_start.problem.parameters
+    with np.errstate(all="ignore"):  # moduli act by their ratio
+        change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
+    out = {}
+    for state in warm_start.states:
+        u = state.u if state.sensitivity is None else state.u + state.sensitivity @ change
+        out[round(state.time, 9)] = replace(state, u=u)
+    return out

@@ -1,0 +1,156 @@
+"""What a record says of the others: sites left out, to first order at an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fit.objective import Measured, Simulate, SiteResponse
+
+Array = NDArray[np.float64]
+
+LARGE, ERROR = 4.0, 0.12  # standardised error and prediction error over the peak that are flagged
+GAIN = 4.0  # by which a correction must lower the squared misfit of all sites
+
+_PRIOR_SD = 0.5  # of log(parameters) about the answer: keeps what few sites leave open where it was
+
+
+_ASSUMED = 0.03  # force error, as a fraction of the peak, that data and prior are weighed by
+
+
+_STEPS = 6
+
+
+_FLOOR = 0.02  # prediction error, as a fraction of the peak, below which sites are not told apart
+
+
+class FirstOrder:
+    """A simulation expanded about one point: log(force) to first order in log(parameters).
+
+    A force scales with the moduli, which this form keeps exactly; where it is small it is linear.
+    """
+
+    def __init__(self, parameters: Array, responses: Sequence[SiteResponse]) -> None:
+        self.parameters, self.responses = parameters, tuple(responses)
+
+    def __call__(self, parameters: Array) -> list[SiteResponse]:
+        step = np.log(parameters / self.parameters)
+        return [self._moved(response, step, parameters) for response in self.responses]
+
+    def _moved(self, response: SiteResponse, step: Array, parameters: Array) -> SiteResponse:
+        force, scaled = response.force_N, response.jacobian * self.parameters
+        small = force < 0.05 * force.max()
+        rate = scaled / np.where(small, 1.0, force)[:, None]
+        grown = np.exp(np.clip(rate @ step, -5.0, 5.0))
+        moved = np.where(small, force + scaled @ step, force * grown)
+        slope = np.where(small[:, None], scaled, scaled * grown[:, None])
+        return SiteResponse(moved, slope / parameters)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A site predicted without itself.
+
+    ``error`` is the root mean square of its prediction error over its peak; ``expected`` that of the others
+    when it has no say; ``ratio`` the best factor from predicted to measured force; ``cook`` how far it moves
+    the forces of all sites, against the misfit.
+    """
+
+    site: str
+    error: float
+    expected: float
+    ratio: float
+    cook: float
+
+    @property
+    def standardised(self) -> float:
+        return self.error / self.expected
+
+
+@dataclass(frozen=True)
+class Correction:
+    """One change to the records that makes all sites agree better: names exchanged, or a unit converted.
+
+    ``gain`` is the squared misfit of all sites before over after, each refitted; the errors (root mean
+    square over the peak) are those of ``sites``, ``worst_before`` that of any site: a fit may follow the bad
+    record and miss the others.
+    """
+
+    kind: Literal["swap", "unit"]
+    sites: tuple[int, ...]
+    cause: str
+    gain: float
+    errors_before: tuple[float, ...]
+    errors_after: tuple[float, ...]
+    worst_before: float
+
+    @property
+    def convinces(self) -> bool:
+        worst = self.worst_before
+        return self.gain > GAIN and worst > ERROR / 2 and max(self.errors_after) < 0.6 * worst
+
+
+class Sites:
+    """All recorded sites with their simulation: regularised fits on some, errors on others."""
+
+    def __init__(self, simulate: Simulate, measured: Sequence[Measured], start: Array) -> None:
+        self.simulate, self.measured, self.start = simulate, tuple(measured), start
+        self.peaks = [float(site.force_N.max()) for site in measured]
+        self._fits: dict[tuple[int, ...], Array] = {}
+
+    def without(self, *left: int) -> Array:
+        """Forces of all sites, one flat vector each, from the fit without some."""
+        key = tuple(sorted(left))
+        if key not in self._fits:
+            self._fits[key] = self._fit([i for i in range(len(self.measured)) if i not in left])
+        return self._fits[key]
+
+    def _fit(self, chosen: Sequence[int]) -> Array:
+        z = np.zeros(len(self.start))
+        for _ in range(_STEPS):
+            p = self.start * np.exp(z)
+            responses = self.simulate(p)
+            rows = [self._rows(i, responses[i], p) for i in chosen]
+            residual = np.concatenate([r for r, _ in rows])
+            slope = np.concatenate([s for _, s in rows])
+            H = slope.T @ slope + np.eye(len(z)) / _PRIOR_SD**2
+            step = np.linalg.solve(H, -slope.T @ residual - z / _PRIOR_SD**2)
+            z = z + np.clip(step, -1.0, 1.0)
+            if np.abs(step).max() < 1e-3:
+                break
+        return self.start * np.exp(z)
+
+    def _rows(self, i: int, response: SiteResponse, parameters: Array) -> tuple[Array, Array]:
+        weight = 1 / (_ASSUMED * self.peaks[i] * np.sqrt(response.force_N.size))
+        difference = response.force_N - self.measured[i].force_N
+        # A record that is many times too strong must not drown the others (Huber's weight).
+        size = float(np.sqrt(np.mean(difference**2))) / self.peaks[i]
+        weight *= np.sqrt(min(1.0, 5 * _ASSUMED / max(size, 1e-12)))
+        return difference * weight, response.jacobian * parameters * weight
+
+    def errors(self, parameters: Array) -> Array:
+        """Root mean square error (n,) of each site over its peak, simulated or measured, the larger one.
+
+        So a record that is too weak by a factor counts as much as one that is too strong by it.
+        """
+        triples = zip(self.simulate(parameters), self.measured, self.peaks)
+        return np.array(
+            [
+                np.sqrt(np.mean((r.force_N - m.force_N) ** 2)) / max(peak, r.force_N.max())
+                for r, m, peak in triples
+            ]
+        )
+
+    def ratio(self, i: int, parameters: Array) -> float:
+        force = self.simulate(parameters)[i].force_N
+        return float(force @ self.measured[i].force_N / (force @ force))
+
+    def expected(self, *left: int) -> float:
+        """Root mean square of the errors with which sites are predicted without themselves and ``left``."""
+        rest = [j for j in range(len(self.measured)) if j not in left]
+        errors = [self.errors(self.without(*left, j))[j] for j in rest]
+        return max(float(np.sqrt(np.mean(np.square(errors)))), _FLOOR)
