@@ -16,4 +16,5 @@ myst_heading_anchors = 4
 # Pages link to files of the repository that are no pages of the site, the examples above all.
 suppress_warnings = ["myst.xref_missing"]
 autodoc_typehints = "description"
+autodoc_type_aliases = {"ArrayLike": "ArrayLike", "Array": "Array"}
 autodoc_member_order = "bysource"

@@ -12,8 +12,8 @@ from .groups import GROUPS
 HEAD = """# Commands
 
 Made by `python -m limbfit.cli.reference`; `limbfit COMMAND --help` says the same. Every command takes
-`--json` and then prints one JSON object. The exit code is 0 when done, 1 when something failed, 2 for bad usage or bad
-input, 130 when interrupted.
+`--json` and then prints one JSON object. The exit code is 0 when done, 1 when something failed, 2 for bad
+usage or bad input, 130 when interrupted.
 `limbfit --install-completion` completes commands and options in the shell.
 """
 
