@@ -8,7 +8,7 @@ import pytest
 from conftest import write_trace
 from limbfit import check_study, load_study
 from limbfit.report.sections.doubts import doubts
-from limbfit.report.store import Store
+from limbfit.report.store import Results
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])
 
@@ -66,7 +66,7 @@ def test_a_wrong_axis_is_told_with_its_angle(five):
 def section(tmp_path, **predict):
     empty = {"run": {}, "segment": {}, "surfaces": {}, "sites": (), "traces": {}, "mesh": {}}
     more = {"calibration": {}, "simulated": (), "compared": (), "truth": {}}
-    return doubts(Store(tmp_path, **empty, **more, predict={"sites": [], **predict}))
+    return doubts(Results(tmp_path, **empty, **more, predict={"sites": [], **predict}))
 
 
 def test_the_report_says_that_nothing_is_wrong_or_what_is(five, tmp_path):

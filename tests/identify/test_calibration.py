@@ -25,8 +25,8 @@ from limbfit.identify import (
     FIXED,
     CalibrationSettings,
     Measured,
+    SearchState,
     SiteResponse,
-    State,
     Unknowns,
     calibrate,
     search_space,
@@ -220,7 +220,7 @@ def test_a_run_taken_up_again_from_any_state_gives_the_same_answer():
     assert whole.converged, whole.reason
     assert len(states) > 12
     for text in states:
-        again = calibrate(simulate, records(0.03), far, state=State.from_dict(json.loads(text)))
+        again = calibrate(simulate, records(0.03), far, state=SearchState.from_dict(json.loads(text)))
         assert again.to_dict() == whole.to_dict()
 
 
@@ -354,7 +354,7 @@ def test_a_doubtful_run_taken_up_again_gives_the_same_answer():
     states = []
     found = calibrate(run, records(), PAPER, on_iterate=states.append)
     for state in states[:: max(len(states) // 4, 1)]:
-        stored = State.from_dict(json.loads(json.dumps(state.to_dict())))
+        stored = SearchState.from_dict(json.loads(json.dumps(state.to_dict())))
         again = calibrate(run, records(), PAPER, state=stored)
         assert np.array_equal(again.parameters, found.parameters)
         assert again.evaluations == found.evaluations

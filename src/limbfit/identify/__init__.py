@@ -16,7 +16,7 @@ from .fit.parameters import (
     two_stages,
 )
 from .fit.prediction import Summary, error_percent, prediction_sd, summarise
-from .fit.state import Calibration, CalibrationSettings, Iterate, StageResult, State
+from .fit.state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .uncertainty.discrepancy import ResidualModel, estimate_discrepancy
 from .uncertainty.emulator import Emulator
 from .uncertainty.noise import SiteNoise, curve_noise, record_noise
@@ -47,12 +47,12 @@ __all__ = [
     "Multistart",
     "Prior",
     "ResidualModel",
+    "SearchState",
     "SiteNoise",
     "SiteResponse",
     "Space",
     "StageResult",
     "Started",
-    "State",
     "Summary",
     "Uncertainty",
     "Unknowns",

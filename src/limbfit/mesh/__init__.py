@@ -1,6 +1,6 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
-from .measures import Quality, dihedral_angles, quality
+from .measures import MeshQuality, dihedral_angles, quality
 from .volume import (
     CELL_NODES,
     TET10_EDGES,
@@ -23,7 +23,7 @@ __all__ = [
     "TRI6_EDGES",
     "VTK_CELL",
     "Mesh",
-    "Quality",
+    "MeshQuality",
     "boundary_faces",
     "cell_volumes",
     "check",

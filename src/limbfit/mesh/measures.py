@@ -12,7 +12,7 @@ from .volume import TET_FACES, Mesh, cell_volumes, node_jacobians
 
 
 @dataclass(frozen=True)
-class Quality:
+class MeshQuality:
     """Element quality of a mesh; angles in degrees, volumes in mm3.
 
     Dihedral angles are those of the straight tetrahedra (NaN for hexahedra); the scaled Jacobian is the
@@ -29,7 +29,7 @@ class Quality:
     inverted: int
 
 
-def quality(mesh: Mesh) -> Quality:
+def quality(mesh: Mesh) -> MeshQuality:
     """Quality of a mesh; ``inverted`` counts cells whose Jacobian is not positive at some node."""
     size = cell_volumes(mesh)
     jacobians = node_jacobians(mesh)
@@ -41,7 +41,7 @@ def quality(mesh: Mesh) -> Quality:
     )
     smallest = angles.min(axis=1)
     marks = (0.1, 1, 5, 50)
-    return Quality(
+    return MeshQuality(
         min_dihedral_deg=float(smallest.min()),
         dihedral_percentiles_deg={f"{q:g}": float(np.percentile(smallest, q)) for q in marks},
         max_dihedral_deg=float(angles.max()),

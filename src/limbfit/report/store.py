@@ -19,7 +19,7 @@ Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Store:
+class Results:
     """A results folder; every dictionary is empty where its file is not there (yet).
 
     ``experiments``: what each finished experiment stored, by its name; ``outdated``: those that are stale.
@@ -91,7 +91,7 @@ class Store:
         return file if file.is_file() else None
 
 
-def load_store(results: Path) -> Store:
+def load_store(results: Path) -> Results:
     """Read what is below ``results``.
 
     Raises
@@ -105,7 +105,7 @@ def load_store(results: Path) -> Store:
     run = _read_json(results / "run.json")
     states = {name: row.get("state") for name, row in (run.get("experiments") or {}).items()}
     done = [name for name, state in states.items() if state == "done"]
-    return Store(
+    return Results(
         folder=results,
         run=run,
         segment=_read_json(results / "segment" / "segment.json"),

@@ -7,7 +7,7 @@ from typing import Any
 
 from .formats import NOTHING, duration, fixed, heading, number, numeric, vector
 from .page import Cell, Row, Table
-from .store import PARAMETERS, Json, Store
+from .store import PARAMETERS, Json, Results
 
 SYMBOLS = {"c_kPa": "c", "m": "m", "gamma": "γ", "tau_s": "τ"}
 UNITS = {"c_kPa": "kPa", "m": NOTHING, "gamma": NOTHING, "tau_s": "s"}
@@ -20,14 +20,14 @@ MEANING = {
 PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}  # where fat is no tissue of its own
 
 
-def interval(store: Store, tissue: str, name: str) -> list[float] | None:
+def interval(store: Results, tissue: str, name: str) -> list[float] | None:
     """The stored 95 % interval of a parameter."""
     uncertainty = store.calibration.get("uncertainty") or {}
     limits = (uncertainty.get("intervals_95") or {}).get(tissue, {}).get(name)
     return limits if limits and None not in limits else None
 
 
-def verdict(store: Store, tissue: str, name: str) -> str:
+def verdict(store: Results, tissue: str, name: str) -> str:
     """What the identification says about a parameter: ``determined`` or the contrary, in its own words."""
     uncertainty = store.calibration.get("uncertainty") or {}
     key = f"{tissue}.{name}"
@@ -35,7 +35,7 @@ def verdict(store: Store, tissue: str, name: str) -> str:
     return f"{word}; at its bound" if (uncertainty.get("at_bound") or {}).get(key) else word
 
 
-def tissue_name(store: Store, tissue: str) -> str:
+def tissue_name(store: Results, tissue: str) -> str:
     """A tissue as the head of a row; the two of the paper as the paper names them."""
     if store.tissues == tuple(PAPER_TISSUES):
         return PAPER_TISSUES[tissue]
@@ -46,7 +46,7 @@ def _limits(limits: list[float] | None) -> str:
     return f"{number(limits[0])} to {number(limits[1])}" if limits else NOTHING
 
 
-def parameter_table(store: Store) -> Table:
+def parameter_table(store: Results) -> Table:
     """Table 1: start, value after each stage, interval, verdict, and the truth where it is known."""
     stages = store.stages
     head = ["Tissue", "Parameter", "Unit", "Start"]
@@ -61,7 +61,7 @@ def parameter_table(store: Store) -> Table:
     )
 
 
-def _parameter_row(store: Store, tissue: str, name: str) -> Row:
+def _parameter_row(store: Results, tissue: str, name: str) -> Row:
     stages = store.stages
     values = [stages[0].get("start", {}), *(stage.get("parameters", {}) for stage in stages)]
     cells = [
@@ -76,7 +76,7 @@ def _parameter_row(store: Store, tissue: str, name: str) -> Row:
     return Row(tuple(cells))
 
 
-def site_table(store: Store) -> Table:
+def site_table(store: Results) -> Table:
     """Table 2: largest force and errors of each site, fitted sites marked."""
     head = (
         "Site",
@@ -97,7 +97,7 @@ def site_table(store: Store) -> Table:
     )
 
 
-def _site_row(store: Store, row: Json) -> Row:
+def _site_row(store: Results, row: Json) -> Row:
     fitted = bool(row.get("fitted"))
     depth = store.traces.get(row["site"], {}).get("depth_mm")
     return Row(
@@ -118,7 +118,7 @@ def _error(row: Json, key: str, what: str) -> str:
     return "not predicted" if what in row.get("not_predicted", ()) else fixed(row.get(key))
 
 
-def _mean_rows(store: Store) -> Iterable[Row]:
+def _mean_rows(store: Results) -> Iterable[Row]:
     for word, key in (("fitted", "fitted"), ("held out", "heldout")):
         chosen = [row for row in store.predicted if bool(row.get("fitted")) == (key == "fitted")]
         errors = [row.get("error_one_material_percent") for row in chosen]
@@ -137,14 +137,14 @@ def _mean_rows(store: Store) -> Iterable[Row]:
             )
 
 
-def mean_and_deviation(store: Store, which: str) -> str:
+def mean_and_deviation(store: Results, which: str) -> str:
     """``4.5 ± 1.0``: stored mean and standard deviation of the errors at ``fitted`` or ``heldout`` sites."""
     mean = store.predict.get(f"mean_error_{which}_percent")
     deviation = store.predict.get(f"sd_error_{which}_percent")
     return fixed(mean) if deviation is None else f"{fixed(mean)} ± {fixed(deviation)}"
 
 
-def correlation_table(store: Store) -> Table | None:
+def correlation_table(store: Results) -> Table | None:
     """The correlation of every pair of parameters, coloured."""
     correlation = (store.calibration.get("uncertainty") or {}).get("correlation") or {}
     names, matrix = correlation.get("names"), correlation.get("matrix")
@@ -173,7 +173,7 @@ def _short(name: str) -> str:
     return f"{tissue} {SYMBOLS.get(parameter, parameter)}" if parameter else name
 
 
-def place_table(store: Store) -> Table:
+def place_table(store: Results) -> Table:
     """Where each site lies, and on what evidence."""
     rows = tuple(_place_row(row) for row in store.sites)
     head = ("Site", "Region", "Position, LPS (mm)", "Axis into the limb", "Off the skin (mm)", "Marker")
@@ -200,7 +200,7 @@ def _place_row(row: Json) -> Row:
     return Row(cells, bool(row.get("fitted")))
 
 
-def volume_table(store: Store) -> Table | None:
+def volume_table(store: Results) -> Table | None:
     """Volumes from the label map and inside the surfaces."""
     labels = store.segment.get("volumes_cm3") or {}
     bodies = {"skin": store.surfaces.get("skin"), **(store.surfaces.get("bones") or {})}
@@ -216,7 +216,7 @@ def volume_table(store: Store) -> Table | None:
     return Table("volumes", "Volumes of the segmented structures and of the smooth surfaces.", head, rows)
 
 
-def mesh_table(store: Store) -> Table:
+def mesh_table(store: Results) -> Table:
     """Size and quality of every site's mesh, and what the bone policy trimmed."""
     head = (
         "Site",
@@ -269,7 +269,7 @@ def _count(value: Any) -> str:
     return f"{value:,}".replace(",", " ") if isinstance(value, int) else NOTHING
 
 
-def solver_table(store: Store) -> Table:
+def solver_table(store: Results) -> Table:
     """How each prediction went: steps, penetration, and the reason where one stopped early."""
     rows = tuple(
         Row(
@@ -293,7 +293,7 @@ def solver_table(store: Store) -> Table:
     return Table("solver", "The simulation of each site with the identified parameters.", head, rows)
 
 
-def simulated_table(store: Store) -> Table:
+def simulated_table(store: Results) -> Table:
     """Indentations that were simulated one by one."""
     rows = tuple(
         Row(
@@ -346,7 +346,7 @@ def _unit(name: str) -> str:
     return f" ({UNITS[name]})" if UNITS[name] != NOTHING else ""
 
 
-def timing_table(store: Store) -> Table:
+def timing_table(store: Results) -> Table:
     """How long each stage took, with bars."""
     seconds = {name: facts.get("seconds") for name, facts in (store.run.get("stages") or {}).items()}
     known = {name: value for name, value in seconds.items() if isinstance(value, int | float)}

@@ -6,10 +6,10 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from .tables import Positive, Table
+from .tables import Positive, TomlTable
 
 
-class AcquireTable(Table):
+class AcquireTable(TomlTable):
     """Speeds, forces, pauses, repeats and limits of the experiment; defaults are the paper's (section 2.1.2).
 
     What the paper does not state (approach, retraction, limits) is what suits a seated person's limb.

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from .tables import Positive, Table
+from .tables import Positive, TomlTable
 
 MOST_CELLS = 3e6  # some 4 million nodes: more than a workstation solves
 _LIMB_MM = 80.0  # the farthest tissue from a site that counts
@@ -66,7 +66,7 @@ ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
 _OWN = ACCURACIES["standard"][0]
 
 
-class CoarseMeshTable(Table):
+class CoarseMeshTable(TomlTable):
     """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
 
     edge_near_mm: Positive = 5.5
@@ -81,7 +81,7 @@ class CoarseMeshTable(Table):
         return self
 
 
-class MeshTable(Table):
+class MeshTable(TomlTable):
     """The mesh of each site: element and edge lengths near the indenter and far from it.
 
     ``accuracy`` sets all edge lengths; those that are stated go before it. With ``coarse``, parameters are

@@ -16,13 +16,13 @@ KAPPA_RATIO = (10.0, 1e4)
 TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """A frozen table without unknown keys or numbers that are not finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class TissueParameters(Table):
+class TissueParameters(TomlTable):
     """Parameters of one tissue: long-term shear modulus, exponent, relaxation amplitude and time."""
 
     c_kPa: Positive
@@ -31,14 +31,14 @@ class TissueParameters(Table):
     tau_s: Positive
 
 
-class StudyTable(Table):
+class StudyTable(TomlTable):
     """What the study is called."""
 
     name: str
     description: str = ""
 
 
-class ImageTable(Table):
+class ImageTable(TomlTable):
     """The image: a DICOM folder, NIfTI, NRRD or MHA.
 
     ``markers`` is another one of the same limb with skin markers on, or ``"same"``: they are on in this one.
@@ -61,7 +61,7 @@ class ImageTable(Table):
         return None if self.markers == "same" else self.markers
 
 
-class SegmentationTable(Table):
+class SegmentationTable(TomlTable):
     """``labels``: a label map (``.seg.nrrd``, image, DICOM-SEG, RTSTRUCT); it wins over the automatic one.
 
     ``contours`` is a file of contours that does so; ``seeds`` are points (LPS mm) in each bone to be found.
@@ -89,7 +89,7 @@ class SegmentationTable(Table):
         return self.labels is not None or self.contours is not None
 
 
-class SurfacesTable(Table):
+class SurfacesTable(TomlTable):
     """Closed surfaces as the way in, instead of an image.
 
     ``coordinates`` is by default what the files say themselves, or LPS where they do not.
@@ -101,21 +101,21 @@ class SurfacesTable(Table):
     unit: Literal["mm", "cm", "m", "inch"] = "mm"
 
 
-class MarkupsTable(Table):
+class MarkupsTable(TomlTable):
     """Control points of 3D Slicer (``.mrk.json``): ``position`` or ``near`` of the sites of their names."""
 
     file: Path
     gives: Literal["position", "near"] = "position"
 
 
-class Plane(Table):
+class Plane(TomlTable):
     """A plane by a point and the normal that points proximally."""
 
     point: Vector
     normal: Vector = (0.0, 0.0, 1.0)
 
 
-class Layer(Table):
+class Layer(TomlTable):
     """A layer of tissue under the skin's surface, of one thickness or as thick as the segmented fat says.
 
     With ``thickness = "map"`` its inner face is that of the image's fat, but at least ``min_thickness_mm``
@@ -136,7 +136,7 @@ class Layer(Table):
         return self
 
 
-class GeometryTable(Table):
+class GeometryTable(TomlTable):
     """How surfaces become a model: one ``skin_layer_mm``, or ``layers`` (outermost first) over ``core``."""
 
     skin_layer_mm: Positive = 3.0
@@ -170,7 +170,7 @@ class GeometryTable(Table):
         return self.layers or (Layer(name="skin", thickness_mm=self.skin_layer_mm),)
 
 
-class IndenterTable(Table):
+class IndenterTable(TomlTable):
     """The rigid indenter; the paper's is a square of 20 mm.  ``file`` is the surface of shape ``stl``."""
 
     shape: Literal["square", "sphere", "cylinder", "stl"] = "square"
@@ -188,7 +188,7 @@ class IndenterTable(Table):
         return self
 
 
-class TracesTable(Table):
+class TracesTable(TomlTable):
     """Column names of the records, where they differ from the defaults; units are in the names."""
 
     time_s: str = "time_s"
@@ -197,7 +197,7 @@ class TracesTable(Table):
     smoothing: Annotated[float, Field(ge=0)] | None = None
 
 
-class Site(Table):
+class Site(TomlTable):
     """An indentation site.
 
     ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
@@ -237,7 +237,7 @@ class Site(Table):
         return self
 
 
-class TissueRange(Table):
+class TissueRange(TomlTable):
     """Where one tissue's start or bounds differ from those of all; what is not named here stays."""
 
     start: dict[ParameterName, Positive] = {}
@@ -245,7 +245,7 @@ class TissueRange(Table):
     upper: dict[ParameterName, Positive] = {}
 
 
-class MaterialTable(Table):
+class MaterialTable(TomlTable):
     """Start and bounds of the identification; the defaults are the paper's (section 2.3, table 1).
 
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
@@ -291,14 +291,14 @@ class MaterialTable(Table):
         return self
 
 
-class PriorTable(Table):
+class PriorTable(TomlTable):
     """What is known of a parameter beforehand: lognormal, ``factor`` is one standard deviation either way."""
 
     median: Positive
     factor: Annotated[float, Field(gt=1)]
 
 
-class CalibrationTable(Table):
+class CalibrationTable(TomlTable):
     """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals.
 
     ``fixed``, ``tied`` and ``prior`` name parameters as ``skin.c_kPa``; ``starts`` after one are random.
@@ -337,7 +337,7 @@ class CalibrationTable(Table):
         return (*self.fixed, *(name for group in self.tied for name in group), *self.prior)
 
 
-class UncertaintyTable(Table):
+class UncertaintyTable(TomlTable):
     """What ``limbfit uncertainty`` may spend, and how well geometry and contact are known (one deviation).
 
     ``runs`` are simulations of all fitted sites beyond those of the calibration; of the ``checked``
@@ -355,7 +355,7 @@ class UncertaintyTable(Table):
     edge_radius_mm: Annotated[float, Field(ge=0)] = 1.0
 
 
-class SolverTable(Table):
+class SolverTable(TomlTable):
     """Steps over loading and unloading before the solver adapts them, and how hard the contact is.
 
     ``penalty_per_mm`` is the contact's stiffness over the mean instantaneous shear modulus of the tissues, as
@@ -370,7 +370,7 @@ class SolverTable(Table):
     penalty_per_mm: Positive | None = None
 
 
-class FebioTable(Table):
+class FebioTable(TomlTable):
     """FEBio beside limbfit: where it is, what it may take; ``penalty`` is times its automatic one.
 
     Without ``penalty`` it is given an explicit one, as stiff as limbfit's contact.
@@ -382,7 +382,7 @@ class FebioTable(Table):
     penalty: Positive | None = None
 
 
-class ExecutionTable(Table):
+class ExecutionTable(TomlTable):
     """Workers that simulate side by side, one thread each; 0 means one per core.
 
     What a simulation may take in a worker: wall time in s and memory in GB; 0 means no limit.

@@ -24,13 +24,13 @@ from .tables import (
     SolverTable,
     StudyTable,
     SurfacesTable,
-    Table,
+    TomlTable,
     TracesTable,
     UncertaintyTable,
 )
 
 
-class Study(Table):
+class Study(TomlTable):
     """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
 
     study: StudyTable

@@ -30,7 +30,7 @@ class Shell:
 
 
 @dataclass(frozen=True)
-class Volume:
+class VolumeShape:
     """Tetrahedra, and the faces between them, each once.
 
     points (n, 3) float32; cells (m, 4) uint32; regions (m,) uint8; ``nodes`` (n,): numbers of the points in
@@ -85,7 +85,7 @@ def shell_of(surface: Any) -> Shell:
     return Shell(np.asarray(surface.points, dtype=np.float32), faces.astype(np.uint32))
 
 
-def volume_of(mesh: Mesh) -> Volume:
+def volume_of(mesh: Mesh) -> VolumeShape:
     """A mesh of tetrahedra as arrays to draw.
 
     Raises
@@ -98,7 +98,7 @@ def volume_of(mesh: Mesh) -> Volume:
     nodes, cells = np.unique(mesh.cells[:, :4], return_inverse=True)
     cells = cells.reshape(-1, 4)
     faces, owners, neighbours = _face_table(cells, len(nodes))
-    return Volume(
+    return VolumeShape(
         points=mesh.points[nodes].astype(np.float32),
         cells=cells.astype(np.uint32),
         regions=mesh.regions.astype(np.uint8),
@@ -123,7 +123,7 @@ def _face_table(cells: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64]
     return faces[order[starts]], owners, np.where(sizes == 2, second, _NO_CELL)
 
 
-def interface(volume: Volume, region: int) -> Shell:
+def interface(volume: VolumeShape, region: int) -> Shell:
     """The faces between the regions up to ``region`` (layers, outermost first) and those beyond."""
     inside = volume.neighbours != _NO_CELL
     ours = volume.regions[volume.owners] <= region

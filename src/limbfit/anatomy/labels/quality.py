@@ -33,7 +33,7 @@ class Suspect:
 
 
 @dataclass(frozen=True)
-class Quality:
+class LabelQuality:
     """Measures of each label, and slices to look at; ``axis`` 0, 1, 2 (i, j, k) is the limb's."""
 
     axis: int
@@ -48,7 +48,7 @@ class Quality:
         }
 
 
-def assess(labels: LabelMap) -> Quality:
+def assess(labels: LabelMap) -> LabelQuality:
     """Measure every label and the limb as a whole, and name the slices that do not fit their neighbours."""
     axis = longest_axis(labels.limb, labels)
     order = [*(n for n in range(3) if n != axis), axis]
@@ -61,7 +61,7 @@ def assess(labels: LabelMap) -> Quality:
         if name != SOFT_TISSUE:
             suspects += _odd_slices(name, mask, turned.spacing)
     facts = {name: _facts(mask, turned) for name, mask in masks.items()}
-    return Quality(axis, facts, tuple(sorted(suspects, key=lambda s: (s.slice, s.label))))
+    return LabelQuality(axis, facts, tuple(sorted(suspects, key=lambda s: (s.slice, s.label))))
 
 
 def _facts(mask: Mask, labels: LabelMap) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from ...mesh import Mesh, Quality, quality
+from ...mesh import Mesh, MeshQuality, quality
 from ..surfaces.surfaces import Anatomy, Surface
 from .layered import inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
@@ -95,7 +95,7 @@ def mesh_report(
     )
 
 
-def _warnings(found: Quality, volume_error: float) -> tuple[str, ...]:
+def _warnings(found: MeshQuality, volume_error: float) -> tuple[str, ...]:
     warnings = []
     if found.min_dihedral_deg < GOOD_DIHEDRAL_DEG:
         warnings.append(f"smallest dihedral angle {found.min_dihedral_deg:.1f} degrees; choose smaller edges")

@@ -25,7 +25,7 @@ PronyTerms = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class MaterialTable:
+class LawTable:
     """What the kernels know of a material, or a derivative of it.
 
     ``terms (k, 2)``: Ogden moduli c_k (MPa) and exponents m_k; ``kappa``: bulk modulus (MPa);
@@ -60,10 +60,10 @@ class Material(Protocol):
     def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
         """Derivative of `instantaneous_modulus` with respect to each parameter."""
 
-    def table(self) -> MaterialTable:
+    def table(self) -> LawTable:
         """The material as the kernels read it."""
 
-    def derivatives(self) -> tuple[MaterialTable, ...]:
+    def derivatives(self) -> tuple[LawTable, ...]:
         """Derivative of the table with respect to each parameter."""
 
 
@@ -132,21 +132,21 @@ class Uncoupled(ABC):
     def _shear_modulus_gradient(self) -> Array:
         return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
 
-    def table(self) -> MaterialTable:
+    def table(self) -> LawTable:
         """The material as the kernels read it."""
         prony = np.array(self.prony, dtype=float).reshape(-1, 2)
         law = VOLUMETRIC_LAWS[self.volumetric]
-        return MaterialTable(self.ogden_terms(), self.kappa_ratio * self.shear_modulus, prony, law)
+        return LawTable(self.ogden_terms(), self.kappa_ratio * self.shear_modulus, prony, law)
 
-    def derivatives(self) -> tuple[MaterialTable, ...]:
+    def derivatives(self) -> tuple[LawTable, ...]:
         """Derivative of the table with respect to each parameter."""
         still, slopes = np.zeros((len(self.prony), 2)), self._shear_modulus_gradient
         elastic = [
-            MaterialTable(terms, float(self.kappa_ratio * slope), still)
+            LawTable(terms, float(self.kappa_ratio * slope), still)
             for terms, slope in zip(self.ogden_term_derivatives(), slopes)
         ]
         rest, units = np.zeros_like(self.ogden_terms()), np.eye(2 * len(self.prony))
-        return *elastic, *(MaterialTable(rest, 0.0, unit.reshape(-1, 2)) for unit in units)
+        return *elastic, *(LawTable(rest, 0.0, unit.reshape(-1, 2)) for unit in units)
 
     def _check_shared(self) -> None:
         """Raise `ProblemError` where what all laws share is impossible."""

@@ -17,7 +17,7 @@ from ...errors import CalibrationError, ProblemError
 from .objective import Measured, Simulate, SiteResponse, check_responses, new_doubts, residuals
 from .parameters import Grouping, Space, Unknowns, search_space, two_stages
 from .prediction import error_percent
-from .state import Calibration, CalibrationSettings, Iterate, StageResult, State
+from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .trust_region import FIRST_RADIUS, Point, Step, minimise
 
 Array = NDArray[np.float64]
@@ -39,8 +39,8 @@ def calibrate(
     settings: CalibrationSettings | None = None,
     *,
     stages: Sequence[Grouping] = (),
-    on_iterate: Callable[[State], None] | None = None,
-    state: State | None = None,
+    on_iterate: Callable[[SearchState], None] | None = None,
+    state: SearchState | None = None,
 ) -> Calibration:
     """Find the parameters that bring the simulated forces closest to the measured ones.
 
@@ -81,7 +81,7 @@ def iterate_at(
     unknowns: Unknowns,
     settings: CalibrationSettings,
     groupings: Sequence[Grouping],
-    state: State,
+    state: SearchState,
 ) -> Iterate:
     """The iterate that a state stands at as ``simulate`` sees it now; it is not counted as an evaluation.
 
@@ -162,7 +162,7 @@ class _Run:
         self._here = self.responses(parameters)
         self._responses = {parameters.tobytes(): self._here}
 
-    def first(self) -> tuple[State, Point]:
+    def first(self) -> tuple[SearchState, Point]:
         """The start, or a place between it and the middle of the bounds where all simulations complete.
 
         One where none slips is preferred; folded elements may be the mesh's doing, and are told.
@@ -181,7 +181,7 @@ class _Run:
         if found is None:
             raise CalibrationError(f"no simulation completes near the start parameters: {self.failure}")
         self.accept(space.expand(found.z))
-        state = State(0, tuple(found.z.tolist()), FIRST_RADIUS, self.evaluations)
+        state = SearchState(0, tuple(found.z.tolist()), FIRST_RADIUS, self.evaluations)
         return replace(state, history=(self.iterate(0, found),)), found
 
     def iterate(self, stage: int, point: Point) -> Iterate:
@@ -192,7 +192,7 @@ class _Run:
         )
         return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations, self.failures)
 
-    def states(self, state: State | None) -> Iterator[State]:
+    def states(self, state: SearchState | None) -> Iterator[SearchState]:
         """The first or resumed state, then one for every accepted step, finished stage and new stage."""
         state, point = self.first() if state is None else (state, self.again(state))
         yield state
@@ -209,7 +209,7 @@ class _Run:
             state, point = self._next_stage(state, space.logarithms(point.z))
             yield state
 
-    def again(self, state: State) -> Point:
+    def again(self, state: SearchState) -> Point:
         """The point at which a run was interrupted; its evaluation was counted then."""
         space = self.space(state.stage)
         for _ in range(_TRIES):
@@ -221,7 +221,7 @@ class _Run:
                 return point
         raise CalibrationError(f"the simulation of the stored iterate fails now: {self.failure}")
 
-    def _steps(self, space: Space, point: Point, state: State) -> Iterator[Step]:
+    def _steps(self, space: Space, point: Point, state: SearchState) -> Iterator[Step]:
         done = sum(1 for iterate in state.history if iterate.stage == state.stage) - 1
         paper = self.settings.stopping == "paper"
         pointwise = self.settings.objective == "pointwise" and not paper
@@ -238,7 +238,7 @@ class _Run:
             stop=self._paper_rule(space) if paper else self._valley_rule(state),
         )
 
-    def _after(self, state: State, step: Step) -> State:
+    def _after(self, state: SearchState, step: Step) -> SearchState:
         """The state after an accepted step, the stage closed where it was the last."""
         history = state.history
         if tuple(step.point.z.tolist()) != state.z:
@@ -248,7 +248,7 @@ class _Run:
             mine = [iterate for iterate in history if iterate.stage == state.stage]
             counted = self.evaluations - sum(stage.evaluations for stage in stages)
             stages = (*stages, self._stage_result(state.stage, mine, counted, step))
-        return State(
+        return SearchState(
             state.stage, tuple(step.point.z.tolist()), step.radius, self.evaluations, history, stages,
             self.folds,
         )  # fmt: skip
@@ -260,7 +260,7 @@ class _Run:
             self.stages[stage], last.parameters, last.cost, len(mine) - 1, counted, step.converged, reason
         )
 
-    def _next_stage(self, state: State, logarithms: Array) -> tuple[State, Point]:
+    def _next_stage(self, state: SearchState, logarithms: Array) -> tuple[SearchState, Point]:
         """The same parameters in the next space, in the ratios of the tissues' own starts.
 
         Where all tissues start alike, nothing is simulated unless the bounds forbid the parameters.
@@ -280,9 +280,11 @@ class _Run:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
         self.folds = 0
         history = (*state.history, self.iterate(stage, point))
-        return State(stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages), point
+        return SearchState(
+            stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages
+        ), point
 
-    def _valley_rule(self, state: State) -> Callable[[Point, Point], str]:
+    def _valley_rule(self, state: SearchState) -> Callable[[Point, Point], str]:
         """Ends a creep along a valley in which the data cannot tell one place from another."""
         mine = [iterate for iterate in state.history if iterate.stage == state.stage]
         track = [(iterate.cost, iterate.failures) for iterate in mine]
@@ -314,7 +316,7 @@ class _Run:
         """The paper's objective (sites,) N^2, whatever the objective that is followed."""
         return residuals("paper", self.responses(space.expand(point.z)), self.measured)[0]
 
-    def result(self, state: State) -> Calibration:
+    def result(self, state: SearchState) -> Calibration:
         parameters = np.array(state.history[-1].parameters)
         return Calibration(
             names=self.unknowns.names,

@@ -17,7 +17,7 @@ from .calibration import calibrate, iterate_at
 from .correction import CoarseToFine
 from .objective import Measured, Simulate, SiteResponse, check_responses, new_doubts
 from .parameters import Grouping, Unknowns, search_space, two_stages
-from .state import Calibration, CalibrationSettings, Iterate, StageResult, State
+from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .trust_region import FIRST_RADIUS
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def calibrate_corrected(
     fidelity: FidelitySettings | None = None,
     *,
     stages: Sequence[Grouping] = (),
-    on_iterate: Callable[[State], None] | None = None,
+    on_iterate: Callable[[SearchState], None] | None = None,
 ) -> Corrected:
     """Like :func:`calibrate`, on corrected coarse simulations.
 
@@ -142,7 +142,7 @@ def calibrate_corrected(
 class _Standing:
     """A corrected iterate of a stage, its cost that of the fine forces, and the model as it was there."""
 
-    state: State
+    state: SearchState
     iterate: Iterate
     correction: CoarseToFine
 
@@ -162,8 +162,8 @@ class _Outer:
     settings: CalibrationSettings
     fidelity: FidelitySettings
     stages: tuple[Grouping, ...]
-    on_iterate: Callable[[State], None] | None
-    state: State | None = None
+    on_iterate: Callable[[SearchState], None] | None
+    state: SearchState | None = None
     history: tuple[Iterate, ...] = ()
     ended: tuple[StageResult, ...] = ()
     rounds: tuple[Round, ...] = ()
@@ -216,7 +216,7 @@ class _Outer:
         """The optimum of the model as it is corrected now, from where the round or stage before ended."""
         start = self.state
 
-        def keep(state: State) -> None:
+        def keep(state: SearchState) -> None:
             fresh = state.history[len(() if start is None else start.history) :]
             self.state = state
             if self.on_iterate:

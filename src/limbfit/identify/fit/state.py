@@ -64,7 +64,7 @@ class StageResult:
 
 
 @dataclass(frozen=True)
-class State:
+class SearchState:
     """All that is needed to go on: the current stage, its parameters and trust radius, and what went before.
 
     ``folds``: trials of the stage that were refused for folded elements.
@@ -84,7 +84,7 @@ class State:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> State:
+    def from_dict(cls, content: dict[str, Any]) -> SearchState:
         """The state of :meth:`to_dict`, also after a trip through JSON."""
         return cls(
             stage=int(content["stage"]),

@@ -16,7 +16,7 @@ from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
-from ...identify.fit.state import Calibration, CalibrationSettings, State
+from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
 from ...identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
@@ -198,7 +198,7 @@ class Laboratory:
             lacking.append(share * (fitted.force_N - known))
         return tuple(lacking)
 
-    def _facts(self, state: State) -> dict[str, Any]:
+    def _facts(self, state: SearchState) -> dict[str, Any]:
         """The newest iterate in numbers: error in percent of the largest force, parameters, cost."""
         last = state.history[-1]
         return {
@@ -243,7 +243,7 @@ class Laboratory:
 
         titles = stage_titles(study.tissues)[-len(stages) :]
 
-        def tell(state: State) -> None:
+        def tell(state: SearchState) -> None:
             name = titles[state.history[-1].stage]
             facts = {"of": name, **self._facts(state)}
             words = f"{name}: {_describe(state, study.tissues)}"
@@ -316,7 +316,7 @@ def unknowns(study: Study) -> Unknowns:
     return Unknowns(names, flat("start"), flat("lower"), flat("upper"), priors)
 
 
-def _describe(state: State, tissues: Sequence[str]) -> str:
+def _describe(state: SearchState, tissues: Sequence[str]) -> str:
     last = state.history[-1]
     values = to_parameters(np.array(last.parameters), tissues)
     words = " | ".join(

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..formats import fixed, number
 from ..page import Figure
-from ..store import PARAMETERS, Curves, Json, Store
+from ..store import PARAMETERS, Curves, Json, Results
 from ..tables import SYMBOLS, UNITS, interval
 from .ink import (
     FITTED,
@@ -40,7 +40,9 @@ def thin(curves: Curves) -> Curves:
     return {name: values[::stride] for name, values in curves.items()}
 
 
-def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, columns: int) -> Figure | None:
+def force_figure(
+    store: Results, rows: Iterable[Json], against: str, name: str, columns: int
+) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
     found = [(row, store.curves("predict", row["site"])) for row in rows]
     pairs = [(row, curves) for row, curves in found if curves is not None]
@@ -67,7 +69,7 @@ def force_figure(store: Store, rows: Iterable[Json], against: str, name: str, co
     return Figure(name, svg(drawing, name, alt), caption)
 
 
-def _site_title(store: Store, row: Json, columns: int) -> str:
+def _site_title(store: Results, row: Json, columns: int) -> str:
     region = str(row.get("region") or "")
     head = f"site {row['site']}" + (f", {region}" if region and columns < 3 else "")
     return f"{_short(head, LONGEST_TITLE // (columns - 1 or 1))}: {fixed(row.get('error_percent'))} %"
@@ -91,7 +93,7 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
     ax.margins(x=0.01)
 
 
-def simulated_figure(store: Store) -> Figure | None:
+def simulated_figure(store: Results) -> Figure | None:
     """Force of each indentation that was simulated by itself, against time and displacement."""
     found = [(row, store.curves("simulate", row["site"])) for row in store.simulated]
     pairs = [(row, curves) for row, curves in found if curves is not None]
@@ -112,7 +114,7 @@ def simulated_figure(store: Store) -> Figure | None:
     return Figure("simulated", svg_text, "Force of the simulated indentations.")
 
 
-def compared_figure(store: Store) -> Figure | None:
+def compared_figure(store: Results) -> Figure | None:
     """Force by FEBio and by limbfit, a panel for each site where both were run."""
     pairs = [(row["site"], store.curves("compare", row["site"])) for row in store.compared]
     found = [(site, curves) for site, curves in pairs if curves is not None]
@@ -132,7 +134,7 @@ def compared_figure(store: Store) -> Figure | None:
     return Figure("compared", text, "Force of the same indentation by FEBio and by limbfit.")
 
 
-def convergence_figure(store: Store) -> Figure | None:
+def convergence_figure(store: Results) -> Figure | None:
     """The error and the parameters over the accepted iterates, stage after stage."""
     stages = [stage for stage in store.stages if stage.get("iterations")]
     if not stages:
@@ -178,7 +180,7 @@ def _draw_stage(axes: list[Axes], stage: Json, offset: int) -> int:
     return len(steps)
 
 
-def _finish_convergence(axes: list[Axes], store: Store, stages: list[Json]) -> None:
+def _finish_convergence(axes: list[Axes], store: Results, stages: list[Json]) -> None:
     axes[0].set_title("Error (%)")
     axes[0].set_yscale("log")
     axes[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -195,7 +197,7 @@ def _finish_convergence(axes: list[Axes], store: Store, stages: list[Json]) -> N
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
-def error_figure(store: Store) -> Figure | None:
+def error_figure(store: Results) -> Figure | None:
     """The error of every site as a bar, fitted and held-out told apart by colour and hatching."""
     rows = [row for row in store.predicted if isinstance(row.get("error_percent"), int | float)]
     if not rows:
@@ -221,7 +223,7 @@ def _bar_label(row: Json) -> str:
     return f"{row['site']} ({use})"
 
 
-def interval_figure(store: Store) -> Figure | None:
+def interval_figure(store: Results) -> Figure | None:
     """Start, one-material value, interval and truth of every parameter, as a ratio to the identified one."""
     if not store.stages:
         return None
@@ -255,7 +257,7 @@ def _unit(name: str) -> str:
     return UNITS[name] if UNITS[name] != "–" else ""
 
 
-def _draw_ratio(ax: Axes, store: Store, at: int, tissue: str, name: str) -> None:
+def _draw_ratio(ax: Axes, store: Results, at: int, tissue: str, name: str) -> None:
     stages = store.stages
     value = stages[-1]["parameters"][tissue][name]
     first = at == 0

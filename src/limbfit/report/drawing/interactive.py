@@ -18,7 +18,7 @@ from ...mesh import read_vtu
 from ...web.arrays import pack
 from ...web.shapes import interface, read_shell, shell_of, volume_of
 from ..page import Interactive
-from ..store import PARAMETERS, Curves, Json, Store
+from ..store import PARAMETERS, Curves, Json, Results
 from ..tables import SYMBOLS, UNITS
 from .pictures import BONE, FITTED, HELD_OUT, SKIN_SURFACE, cut_views, drawable, far_side, limb_frame, linear
 
@@ -28,7 +28,7 @@ LAYER = "#c8a13a"
 STRESS = "von_mises_kPa"
 
 
-def explorer(store: Store) -> Interactive | None:
+def explorer(store: Results) -> Interactive | None:
     """Surfaces, layers, bones and sites, the field at the deepest point of each site, and its curves."""
     if "skin" not in store.surface_files:
         return None
@@ -53,7 +53,7 @@ def explorer(store: Store) -> Interactive | None:
     return Interactive("explorer", "model", "The limb in three dimensions.", caption, content)
 
 
-def _surfaces(store: Store, arrays: dict[str, NDArray[Any]]) -> list[Json]:
+def _surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     rows = []
     for name, file in store.surface_files.items():
         shell = read_shell(file, MOST_FACES)
@@ -74,7 +74,7 @@ def _surfaces(store: Store, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     return rows
 
 
-def _layers(store: Store) -> Iterable[tuple[str, Any]]:
+def _layers(store: Results) -> Iterable[tuple[str, Any]]:
     """The inner face of each layer, as in the first stored mesh."""
     file = next((file for site in store.site_names if (file := store.vtu("mesh", site))), None)
     if file is None:
@@ -85,7 +85,7 @@ def _layers(store: Store) -> Iterable[tuple[str, Any]]:
         yield f"inner face of {name}", interface(volume, index)
 
 
-def _site(store: Store, row: Json) -> Json:
+def _site(store: Results, row: Json) -> Json:
     fitted = bool(row.get("fitted"))
     axis = np.asarray(row["axis"], dtype=float)
     known = {one["site"]: one for one in store.predicted}.get(row["site"], {})
@@ -100,7 +100,7 @@ def _site(store: Store, row: Json) -> Json:
     }
 
 
-def _fields(store: Store, arrays: dict[str, NDArray[Any]]) -> list[Json]:
+def _fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     """The cut through each site at its deepest point, as triangles with displacements and stress."""
     stage = "predict" if store.predict else "simulate"
     found = []
@@ -114,7 +114,7 @@ def _fields(store: Store, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     return found
 
 
-def _field(store: Store, row: Json, file: Path) -> dict[str, NDArray[Any]] | None:
+def _field(store: Results, row: Json, file: Path) -> dict[str, NDArray[Any]] | None:
     grid = linear(file)
     if STRESS not in grid.cell_data or "displacement_mm" not in grid.point_data:
         return None
@@ -157,7 +157,7 @@ _COLUMNS = (
 )
 
 
-def _site_curves(store: Store, site: str) -> Json | None:
+def _site_curves(store: Results, site: str) -> Json | None:
     """What is known of a site's force: predicted, else simulated by itself, else as recorded."""
     for stage in ("predict", "simulate", "traces"):
         curves = store.curves(stage, site)
@@ -166,7 +166,7 @@ def _site_curves(store: Store, site: str) -> Json | None:
     return None
 
 
-def record_curves(store: Store, sites: Sequence[str]) -> Interactive | None:
+def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
     """Each record as the robot wrote it and regularised, to choose from."""
     choices = {}
     for site in sites:
@@ -199,7 +199,7 @@ def record_curves(store: Store, sites: Sequence[str]) -> Interactive | None:
     return Interactive("records", "records", "Records of all sites.", caption, {"sites": choices})
 
 
-def convergence_curves(store: Store) -> Interactive | None:
+def convergence_curves(store: Results) -> Interactive | None:
     """The error and each parameter over the accepted iterates of all stages."""
     steps = [(stage, step) for stage in store.stages for step in stage.get("iterations") or ()]
     if not steps:

@@ -16,7 +16,7 @@ from vtkmodules.vtkCommonCore import vtkLogger
 
 from ...web.shapes import patient_frame
 from ..page import Figure
-from ..store import Json, Store
+from ..store import Json, Results
 from .panels import FIELD_MAP, PAPER, Mark, Shot, View, colour_bar, legend, strip
 
 SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
@@ -40,7 +40,7 @@ def unit(values: Iterable[float]) -> Array:
     return v / np.linalg.norm(v)
 
 
-def limb_frame(store: Store) -> Array:
+def limb_frame(store: Results) -> Array:
     """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
     return patient_frame(store.surfaces.get("cut_normal"))
 
@@ -78,7 +78,7 @@ def new_plotter() -> Any:
 
 
 @without_display_warning()
-def surface_figure(store: Store) -> Figure | None:
+def surface_figure(store: Results) -> Figure | None:
     """The limb from four sides: skin translucent, bones inside, sites named on the side that shows them."""
     files = store.surface_files
     if "skin" not in files:
@@ -102,7 +102,7 @@ def surface_figure(store: Store) -> Figure | None:
 
 
 @without_display_warning()
-def marker_figure(store: Store) -> Figure | None:
+def marker_figure(store: Results) -> Figure | None:
     """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
     marked_file, plain_file = store.folder / "segment" / "skin-markers.stl", store.surface_files.get("skin")
     if plain_file is None or not marked_file.is_file():
@@ -127,7 +127,7 @@ def marker_figure(store: Store) -> Figure | None:
     return Figure("markers", strip(shots, SIDES, alt) + bar, caption)
 
 
-def four_sides(store: Store, skin: Any) -> list[View]:
+def four_sides(store: Results, skin: Any) -> list[View]:
     """Views of the whole limb, in the order of ``SIDES``."""
     left, back, up = limb_frame(store)
     points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
@@ -137,7 +137,7 @@ def four_sides(store: Store, skin: Any) -> list[View]:
     return [View(np.array(skin.center), side, up, half[2], size) for side in (back, -left, -back, left)]
 
 
-def _facing(store: Store, view: View) -> list[Mark]:
+def _facing(store: Results, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
     marks = []
     for row in store.sites:
@@ -154,7 +154,7 @@ def site_mark(row: Json, axis: bool = False) -> Mark:
 
 
 @without_display_warning()
-def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
+def mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
     rows = drawable(store, sites, "mesh")
     if not rows:
@@ -187,7 +187,7 @@ def mesh_figure(store: Store, sites: Sequence[str]) -> Figure | None:
 
 
 @without_display_warning()
-def field_figure(store: Store, sites: Sequence[str], stage: str, name: str) -> Figure | None:
+def field_figure(store: Results, sites: Sequence[str], stage: str, name: str) -> Figure | None:
     """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
     rows = drawable(store, sites, stage)
     grids = [(row, file, linear(file)) for row, file in rows]
@@ -221,7 +221,7 @@ def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float])
     return pixels
 
 
-def drawable(store: Store, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
+def drawable(store: Results, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
     """Sites with a place and a stored mesh."""
     rows = {row["site"]: row for row in store.sites if row.get("position_mm") and row.get("axis")}
     found = [(rows[name], store.vtu(stage, name)) for name in sites if name in rows]
@@ -245,7 +245,7 @@ def linear(file: Path) -> Grid:
     return plain
 
 
-def cut_views(store: Store, row: Json, file: Path) -> tuple[View, View]:
+def cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
     """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
     up = limb_frame(store)[2]
     axis = unit(row["axis"])

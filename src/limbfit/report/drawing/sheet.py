@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...anatomy.grid import FAT, SOFT_TISSUE, LabelMap, Volume
 from ...anatomy.labels.contours import outlines
-from ...anatomy.labels.quality import LIMB, Quality
+from ...anatomy.labels.quality import LIMB, LabelQuality
 
 Mask = NDArray[np.bool_]
 
@@ -25,7 +25,7 @@ _MOST = 6  # suspects drawn
 _MARGIN = 4  # voxels around the limb
 
 
-def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Quality) -> None:
+def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: LabelQuality) -> None:
     """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
     order = [*(n for n in range(3) if n != quality.axis), quality.axis]
     image, turned = volume.turned(order), labels.turned(order)
@@ -85,7 +85,7 @@ def _evenly(limb: Mask) -> list[int]:
     return [int(filled[n]) for n in np.unique(np.linspace(0, len(filled) - 1, count).round().astype(int))]
 
 
-def _worst(quality: Quality) -> list[tuple[int, str]]:
+def _worst(quality: LabelQuality) -> list[tuple[int, str]]:
     """Slices to look at with what is odd there, at most six, evenly taken from all."""
     said: dict[int, list[str]] = {}
     for suspect in quality.suspects:

@@ -6,10 +6,10 @@ import base64
 from html import escape
 
 from ..page import Figure
-from ..store import Store
+from ..store import Results
 
 
-def slices_figure(store: Store) -> Figure | None:
+def slices_figure(store: Results) -> Figure | None:
     """The stored picture of outlines over slices, and what its slices to look at are."""
     file = store.folder / "segment" / "quality.png"
     if not file.is_file():

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from ...errors import InputError
 from ...mesh import dihedral_angles
-from ..store import Json, Store, load_store
+from ..store import Json, Results, load_store
 from .panels import FIELD_MAP, Drawing, Key, Mark, Row, Shot, View, sheet, write_png
 from .pictures import (
     BONE,
@@ -62,7 +62,7 @@ def draw_stage(results: Path, stage: str, file: Path) -> Path:
     return file
 
 
-def surfaces_sheet(store: Store) -> Drawing:
+def surfaces_sheet(store: Results) -> Drawing:
     """Four sides: skin translucent over the bones with the plane of the cut; and tissue in colours."""
     skin = pv.read(store.surface_files["skin"])
     plotter = _limb_plotter(store, skin)
@@ -80,7 +80,7 @@ def surfaces_sheet(store: Store) -> Drawing:
     return sheet("Surfaces", rows, keys)
 
 
-def sites_sheet(store: Store) -> Drawing:
+def sites_sheet(store: Results) -> Drawing:
     """Four sides: every site on the side that shows it, with the axis of the indenter."""
     skin = pv.read(store.surface_files["skin"])
     regions = list(dict.fromkeys(str(row.get("region") or "") for row in store.sites))
@@ -105,7 +105,7 @@ def sites_sheet(store: Store) -> Drawing:
     return sheet("Sites, with the axis of the indenter", [Row(shots, SIDES)], keys)
 
 
-def mesh_sheet(store: Store) -> Drawing:
+def mesh_sheet(store: Results) -> Drawing:
     """Meshes of some sites cut through the site, near it, and how sharp their elements are."""
     names = (store.fitted or store.site_names)[:MESHES]
     whole: list[Shot] = []
@@ -149,7 +149,7 @@ def _histogram(drawing: Drawing, angles: dict[str, Any]) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _limb_plotter(store: Store, skin: Any) -> Any:
+def _limb_plotter(store: Results, skin: Any) -> Any:
     """The translucent skin with the bones inside."""
     plotter = new_plotter()
     plotter.enable_depth_peeling(8)
@@ -166,7 +166,7 @@ def _shots(plotter: Any, views: Sequence[View]) -> list[Shot]:
     return shots
 
 
-def _cut_plane(store: Store, skin: Any) -> Any:
+def _cut_plane(store: Results, skin: Any) -> Any:
     normal, point = unit(store.surfaces["cut_normal"]), np.array(store.surfaces["cut_point"])
     near = np.asarray(skin.points)[np.abs((skin.points - point) @ normal) < 3.0]
     centre = near.mean(axis=0) if len(near) else point
@@ -180,7 +180,7 @@ def _cut_plane(store: Store, skin: Any) -> Any:
     )
 
 
-def _thicknesses(store: Store, skin: Any) -> list[tuple[Any, str]]:
+def _thicknesses(store: Results, skin: Any) -> list[tuple[Any, str]]:
     """What is known on the skin: tissue down to the nearest bone, and the fat's depth where it was mapped."""
     found = []
     bones = [pv.read(file) for name, file in store.surface_files.items() if name != "skin"]

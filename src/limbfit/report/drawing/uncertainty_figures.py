@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Drawing
 
 from ..formats import fixed
 from ..page import Figure
-from ..store import Json, Store
+from ..store import Json, Results
 from ..tables import SYMBOLS
 from .ink import (
     INK,
@@ -29,7 +29,7 @@ from .ink import (
 _MOST_DRAWS, _MOST_SITES = 300, 18
 
 
-def true_values(store: Store) -> dict[str, tuple[float, dict[str, Any]]]:
+def true_values(store: Results) -> dict[str, tuple[float, dict[str, Any]]]:
     """The phantom's true parameters by name, with their line; none for a patient."""
     found = store.truth.get("parameters") or {}
     return {
@@ -39,7 +39,7 @@ def true_values(store: Store) -> dict[str, tuple[float, dict[str, Any]]]:
     }
 
 
-def pairs_figure(store: Store, content: Json) -> Figure | None:
+def pairs_figure(store: Results, content: Json) -> Figure | None:
     """Draws of the posterior, every parameter against every other, in logarithms."""
     draws = store.curves("uncertainty", "draws")
     if draws is None:
@@ -107,7 +107,7 @@ def _name_axes(ax: Axes, names: list[str], i: int, j: int) -> None:
         ax.set_ylabel(short(names[i]), fontsize=7)
 
 
-def prediction_figure(store: Store, content: Json) -> Figure | None:
+def prediction_figure(store: Results, content: Json) -> Figure | None:
     """Records beside their prediction intervals, held-out sites first."""
     rows = sorted(content["predictions"]["sites"], key=lambda row: row["fitted"])[:_MOST_SITES]
     found = [(row, store.curves("uncertainty", f"predictions/{row['site']}")) for row in rows]

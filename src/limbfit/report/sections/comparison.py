@@ -5,10 +5,10 @@ from __future__ import annotations
 from ..drawing import figures
 from ..formats import fixed
 from ..page import Block, Cell, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 
 
-def comparison(store: Store) -> Section:
+def comparison(store: Results) -> Section:
     """Curves and differences of the sites that ``limbfit compare`` solved."""
     words = Prose(
         "The same mesh, materials and history by FEBio and by limbfit: once with limbfit's own contact, "
@@ -21,7 +21,7 @@ def comparison(store: Store) -> Section:
     return Section("comparison", "Comparison with FEBio", blocks)
 
 
-def _table(store: Store) -> Table:
+def _table(store: Results) -> Table:
     head = ("Site", "FEBio (N)", "limbfit (N)", "Largest difference (%)", "With FEBio's penalty (%)", "FEBio")
     return Table("compared", "Largest forces and differences.", head, tuple(map(_row, store.compared)))
 

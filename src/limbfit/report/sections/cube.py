@@ -23,14 +23,14 @@ from ..drawing.ink import (
 )
 from ..formats import fixed, heading, number, numeric
 from ..page import Cell, Figure, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))
 _OTHERS = ((ONE_MATERIAL, "--"), (TRUTH, "-."), (THIRD, (0, (6, 2))), (MUTED, ":"), (MEASURED, (0, (1, 2))))
 
 
-def cube_section(store: Store, content: Json) -> Section:
+def cube_section(store: Results, content: Json) -> Section:
     """What the experiment ``cube`` found."""
     own = [row for row in content["tissues"] if row["source"] == "this study"]
     softest = [

@@ -8,14 +8,14 @@ import numpy as np
 from ..drawing.ink import INK, MUTED, ONE_MATERIAL, SIMULATED, STYLE, THIRD, legend_above, panels, svg
 from ..formats import fixed, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 from ..tables import SYMBOLS
 
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))
 _WIDEST = 100.0  # factor that is drawn
 
 
-def design_section(store: Store, content: Json) -> Section:
+def design_section(store: Results, content: Json) -> Section:
     """What the experiment ``design`` found."""
     noise = content["noise"]
     searched = "all choices were compared" if content["designs"][0]["exhaustive"] else (

@@ -6,7 +6,7 @@ from collections import Counter
 
 from ..formats import fixed, heading, numeric
 from ..page import Bullets, Cell, Row, Table
-from ..store import Json, Store
+from ..store import Json, Results
 
 _WORDS = {
     "folded": "elements inside out",
@@ -17,7 +17,7 @@ _WORDS = {
 }
 
 
-def search_doubts(store: Store) -> tuple[Bullets | Table, ...]:
+def search_doubts(store: Results) -> tuple[Bullets | Table, ...]:
     """What the record of the identification says of its doubtful simulations; nothing where none is."""
     found = store.calibration.get("doubts") or {}
     rows, answer = found.get("search") or [], found.get("answer") or {}
@@ -40,7 +40,7 @@ def search_doubts(store: Store) -> tuple[Bullets | Table, ...]:
 _SAME_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
 
-def _contact(store: Store) -> Json:
+def _contact(store: Results) -> Json:
     return dict(store.calibration.get("contact") or {})
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from ..formats import fixed, heading, number, numeric
 from ..page import Bullets, Cell, Note, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 from ..tables import NOTHING
 
 _LARGE = 4.0  # standardised errors from here on are marked
 
 
-def doubts(store: Store) -> Section:
+def doubts(store: Results) -> Section:
     """Flags, what speaks for each, and every site predicted without itself."""
     flags, left_out = store.predict.get("flags") or [], store.predict.get("left_out") or []
     if flags:
@@ -27,7 +27,7 @@ def doubts(store: Store) -> Section:
     )
 
 
-def _not_looked_at(store: Store) -> tuple[Note, ...]:
+def _not_looked_at(store: Results) -> tuple[Note, ...]:
     """What failed, and so was not compared."""
     sites = [
         str(row["site"]) for row in store.predicted if row.get("not_predicted", {}).keys() - {"one_material"}
@@ -68,7 +68,7 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _left_out_tables(store: Store, left_out: list[Json]) -> tuple[Table, ...]:
+def _left_out_tables(store: Results, left_out: list[Json]) -> tuple[Table, ...]:
     if not left_out:
         return ()
     rows = tuple(

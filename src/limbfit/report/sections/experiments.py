@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ..page import Note, Section
-from ..store import Json, Store
+from ..store import Json, Results
 from .cube import cube_section
 from .design import design_section
 from .regions import regions_section
@@ -13,7 +13,7 @@ from .sensitivity import SENSITIVITIES
 from .uncertainty import uncertainty_section
 from .validation import validation_section
 
-Maker = Callable[[Store, Json], Section]
+Maker = Callable[[Results, Json], Section]
 # By the name of the experiment; a maker is given the store and what ``<name>.json`` holds.
 MAKERS: dict[str, Maker] = {
     "uncertainty": uncertainty_section,
@@ -25,7 +25,7 @@ MAKERS: dict[str, Maker] = {
 }
 
 
-def experiment_sections(store: Store) -> tuple[Section, ...]:
+def experiment_sections(store: Results) -> tuple[Section, ...]:
     """A section for each finished experiment, then one that names those that are stale."""
     done = store.experiments
     sections = [make(store, done[name]) for name, make in MAKERS.items() if name in done]

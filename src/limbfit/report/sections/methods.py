@@ -9,18 +9,18 @@ from collections.abc import Iterable, Sequence
 
 from ..formats import fixed, number
 from ..page import Prose, Section
-from ..store import PARAMETERS, Json, Store
+from ..store import PARAMETERS, Json, Results
 from ..tables import NOTHING, SYMBOLS, UNITS, flatten, mean_and_deviation
 
 Part = tuple[str, str]  # a heading and its paragraph
 
 
-def method_section(store: Store) -> Section:
+def method_section(store: Results) -> Section:
     """The parts as paragraphs, each after its heading."""
     return Section("method", "Methods", tuple(Prose(f"{head}. {text}") for head, text in method_parts(store)))
 
 
-def method_markdown(store: Store) -> str:
+def method_markdown(store: Results) -> str:
     """The same as Markdown, with every setting as a table at its end."""
     name = str((store.run.get("study") or {}).get("name") or "Unnamed study")
     lines = [f"# Methods: {name}", ""]
@@ -37,7 +37,7 @@ def _cell(text: str) -> str:
     return str(text).replace("|", "\\|").replace("\n", " ")
 
 
-def method_parts(store: Store) -> tuple[Part, ...]:
+def method_parts(store: Results) -> tuple[Part, ...]:
     """Heading and paragraph of every part of which something is stored."""
     parts = (
         ("Geometry", _geometry(store)),
@@ -55,7 +55,7 @@ def method_parts(store: Store) -> tuple[Part, ...]:
     return tuple((head, text) for head, text in parts if text)
 
 
-def _settings(store: Store, table: str) -> Json:
+def _settings(store: Results, table: str) -> Json:
     return (store.run.get("settings") or {}).get(table) or {}
 
 
@@ -63,7 +63,7 @@ def _said(sentences: Iterable[str]) -> str:
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _geometry(store: Store) -> str:
+def _geometry(store: Results) -> str:
     geometry = _settings(store, "geometry")
     source = store.segment.get("method")
     start = (
@@ -108,7 +108,7 @@ def _layers(geometry: Json) -> str:
     return f"Over the {geometry.get('core')} lie, outermost first: {', '.join(words)}."
 
 
-def _indentations(store: Store) -> str:
+def _indentations(store: Results) -> str:
     if not store.traces:
         return ""
     facts = tuple(store.traces.values())
@@ -142,7 +142,7 @@ def _range(facts: Iterable[Json], key: str, digits: int) -> str:
     return f"{fixed(min(values), digits)} to {fixed(max(values), digits)}" if values else NOTHING
 
 
-def _meshes(store: Store) -> str:
+def _meshes(store: Results) -> str:
     table = _settings(store, "mesh")
     if not store.mesh:
         return ""
@@ -181,7 +181,7 @@ def _pairs(table: Json) -> str:
     return ", ".join(f"{key} = {value}" for key, value in table.items() if value not in (None, [], ""))
 
 
-def _law(store: Store) -> str:
+def _law(store: Results) -> str:
     kappa = number(_settings(store, "material").get("kappa_ratio"))
     return (
         "As in Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater. 59, 379), each "
@@ -193,7 +193,7 @@ def _law(store: Store) -> str:
     )
 
 
-def _contact(store: Store) -> str:
+def _contact(store: Results) -> str:
     indenter, solver = _settings(store, "indenter"), _settings(store, "solver")
     if not indenter:
         return ""
@@ -217,7 +217,7 @@ def _contact(store: Store) -> str:
     )
 
 
-def _solution(store: Store) -> str:
+def _solution(store: Results) -> str:
     solver = _settings(store, "solver")
     if not solver:
         return ""
@@ -236,7 +236,7 @@ def _solution(store: Store) -> str:
     ).replace(" .", ".")
 
 
-def _identification(store: Store) -> str:
+def _identification(store: Results) -> str:
     table, found = _settings(store, "calibration"), store.calibration
     if not store.stages:
         return ""
@@ -340,7 +340,7 @@ def _mesh_error(sites: Json) -> str:
     return f", and for the error of the meshes: {least} to {most} % of the largest force, from others"
 
 
-def _uncertainty(store: Store) -> str:
+def _uncertainty(store: Results) -> str:
     residuals = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
     if not residuals:
         return ""
@@ -357,7 +357,7 @@ def _uncertainty(store: Store) -> str:
     )
 
 
-def _prediction(store: Store) -> str:
+def _prediction(store: Results) -> str:
     if not store.predict:
         return ""
     held = [row for row in store.predicted if not row.get("fitted")]
@@ -371,7 +371,7 @@ def _prediction(store: Store) -> str:
     )
 
 
-def _experiments(store: Store) -> str:
+def _experiments(store: Results) -> str:
     rows = store.run.get("experiments") or {}
     done = []
     for name in store.experiments:
@@ -382,7 +382,7 @@ def _experiments(store: Store) -> str:
     return f"Done beside the identification, with their options: {', '.join(done)}." if done else ""
 
 
-def _software(store: Store) -> str:
+def _software(store: Results) -> str:
     versions = store.run.get("versions") or {}
     if not store.run.get("limbfit"):
         return ""

@@ -9,13 +9,13 @@ from ..drawing.figures import thin
 from ..drawing.ink import GRID, INK, MUTED, SIMULATED, STYLE, legend_above, panels, svg
 from ..formats import fixed, heading, numeric
 from ..page import Cell, Figure, Row, Table
-from ..store import Curves, Json, Store
+from ..store import Curves, Json, Results
 from ..tables import NOTHING
 
 MOST_NAMED = 6  # phases whose names have room in a panel
 
 
-def record_figure(store: Store, site: str) -> Figure | None:
+def record_figure(store: Results, site: str) -> Figure | None:
     """Figure 3: one site's record as the robot wrote it, and regularised from touch-down on."""
     raw, regular = store.curves("traces", f"{site}-raw"), store.curves("traces", site)
     if raw is None or regular is None:
@@ -74,7 +74,7 @@ def _mark_phases(ax: Axes, phases: list[Json]) -> None:
             )  # fmt: skip
 
 
-def trace_table(store: Store) -> Table:
+def trace_table(store: Results) -> Table:
     """Touch-down, peak, noise and phases of every record."""
     head = (
         "Site",

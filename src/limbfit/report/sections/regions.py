@@ -8,13 +8,13 @@ from matplotlib.axes import Axes
 from ..drawing.ink import HELD_OUT, INK, SIMULATED, STYLE, panels, svg, tissue_style
 from ..formats import fixed, heading, number, numeric
 from ..page import Bullets, Cell, Figure, Prose, Row, Section, Table
-from ..store import PARAMETERS, Json, Store
+from ..store import PARAMETERS, Json, Results
 from ..tables import MEANING, SYMBOLS, UNITS, tissue_name
 
 WIDEST = 1e3  # of an interval over its value, in the figure
 
 
-def regions_section(store: Store, content: Json) -> Section:
+def regions_section(store: Results, content: Json) -> Section:
     """What the experiment ``regions`` found."""
     every = content["sites_used"] == "all"
     used = (
@@ -48,7 +48,7 @@ def _open(content: Json) -> str:
     )
 
 
-def _parameter_table(store: Store, content: Json) -> Table:
+def _parameter_table(store: Results, content: Json) -> Table:
     regions = content["regions"]
     head = ("Tissue", "Parameter", "Unit", "Start", "Whole limb", *(_head(row) for row in regions))
     rows = tuple(

@@ -10,7 +10,7 @@ from ..drawing.interactive import convergence_curves, explorer, record_curves
 from ..drawing.slices import slices_figure
 from ..formats import fixed
 from ..page import Block, Bullets, Figure, Note, Page, Prose, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 from .comparison import comparison
 from .doubted import search_doubts
 from .doubts import doubts
@@ -25,11 +25,11 @@ PRIVACY = (
 )
 
 
-def make_page(store: Store) -> Page:
+def make_page(store: Results) -> Page:
     """Every section in the order in which a reader asks."""
     study = store.run.get("study") or {}
     name = str(study.get("name") or "Unnamed study")
-    makers: tuple[Callable[[Store], Section], ...] = (
+    makers: tuple[Callable[[Results], Section], ...] = (
         model,
         meshes,
         records,
@@ -39,7 +39,7 @@ def make_page(store: Store) -> Page:
         parameters,
         convergence,
     )
-    closing: tuple[Callable[[Store], Section], ...] = (
+    closing: tuple[Callable[[Results], Section], ...] = (
         simulated,
         comparison,
         solver,
@@ -48,7 +48,7 @@ def make_page(store: Store) -> Page:
         settings,
         provenance,
     )
-    absent: dict[Callable[[Store], Section], bool] = {
+    absent: dict[Callable[[Results], Section], bool] = {
         simulated: not store.simulated,
         comparison: not store.compared,
         doubts: "flags" not in store.predict,
@@ -74,7 +74,7 @@ def _blocks(*blocks: Block | None, otherwise: str) -> tuple[Block, ...]:
     return found or (Note(otherwise),)
 
 
-def model(store: Store) -> Section:
+def model(store: Results) -> Section:
     """Surfaces, sites and volumes."""
     blocks = _blocks(
         explorer(store),
@@ -92,7 +92,7 @@ def model(store: Store) -> Section:
     return Section("model", "The model", blocks)
 
 
-def meshes(store: Store) -> Section:
+def meshes(store: Results) -> Section:
     """Cut meshes and their quality."""
     warnings = tuple(
         f"Site {site}: {text}"
@@ -108,7 +108,7 @@ def meshes(store: Store) -> Section:
     return Section("meshes", "Meshes", blocks)
 
 
-def records(store: Store) -> Section:
+def records(store: Results) -> Section:
     """Indentation records."""
     chosen = [site for site in (*store.fitted, *store.traces) if store.curves("traces", site)]
     blocks = _blocks(
@@ -120,7 +120,7 @@ def records(store: Store) -> Section:
     return Section("records", "Indentation records", blocks)
 
 
-def fit(store: Store) -> Section:
+def fit(store: Results) -> Section:
     """Force against time at the fitted sites."""
     rows = [row for row in store.predicted if row.get("fitted")]
     blocks = _blocks(
@@ -131,7 +131,7 @@ def fit(store: Store) -> Section:
     return Section("fit", "Fitted sites", blocks)
 
 
-def prediction(store: Store) -> Section:
+def prediction(store: Results) -> Section:
     """Everything about the sites that were not used, and table 2."""
     rows = [row for row in store.predicted if not row.get("fitted")]
     blocks = _blocks(
@@ -146,7 +146,7 @@ def prediction(store: Store) -> Section:
     return Section("prediction", "All sites, held-out sites", blocks)
 
 
-def parameters(store: Store) -> Section:
+def parameters(store: Results) -> Section:
     """Table 1, intervals and correlations."""
     found: tuple[Block | None, ...] = ()
     if store.stages:
@@ -165,7 +165,7 @@ def parameters(store: Store) -> Section:
     return Section("parameters", "Parameters", blocks)
 
 
-def _residuals(store: Store) -> str:
+def _residuals(store: Results) -> str:
     """What the intervals rest on: noise, misfit of the model and error of the mesh, site by site."""
     found = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
     rows = found.get("sites") or {}
@@ -192,7 +192,7 @@ def _residuals(store: Store) -> str:
     )
 
 
-def convergence(store: Store) -> Section:
+def convergence(store: Results) -> Section:
     """How the identification went."""
     stages = store.stages
     texts = tuple(
@@ -222,7 +222,7 @@ def _doubts(rows: Sequence[Json]) -> Bullets | None:
     return Bullets(texts) if texts else None
 
 
-def simulated(store: Store) -> Section:
+def simulated(store: Results) -> Section:
     """Indentations that were simulated one by one."""
     names = [str(row["site"]) for row in store.simulated][:4]
     blocks = _blocks(
@@ -246,7 +246,7 @@ def _corrections(rounds: Sequence[Json]) -> str | None:
     return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
 
 
-def solver(store: Store) -> Section:
+def solver(store: Results) -> Section:
     """What the simulations say about themselves."""
     facts = {
         "Objective": store.calibration.get("objective"),
@@ -274,7 +274,7 @@ def solver(store: Store) -> Section:
     return Section("solver", "Solver", blocks)
 
 
-def timing(store: Store) -> Section:
+def timing(store: Results) -> Section:
     """How long it took, and on what."""
     machine = store.run.get("machine") or {}
     words = [
@@ -291,7 +291,7 @@ def timing(store: Store) -> Section:
     return Section("timing", "Computing time", blocks)
 
 
-def settings(store: Store) -> Section:
+def settings(store: Results) -> Section:
     """Every setting of the study file."""
     flat = tables.flatten(store.run.get("settings") or {})
     table = tables.pair_table(
@@ -301,7 +301,7 @@ def settings(store: Store) -> Section:
     return Section("settings", "Settings", blocks)
 
 
-def provenance(store: Store) -> Section:
+def provenance(store: Results) -> Section:
     """Versions and hashes: what someone else needs to get the same numbers."""
     versions = {"limbfit": store.run.get("limbfit")} | (store.run.get("versions") or {})
     inputs = store.run.get("inputs") or {}

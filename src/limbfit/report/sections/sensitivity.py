@@ -24,7 +24,7 @@ from ..drawing.ink import (
 )
 from ..formats import fixed, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 from ..tables import NOTHING
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
@@ -39,7 +39,7 @@ _CHANGES = (
 _EFFORT = (("Steps", "steps", 0), ("Cut", "cuts", 0), ("Newton iterations", "newton_iterations", 0))
 
 
-def stiffness_section(store: Store, content: Json) -> Section:
+def stiffness_section(store: Results, content: Json) -> Section:
     """Force against c of each tissue at equal m, at thin and thick sites, and its derivatives everywhere."""
     name = "sensitivity-c"
     words = Prose(
@@ -95,7 +95,7 @@ def _finding(content: Json) -> str:
     return _sentence(found)
 
 
-def _stiffness_figure(store: Store, content: Json) -> Figure:
+def _stiffness_figure(store: Results, content: Json) -> Figure:
     sites = content["sites"][:2]
     drawing, axes = panels(len(sites) + 1, len(sites) + 1, 2.9)
     tissues = list(content["parameters"])
@@ -115,7 +115,7 @@ def _stiffness_figure(store: Store, content: Json) -> Figure:
     return Figure("sensitivity-c", svg(drawing, "sensitivity-c", "Force against c of each tissue"), caption)
 
 
-def _draw_curves(ax: Axes, store: Store, name: str, site: Json, content: Json) -> None:
+def _draw_curves(ax: Axes, store: Results, name: str, site: Json, content: Json) -> None:
     """Force against time of every variant of a site."""
     curves = store.curves(name, site["site"]) or {}
     rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
@@ -160,7 +160,7 @@ def _derivative_table(content: Json) -> Table:
     return Table("sensitivity-c-local", caption, head, rows)
 
 
-def kappa_section(store: Store, content: Json) -> Section:
+def kappa_section(store: Results, content: Json) -> Section:
     """The ratio of bulk modulus to c, and the change of volume that it allows."""
     name = "sensitivity-kappa"
     columns = (
@@ -225,7 +225,7 @@ def _kappa_figure(content: Json) -> Figure:
     return Figure(name, svg(drawing, name, "Force and ratio of volumes against the bulk modulus"), caption)
 
 
-def contact_section(store: Store, content: Json) -> Section:
+def contact_section(store: Results, content: Json) -> Section:
     """Sticky against frictionless contact."""
     words = Prose(
         f"The skin under the indenter slips freely in this study's model ({content['friction']}), or "
@@ -239,7 +239,7 @@ def contact_section(store: Store, content: Json) -> Section:
     return _simple(store, "sensitivity-contact", "Sensitivity to friction", words, content, _EFFORT)
 
 
-def indenter_section(store: Store, content: Json) -> Section:
+def indenter_section(store: Results, content: Json) -> Section:
     """The square against a sphere and others."""
     words = Prose(
         "The same displacement and width with other indenters. The paper expects of a sphere that "
@@ -261,7 +261,7 @@ def _peaks(content: Json) -> str:
     )
 
 
-def mesh_section(store: Store, content: Json) -> Section:
+def mesh_section(store: Results, content: Json) -> Section:
     """Mesh independence."""
     name = "sensitivity-mesh"
     words = Prose(
@@ -307,7 +307,7 @@ def _limits(content: Json) -> str:
     return _sentence(parts)
 
 
-def _mesh_figure(store: Store, content: Json) -> Figure:
+def _mesh_figure(store: Results, content: Json) -> Figure:
     sites = content["sites"][:2]
     drawing, axes = panels(len(sites) + 1, len(sites) + 1, 2.7)
     with matplotlib.rc_context(STYLE):
@@ -334,7 +334,7 @@ def _mesh_figure(store: Store, content: Json) -> Figure:
 
 
 def _simple(
-    store: Store, name: str, title: str, words: Block, content: Json, more: Iterable[tuple[str, str, int]]
+    store: Results, name: str, title: str, words: Block, content: Json, more: Iterable[tuple[str, str, int]]
 ) -> Section:
     """Curves of every site, and the table of its runs."""
     drawing, axes = panels(len(content["sites"]), 2, 2.7)
@@ -380,7 +380,7 @@ def _partial(content: Json) -> tuple[Block, ...]:
     return (Bullets(tuple(texts)),) if texts else ()
 
 
-SENSITIVITIES: dict[str, Callable[[Store, Json], Section]] = {
+SENSITIVITIES: dict[str, Callable[[Results, Json], Section]] = {
     "sensitivity-c": stiffness_section,
     "sensitivity-kappa": kappa_section,
     "sensitivity-contact": contact_section,

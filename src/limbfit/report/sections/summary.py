@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from .. import tables
 from ..formats import fixed, number
 from ..page import Block, Bullets, KeyNumber, Prose
-from ..store import PARAMETERS, Store
+from ..store import PARAMETERS, Results
 
 _RANKS = {"determined": 0, "weakly": 1, "not": 2}
 
 
-def key_numbers(store: Store) -> tuple[KeyNumber, ...]:
+def key_numbers(store: Results) -> tuple[KeyNumber, ...]:
     """The numbers that a reader looks for first."""
     found = []
     if store.predict:
@@ -34,13 +34,13 @@ def _short_time(seconds: float) -> tuple[str, str]:
     return (f"{seconds:.0f}", "s") if seconds < 120 else (f"{seconds / 60:.0f}", "min")
 
 
-def _with_interval(store: Store, tissue: str) -> str:
+def _with_interval(store: Results, tissue: str) -> str:
     limits = tables.interval(store, tissue, "c_kPa")
     text = f"{tissue}, long-term shear modulus c"
     return f"{text} ({number(limits[0])} to {number(limits[1])} kPa)" if limits else text
 
 
-def summary(store: Store) -> tuple[Block, ...]:
+def summary(store: Results) -> tuple[Block, ...]:
     """One paragraph in plain words, then the verdict."""
     sentences = [_what_was_done(store), _how_well(store), _one_or_two(store)]
     blocks: list[Block] = [Prose(" ".join(sentence for sentence in sentences if sentence))]
@@ -48,7 +48,7 @@ def summary(store: Store) -> tuple[Block, ...]:
     return (*blocks, Bullets(words)) if words else tuple(blocks)
 
 
-def _what_was_done(store: Store) -> str:
+def _what_was_done(store: Results) -> str:
     names, fitted = store.site_names, store.fitted
     if not names:
         return "Nothing has been computed yet for this study."
@@ -72,7 +72,7 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _how_well(store: Store) -> str:
+def _how_well(store: Results) -> str:
     held = [row for row in store.predicted if not row.get("fitted")]
     if not store.predict:
         return ""
@@ -88,7 +88,7 @@ def _how_well(store: Store) -> str:
     )
 
 
-def _one_or_two(store: Store) -> str:
+def _one_or_two(store: Results) -> str:
     held = [row for row in store.predicted if not row.get("fitted")]
     pairs = [(row.get("error_one_material_percent"), row.get("error_percent")) for row in held]
     known = [(one, two) for one, two in pairs if one is not None and two is not None]
@@ -101,7 +101,7 @@ def _one_or_two(store: Store) -> str:
     return start + f"{store.materials} predict {'better' if second < first else 'worse'}."
 
 
-def _verdict(store: Store) -> tuple[str, ...]:
+def _verdict(store: Results) -> tuple[str, ...]:
     """Which parameters the data determine, best first, and how many combinations of them."""
     uncertainty = store.calibration.get("uncertainty") or {}
     stored = uncertainty.get("verdict") or {}
@@ -120,12 +120,12 @@ def _verdict(store: Store) -> tuple[str, ...]:
     return (*words, f"Determined together: {known} of {len(combinations)} products of them (see Parameters).")
 
 
-def _symbols(store: Store) -> dict[str, str]:
+def _symbols(store: Results) -> dict[str, str]:
     """Each parameter's name as people read it: ``muscle.tau_s`` is muscle τ."""
     return {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
 
 
-def _combinations(store: Store) -> tuple[Block, ...]:
+def _combinations(store: Results) -> tuple[Block, ...]:
     """What the data determine of several parameters together, best determined first."""
     sentences = (store.calibration.get("uncertainty") or {}).get("combinations") or ()
     if not sentences:

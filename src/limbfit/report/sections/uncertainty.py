@@ -10,13 +10,13 @@ from ..drawing.ink import MUTED, SIMULATED, STYLE, legend_above, panels, svg
 from ..drawing.uncertainty_figures import pairs_figure, prediction_figure, true_values
 from ..formats import fixed, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 from ..tables import SYMBOLS
 
 _MOST_PANELS_IN_A_ROW = 4
 
 
-def uncertainty_section(store: Store, content: Json) -> Section:
+def uncertainty_section(store: Results, content: Json) -> Section:
     """What the experiment ``uncertainty`` found."""
     blocks: tuple[Block | None, ...] = (
         Bullets(tuple(content["verdict"])),
@@ -61,7 +61,7 @@ def _range(limits: list[float] | None) -> str:
     return "–" if not limits else f"{number(limits[0])} to {number(limits[1])}"
 
 
-def _parameters(store: Store, content: Json) -> Table:
+def _parameters(store: Results, content: Json) -> Table:
     head = (
         "Parameter", "Identified", "Linearised", "Posterior", "Profile", "Profile says", "With all sources",
         "Verdict",
@@ -110,7 +110,7 @@ def _factor(value: float) -> str:
     return f"×÷ {number(value, 4)}" if value < 100 else "×÷ > 100"
 
 
-def profile_figure(store: Store, content: Json) -> Figure | None:
+def profile_figure(store: Results, content: Json) -> Figure | None:
     """How much worse the records are met as one parameter moves and the others follow."""
     profiles = content["profiles"]
     if not profiles:

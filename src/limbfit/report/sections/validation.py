@@ -8,11 +8,11 @@ import numpy as np
 from ..drawing.ink import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED, STYLE, legend_above, panels, svg
 from ..formats import fixed, heading, numeric
 from ..page import Block, Cell, Figure, Prose, Row, Section, Table
-from ..store import Json, Store
+from ..store import Json, Results
 from ..tables import NOTHING
 
 
-def validation_section(store: Store, content: Json) -> Section:
+def validation_section(store: Results, content: Json) -> Section:
     """What the experiment ``crossvalidate`` found."""
     blocks: list[Block] = [Prose(_words(content)), _figure(content), _site_table(content)]
     if content["regions"]:
