@@ -91,7 +91,8 @@ def python_in(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", [f"docs/{page.name}" for page in PAGES if page.parent.name == "docs"])
-def test_python_of_the_pages_runs(page: str) -> None:
+def test_python_of_the_pages_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     for code in python_in(page):
         exec(compile(code, page, "exec"), {"__name__": "example"})
 
