@@ -53,6 +53,12 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
     return point_data, cell_data
 
 
+def rest(system: System, problem: Problem) -> State:
+    """The state before the first step."""
+    memory = Memory.rest(system, _laws(problem))
+    return State(0.0, float(problem.history.at(0.0)), np.zeros_like(problem.mesh.points), 0.0, memory=memory)
+
+
 class Animation:
     """Fields of every step: ``<name>.pvd`` and, in a folder of the same name, ``step-0000.vtu`` (rest), ..
 
@@ -68,9 +74,7 @@ class Animation:
         for old in self.folder.glob("step-*.vtu"):
             old.unlink()
         self.frames: list[tuple[float, Path]] = []
-        rest = np.zeros_like(problem.mesh.points)
-        memory = Memory.rest(self.system, _laws(problem))
-        self._write(State(0.0, float(problem.history.at(0.0)), rest, 0.0, memory=memory))
+        self._write(rest(self.system, problem))
 
     def add(self, step: Step) -> None:
         """Write one step; give it to `solve` as ``on_step``."""

@@ -14,10 +14,8 @@ from matplotlib.figure import Figure
 from ..errors import ProblemError
 from ..fe import Problem, Result, State, Step, StepControl, System
 from ..fe import solve as simulate
-from ..fe.history import Memory
 from ..fe.kernel.assembly import is_compiled
-from ..fe.kernel.laws import Laws
-from ..fields import state_fields
+from ..fields import rest, state_fields
 from ..mesh import VTK_CELL
 
 COMPILING = "limbfit compiles its kernels: half a minute, once on this machine"
@@ -102,10 +100,7 @@ def solve(
 
     found = simulate(problem, steps or StepControl(), sensitivities=sensitivities, on_step=keep)
     if frames:
-        laws = Laws.build([problem.materials[region] for region in problem.mesh.region_names])
-        memory = Memory.rest(found.system, laws)
-        rest = np.zeros_like(problem.mesh.points)
-        kept.insert(0, State(0.0, float(problem.history.at(0.0)), rest, 0.0, memory=memory))
+        kept.insert(0, rest(found.system, problem))
     return Solution(**{f.name: getattr(found, f.name) for f in fields(Result)}, frames=tuple(kept))
 
 
