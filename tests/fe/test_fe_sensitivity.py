@@ -9,7 +9,7 @@ import pytest
 from blocks import punch
 
 from limbfit.fe import Indenter, StepControl, solve
-from limbfit.fe.solution import stepping
+from limbfit.fe.solution import simulation
 
 TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-10)
 
@@ -38,7 +38,7 @@ def test_an_edge_taken_as_flat_on_the_way_changes_no_answer(monkeypatch):
     rounded = Indenter(axis=(0, 0, -1), centre=(0.0, 0.0, 1.0), edge_radius=3.0)
     problem = punch("tet10", 2, 1, indenter=rounded)
     usual = solve(problem, TIGHT, sensitivities=True)
-    monkeypatch.setattr(stepping, "STEEP_PRESSURE", 1e-6)
+    monkeypatch.setattr(simulation, "STEEP_PRESSURE", 1e-6)
     flat = solve(problem, TIGHT, sensitivities=True)
     assert np.abs(flat.force - usual.force).max() <= 1e-8 * usual.peak_force
     error = np.abs(flat.force_sensitivity - usual.force_sensitivity).max(axis=0)
