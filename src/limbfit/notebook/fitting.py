@@ -9,7 +9,6 @@ from typing import cast
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
@@ -26,7 +25,7 @@ from ..identify import (
     separate,
 )
 from ..identify import calibrate as search
-from .solution import Solution, announce_compilation, solve
+from .solution import Solution, announce_compilation, new_axes, solve
 
 Array = NDArray[np.float64]
 Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s, force (n,) N
@@ -78,8 +77,7 @@ class Fit:
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the curves as measured (dots) and as fitted (lines) over time."""
-        if axes is None:
-            axes = Figure(figsize=(5, 4), layout="constrained").subplots()
+        axes = axes or new_axes()
         for number, ((times, force), response) in enumerate(zip(self.curves, self.responses, strict=True)):
             axes.plot(times, force, ".", color=f"C{number}", label=f"curve {number + 1}")
             axes.plot(times, response.force_N, color=f"C{number}")
@@ -185,11 +183,9 @@ class _Model:
         full = found.sensitivity_at(times)
         absent = np.zeros(len(times))
         columns = [full[:, known.index(name)] if name in known else absent for name in self.names]
-        force, kinds = found.force_at(times), {doubt.kind: doubt.text for doubt in found.doubts}
-        return SiteResponse(
-            force, np.stack(columns, axis=1), found.completed, found.reason, f"curve {number + 1}",
-            found.warnings, kinds.get("slipped", ""), kinds.get("folded", ""),
-        )  # fmt: skip
+        answer = found.force_at(times), np.stack(columns, axis=1), found.completed, found.reason
+        doubts: dict[str, str] = {doubt.kind: doubt.text for doubt in found.doubts}
+        return SiteResponse.with_doubts(*answer, f"curve {number + 1}", doubts)
 
 
 def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple[Array, Array], ...]:

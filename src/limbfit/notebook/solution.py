@@ -57,8 +57,7 @@ class Solution(Result):
 
     def plot(self, axes: Axes | None = None, label: str = "") -> Axes:
         """Draw force (N) against displacement (mm), on new axes where none are given."""
-        if axes is None:
-            axes = Figure(figsize=(5, 4), layout="constrained").subplots()
+        axes = axes or new_axes()
         times = np.linspace(0.0, self.times[-1], 400)
         axes.plot(self.problem.history.at(times), self.force_at(times), label=label or "simulated")
         axes.plot(self.displacement, self.force, ".", color=axes.lines[-1].get_color())
@@ -102,6 +101,11 @@ def solve(
     if frames:
         kept.insert(0, rest(found.system, problem))
     return Solution(**{f.name: getattr(found, f.name) for f in fields(Result)}, frames=tuple(kept))
+
+
+def new_axes() -> Axes:
+    """Axes on a figure of their own, which no window shows by itself."""
+    return Figure(figsize=(5, 4), layout="constrained").subplots()
 
 
 def announce_compilation() -> None:

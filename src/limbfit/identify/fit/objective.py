@@ -7,7 +7,7 @@ takes equation 8 as printed, one mean squared difference per site, which least s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,6 +57,20 @@ class SiteResponse:
     doubts: tuple[str, ...] = ()
     slipped: str = ""
     folded: str = ""
+
+    @classmethod
+    def with_doubts(
+        cls,
+        force_N: Array,
+        jacobian: Array,
+        completed: bool,
+        reason: str,
+        site: str,
+        doubts: Mapping[str, str],
+    ) -> SiteResponse:
+        """A response from the texts of its doubts, by kind."""
+        kinds = doubts.get("slipped", ""), doubts.get("folded", "")
+        return cls(force_N, jacobian, completed, reason, site, tuple(doubts.values()), *kinds)
 
 
 Simulate = Callable[[Array], Sequence[SiteResponse]]

@@ -139,11 +139,8 @@ def as_response(simulation: Simulation) -> SiteResponse:
     """A simulation as it is; derivatives (n, 0) where it has none."""
     jacobian = np.zeros((simulation.force_N.size, 0)) if simulation.jacobian is None else simulation.jacobian
     ended = simulation.completed, simulation.reason
-    kinds = {doubt.kind: doubt.text for doubt in simulation.doubts}
-    return SiteResponse(
-        simulation.force_N, jacobian, *ended, simulation.site, simulation.warnings,
-        kinds.get("slipped", ""), kinds.get("folded", ""),
-    )  # fmt: skip
+    doubts: dict[str, str] = {doubt.kind: doubt.text for doubt in simulation.doubts}
+    return SiteResponse.with_doubts(simulation.force_N, jacobian, *ended, simulation.site, doubts)
 
 
 def site_record(context: Context, site: Site, coarse: bool = False) -> SiteRecord:
