@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from layered import layered_block, store_blocks
-from limbfit import indentation
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
+from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, job_digest

@@ -126,6 +126,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "calibration.force_error_percent": ("calibrate", 2.0),
     "calibration.starts": ("calibrate", 3),
     "calibration.seed": ("calibrate", 1),
+    "calibration.search_radius_mm": ("calibrate", 50.0),
     "calibration.corrections": ("calibrate", 2),
     "calibration.correction_tolerance_percent": ("calibrate", 0.2),
     "uncertainty.runs": ("uncertainty", 12),
@@ -238,12 +239,14 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ),
     (GIVEN, {"calibration.force_error_percent": 2.0}, "calibration.force_error_percent"),
     (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
-    (GIVEN, {"mesh.edge_near_mm": 4.0, "calibration.corrections": 2}, "calibration.corrections"),
-    (
-        GIVEN,
-        {"mesh.edge_near_mm": 4.0, "calibration.correction_tolerance_percent": 0.2},
-        "calibration.correction_tolerance_percent",
-    ),
+    *[
+        (
+            GIVEN,
+            {"mesh.edge_near_mm": 4.0, "calibration": {"search_radius_mm": 0, key: 2}},
+            f"calibration.{key}",
+        )
+        for key in ("corrections", "correction_tolerance_percent")
+    ],
     *[
         (GIVEN, {"uncertainty": {"sources": False, key: 1.0}}, f"uncertainty.{key}")
         for key in ("layer_mm", "position_mm", "axis_degrees", "edge_radius_mm")

@@ -30,6 +30,8 @@ from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, N
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .solution.control import StepControl
+from .solution.guesses import tangent_at_rest
+from .solution.linear import linear_solver
 from .solution.stepping import iterate, solve
 from .system import System
 
@@ -54,5 +56,7 @@ __all__ = [
     "Support",
     "System",
     "iterate",
+    "linear_solver",
     "solve",
+    "tangent_at_rest",
 ]

@@ -302,7 +302,9 @@ class CalibrationTable(TomlTable):
     """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals.
 
     ``fixed``, ``tied`` and ``prior`` name parameters as ``skin.c_kPa``; ``starts`` after one are random.
-    ``corrections`` are those of the coarse meshes' forces (``mesh.coarse``), per stage.
+    Parameters are searched on what of each mesh is within ``search_radius_mm`` of its site (0: on all of it),
+    and on coarse meshes where the study has them (``mesh.coarse``); forces of the whole meshes correct that,
+    at most ``corrections`` times per stage.
     """
 
     objective: Literal["pointwise", "paper"] = "pointwise"
@@ -315,6 +317,7 @@ class CalibrationTable(TomlTable):
     force_error_percent: Positive = 1.0
     starts: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
+    search_radius_mm: Annotated[float, Field(ge=0)] = 65.0
     corrections: Annotated[int, Field(ge=1, le=10)] = 6
     correction_tolerance_percent: Positive = 0.1
 

@@ -126,9 +126,9 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("calibration.corrections", "calibration.correction_tolerance_percent"),
-        lambda s: s.mesh.coarse is None,
-        "there are no coarse meshes to correct",
-        "give [mesh.coarse], or leave it out",
+        lambda s: not s.is_searched_apart,
+        "parameters are searched on the meshes themselves, so nothing is corrected",
+        "give calibration.search_radius_mm, or leave it out",
     ),
     Vain(
         tuple(f"uncertainty.{key}" for key in _SOURCES),

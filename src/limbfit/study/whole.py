@@ -71,6 +71,16 @@ class Study(TomlTable):
         return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
 
     @property
+    def within_mm(self) -> float | None:
+        """How far from a site its mesh counts where parameters are searched; None: as far as it goes."""
+        return self.calibration.search_radius_mm or None
+
+    @property
+    def is_searched_apart(self) -> bool:
+        """Whether parameters are searched on something smaller than the study's own meshes."""
+        return self.mesh.coarse is not None or self.within_mm is not None
+
+    @property
     def inputs(self) -> dict[str, Path]:
         """Every file and folder that the study names, by its key."""
         named: dict[str, Path | None] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,7 @@ from ..threads import single_threaded_numpy
 from .control import StepControl, schedule
 from .direction import renew
 from .factor import Factor
+from .guesses import Warm, extrapolation
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .pace import Pace
 from .schedule import foresee
@@ -64,7 +65,7 @@ class Simulation:
         self.anchors: Anchors | None = None
         if problem.friction == "sticky" and self.system.surface is not None:
             self.anchors = Anchors.none(self.system.surface, self.laws.count if sensitivities else 0)
-        self.warm = _warm_states(problem, warm_start)
+        self.warm = Warm.of(problem, warm_start)
         self.floor, self.pushing = 0.0, False
         width = problem.indenter.width if problem.indenter is not None else 1.0
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
@@ -170,9 +171,9 @@ class Simulation:
         return found
 
     def _predict(self, t: float, displacement: float) -> Array:
-        warm, last = self.warm.get(round(t, 9)), self.warm.get(round(self.states[-1].time, 9))
+        warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
         if warm is not None:  # what it missed by in the step before, it will miss by in this one
-            return warm.u if last is None else warm.u + (self.states[-1].u - last.u)
+            return warm if last is None else warm + (self.states[-1].u - last)
         weights = extrapolation(self.states, displacement)
         return np.asarray(sum(w * state.u for w, state in zip(weights, self.states)))
 
@@ -244,44 +245,8 @@ class Simulation:
         return du.reshape(*u.shape, laws.count), d_force
 
 
-def extrapolation(states: Sequence[State], displacement: float) -> Array:
-    """Weights (k,) of the last states' fields that foresee the field at an advance of the indenter.
-
-    Quadratic in the advance while it goes on steadily; linear where it has just turned or leaps.
-    """
-    weights = np.zeros(len(states))
-    weights[-1] = 1.0
-    d = np.array([state.displacement for state in states])
-    moved = np.diff(d)
-    if len(states) < 2 or moved[-1] == 0.0:
-        return weights
-    slope = float(np.clip((displacement - d[-1]) / moved[-1], -2.0, 8.0))
-    step = slope * moved[-1]
-    weights[-2:] += -slope, slope
-    if len(states) > 2 and 0.0 < slope <= 2.0 and moved[0] * moved[1] > 0.0:
-        bend = step * (step + moved[1]) / (d[2] - d[0])
-        weights += bend * np.array([1.0 / moved[0], -1.0 / moved[0] - 1.0 / moved[1], 1.0 / moved[1]])
-    return weights
-
-
 def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
     for known in (system, warm_start.system if warm_start is not None else None):
         if known is not None and known.fits(problem):
             return known
     return System(problem, threads)
-
-
-def _warm_states(problem: Problem, warm_start: Result | None) -> dict[float, State]:
-    """States of an earlier run by time, moved to the new parameters along their sensitivities."""
-    if warm_start is None or not len(warm_start.states):
-        return {}
-    if warm_start.states[0].u.shape != problem.mesh.points.shape:
-        return {}
-    new, old = problem.parameters, warm_start.problem.parameters
-    with np.errstate(all="ignore"):  # moduli act by their ratio
-        change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
-    out = {}
-    for state in warm_start.states:
-        u = state.u if state.sensitivity is None else state.u + state.sensitivity @ change
-        out[round(state.time, 9)] = replace(state, u=u)
-    return out

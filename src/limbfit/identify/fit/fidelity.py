@@ -184,7 +184,8 @@ class _Outer:
         best: _Standing | None = None
         allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSE)
         for number in range(self.fidelity.rounds):
-            inner = self._inner(stage, _LOOSE if number == 0 or not is_last else 1.0)
+            loose = number == 0 or not is_last
+            inner = self._inner(stage, _LOOSE if loose else 1.0)
             reached = self._correct(stage)
             settled = reached.settles(allowed)
             if best is not None and not reached.reason and not settled and self._cost() > best.cost:
@@ -195,7 +196,7 @@ class _Outer:
                 break
             if best is None or self._cost() < best.cost:
                 best = self._standing()
-            if settled:
+            if settled and (not is_last or not loose):
                 break
         if best is not None and best.cost < self._cost():
             self._return_to(best)

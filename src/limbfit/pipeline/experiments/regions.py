@@ -108,8 +108,8 @@ def _forces(
     context: Context, cache: SimulationCache, records: Sequence[SiteRecord], parameters: Array
 ) -> list[SiteResponse]:
     """Forces on the study's own meshes; with derivatives where the study's prediction has made them so."""
-    searched = context.study.mesh.coarse is None
-    jobs = [record.job(parameters, sensitivities=searched) for record in records]
+    apart = context.study.is_searched_apart
+    jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in records]
     return [as_response(one) for one in cache.run(jobs, context.executor)]
 
 

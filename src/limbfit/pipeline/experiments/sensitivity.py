@@ -79,11 +79,11 @@ def _stiffer(chosen: ChosenSite, equal: Parameters) -> list[Variant]:
 def _derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
     """At every recorded site: change of the largest force in percent for one percent more ``c`` of a tissue.
 
-    Where the study has coarse meshes, they are theirs, as those of the prediction.
+    They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
-    coarse = study.mesh.coarse is not None
-    records = [site_record(context, site, coarse) for site in study.sites if site.trace is not None]
+    apart = study.is_searched_apart
+    records = [site_record(context, site, apart) for site in study.sites if site.trace is not None]
     best = to_vector(identified, study.tissues)
     cache = experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []

@@ -22,6 +22,7 @@ from ...indentation import Parameters, to_vector
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
+from ..stages.predict import Answer, answer_jobs
 from ..stages.record_noise import site_noise
 from ..stages.traces import as_response, site_record
 from .uncertainty_record import Found, Predicted, write_results
@@ -92,7 +93,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         wanted = variants(context, folder, sites.searched, best)
         found = changes(context, sites.cache, wanted)
     result = Found(known, explored, evidence, gain, tuple(found), unknowns(study))
-    write_results(folder, result, _predicted(context, sites, best))
+    write_results(folder, result, _predicted(context, sites))
     return {"runs": explored.rounds[-1].runs}
 
 
@@ -125,18 +126,17 @@ def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evi
     return compare(one, several, *([row[column] for row in held] for column in columns))
 
 
-def _predicted(context: Context, sites: FittedSites, best: Array) -> list[Predicted]:
+def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
     """Every recorded site at the identified parameters, from what the stage ``predict`` has simulated."""
     study = context.study
-    coarse = study.mesh.coarse is not None
+    apart = study.is_searched_apart
     recorded = [site for site in study.sites if site.trace is not None]
-    searched = [site_record(context, site, coarse) for site in recorded]
-    jobs = [record.job(best) for record in searched]
-    if coarse:
-        jobs += [site_record(context, site).job(best, sensitivities=False) for site in recorded]
+    searched = [site_record(context, site, apart) for site in recorded]
+    answer = Answer.of(context.stored("calibrate", "calibration.json")["stages"][-1], study.tissues)
+    jobs = answer_jobs(context, [site_record(context, site) for site in recorded], answer)
     ends = [as_response(end) for end in sites.cache.run(jobs, context.executor)]
     n = len(searched)
-    responses = CoarseToFine(ends[:n], ends[n:])(ends[:n]) if coarse else ends
+    responses = CoarseToFine(ends[n:], ends[:n])(ends[n:]) if apart else ends
     return [
         Predicted(r, end, site_noise(study, r, end.force_N) if end.completed else None)
         for r, end in zip(searched, responses)

@@ -180,7 +180,9 @@ def _of_mesh(
     study = context.study
     settings = searched_settings(study)
     if study.mesh.coarse is not None:
-        jobs = [site_record(context, record.site).job(parameters, sensitivities=False) for record in records]
+        own = [site_record(context, record.site).model for record in records]
+        models = [replace(model, within_mm=study.within_mm) for model in own]
+        jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     else:
         finer = scaled_edges(settings, FINER)
         models = meshed_models(

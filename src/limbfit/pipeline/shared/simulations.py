@@ -125,12 +125,20 @@ def job_digest(job: SimulationJob) -> str:
 
 
 def site_model(
-    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float], coarse: bool = False
+    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float], searched: bool = False
 ) -> SiteModel:
-    """The stored mesh (or the coarse one) and place of a site with a displacement history."""
+    """The stored mesh and place of a site with a displacement history.
+
+    ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
+    than ``calibration.search_radius_mm``.
+    """
     study: Study = context.study
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
-    mesh = context.store["mesh"] / (COARSE if coarse else "") / f"{site.name}.vtu"
+    mesh = (
+        context.store["mesh"]
+        / (COARSE if searched and study.mesh.coarse is not None else "")
+        / f"{site.name}.vtu"
+    )
     file = None if study.indenter.file is None else study.path(study.indenter.file)
     return SiteModel(
         name=site.name,
@@ -146,13 +154,14 @@ def site_model(
         kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
         element=study.mesh.element,
+        within_mm=study.within_mm if searched else None,
     )
 
 
-def recorded_model(context: Context, site: Site, coarse: bool = False) -> SiteModel:
-    """The site driven by its record, from touch-down; ``coarse``: on its coarse mesh."""
+def recorded_model(context: Context, site: Site, searched: bool = False) -> SiteModel:
+    """The site driven by its record, from touch-down; ``searched``: see `site_model`."""
     facts = context.stored("traces", "traces.json")["sites"][site.name]
-    return site_model(context, site, facts["knots_s"], facts["knots_mm"], coarse)
+    return site_model(context, site, facts["knots_s"], facts["knots_mm"], searched)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:

@@ -34,7 +34,7 @@ from .traces import SiteRecord, site_record
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
 COARSER = 1.3  # times the edges: another mesh that tells the error of the study's own
-NEAR = 1.5  # in logarithms of parameters: as far as another simulation's states save work as first guesses
+NEAR = 0.7  # in logarithms of parameters: as far as another simulation's states save work as first guesses
 ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too sure"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
@@ -56,7 +56,7 @@ class Anchored:
 
 
 class Laboratory:
-    """Simulates some sites: with derivatives on one mesh, without on the other where there are two.
+    """Simulates some sites: with derivatives as parameters are searched, without on their own whole meshes.
 
     ``title`` is the stage or experiment that is told of progress.
     """
@@ -68,8 +68,8 @@ class Laboratory:
         self.context, self.cache, self.title = context, cache, title
         self.records = [site_record(context, site) for site in sites]
         self.searched = self.records
-        if study.mesh.coarse is not None:
-            self.searched = [site_record(context, site, coarse=True) for site in sites]
+        if study.is_searched_apart:
+            self.searched = [site_record(context, site, searched=True) for site in sites]
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
         self.latest: dict[str, Simulation] = {}
@@ -80,8 +80,8 @@ class Laboratory:
         self._starts: dict[bytes, Array | None] = {}
 
     @property
-    def has_coarse(self) -> bool:
-        """Whether parameters are searched on meshes of their own."""
+    def is_apart(self) -> bool:
+        """Whether parameters are searched on something smaller than the sites' own meshes."""
         return self.searched is not self.records
 
     @property
@@ -113,15 +113,16 @@ class Laboratory:
         return self._starts[key]
 
     def answer(self, parameters: Array) -> Responses:
-        """The forces of an answer, from rest as all that follows takes them; ``warnings`` are then theirs."""
-        if self.has_coarse:
+        """The forces of an answer as all that follows takes them; ``warnings`` are then theirs."""
+        if self.is_apart:
             return self.check(parameters)
         return self._run([record.job(parameters) for record in self.records], "the answer, from rest")
 
     def check(self, parameters: Array) -> Responses:
         """Force on the study's own meshes; what failed before is tried again."""
         self.corrections += 1
-        jobs = [record.job(parameters, sensitivities=False) for record in self.records]
+        start = self.first_guess(parameters)
+        jobs = [record.own_job(parameters, start) for record in self.records]
         return self._run(jobs, f"correction {self.corrections}", again=True)
 
     def anchored(self, parameters: Array) -> Anchored:
@@ -134,11 +135,11 @@ class Laboratory:
         """
         found = self.search(parameters)
         anchored = Anchored(found, list, ())
-        if self.has_coarse:
+        if self.is_apart:
             correction = CoarseToFine(found, self.check(parameters))
-            share = error_of_own_mesh(self.context.study.mesh)
-            lacking = tuple(share * difference for difference in correction.differences_N)
-            anchored = Anchored(correction(found), correction, lacking)
+            anchored = Anchored(correction(found), correction, ())
+        if self.context.study.mesh.coarse is not None:
+            anchored = replace(anchored, mesh_N=self._mesh_error(parameters, found, self.records))
         for one in anchored.responses:
             if not one.completed:
                 raise RunError(f"site {one.site} cannot be simulated at the answer: {one.reason}")
@@ -152,10 +153,13 @@ class Laboratory:
         """
         study = self.context.study
         further = FURTHER_SIMULATIONS
-        if self.has_coarse:
+        anchored = Anchored(list(found.responses), list, ())
+        if self.is_apart:
             anchored = self.anchored(found.parameters)
-        else:
-            anchored = Anchored(list(found.responses), list, self._mesh_error(found, meshes))
+        if study.mesh.coarse is None:
+            searched = self.search(found.parameters) if self.is_apart else anchored.responses
+            lacking = self._mesh_error(found.parameters, searched, self._coarser(meshes))
+            anchored = replace(anchored, mesh_N=lacking)
             further -= len(self.records)
         known = linearised(study, self.records, found.parameters, anchored)
         kept = Kept()
@@ -173,29 +177,34 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
         return sampled
 
-    def _mesh_error(self, found: Calibration, folder: Path) -> tuple[Array, ...]:
-        """One standard deviation (n,) N of what the study's meshes lack at every site, from coarser ones.
-
-        Zero where the coarser mesh cannot be simulated: a line says so.
-        """
-        study = self.context.study
-        settings = scaled_edges(mesh_settings(study), COARSER)
+    def _coarser(self, folder: Path) -> list[SiteRecord]:
+        """The records on coarser meshes than the study's own, which are made in ``folder``."""
+        settings = scaled_edges(mesh_settings(self.context.study), COARSER)
         own = [record.model for record in self.records]
         models = meshed_models(self.context, folder, own, settings, self.title)
-        jobs = [
-            replace(record.job(found.parameters, sensitivities=False), model=model)
-            for record, model in zip(self.records, models, strict=True)
-        ]
-        share, lacking = error_of_own_mesh(study.mesh), []
+        return [replace(record, model=model) for record, model in zip(self.records, models, strict=True)]
+
+    def _mesh_error(
+        self, parameters: Array, searched: Responses, others: Sequence[SiteRecord]
+    ) -> tuple[Array, ...]:
+        """One standard deviation (n,) N of what the study's meshes lack at every site.
+
+        It follows from the difference of what is ``searched`` and of the same on ``others``, meshes of other
+        edges. Zero where these cannot be simulated: a line says so.
+        """
+        study, lacking = self.context.study, []
+        share = error_of_own_mesh(study.mesh)
+        near = [replace(other, model=replace(other.model, within_mm=study.within_mm)) for other in others]
+        jobs = [other.job(parameters, sensitivities=False) for other in near]
         done = self.cache.run(jobs, self.context.executor, again=True)
-        for record, simulation, fitted in zip(self.records, done, found.responses, strict=True):
-            coarse = record.respond(simulation)
-            told = f"coarser mesh, site {simulation.site}"
-            if not coarse.completed:
-                told = f"warning: site {simulation.site}: the error of its mesh is not known: {coarse.reason}"
+        for record, simulation, known in zip(self.records, done, searched, strict=True):
+            found = record.respond(simulation)
+            told = f"another mesh, site {simulation.site}"
+            if not found.completed:
+                told = f"warning: site {simulation.site}: the error of its mesh is not known: {found.reason}"
             self.context.tell(self.title, 0, 0, told)
-            known = coarse.force_N if coarse.completed else fitted.force_N
-            lacking.append(share * (fitted.force_N - known))
+            usable = found.completed and known.completed
+            lacking.append(share * (known.force_N - found.force_N) * usable)
         return tuple(lacking)
 
     def _facts(self, state: SearchState) -> dict[str, Any]:
@@ -249,7 +258,7 @@ class Laboratory:
             words = f"{name}: {_describe(state, study.tissues)}"
             self.context.tell(self.title, 0, 0, words, fit=True, facts=facts)
 
-        if study.mesh.coarse is None:
+        if not self.is_apart:
             found = calibrate(
                 self.search, self.measured, start, settings(study), stages=stages, on_iterate=tell
             )

@@ -15,12 +15,9 @@ from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.prediction import Known, error_percent, summarise
 from ...indentation import (
-    Parameters,
     Simulation,
     SimulationJob,
-    SiteModel,
-    rested_fields,
-    to_parameters,
+    job_fields,
     to_vector,
 )
 from ..shared.context import Context
@@ -41,14 +38,16 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
     study = context.study
     calibration = context.stored("calibrate", "calibration.json")
-    found = [to_vector(stage["parameters"], study.tissues) for stage in calibration["stages"]]
-    one, best = found[0], found[-1]
+    answers = [Answer.of(stage, study.tissues) for stage in calibration["stages"]]
+    one, best = answers[0].parameters, answers[-1].parameters
     known = Known.of(calibration["uncertainty"])
     records = [site_record(context, site) for site in study.sites if site.trace is not None]
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
-    jobs = _jobs(context, records, best, _one_material(calibration, study.tissues))
+    jobs = answer_jobs(context, records, answers[-1])
+    if len(answers) > 1:
+        jobs += _one_material_jobs(context, records, answers[0], best)
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
@@ -57,15 +56,16 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     ours = own = [as_response(simulation) for simulation in simulations[:n]]
     others = [as_response(simulation) for simulation in simulations[n:]]
     searched, correction = records, None
-    if study.mesh.coarse is not None:
-        searched = [site_record(context, record.site, coarse=True) for record in records]
+    if study.is_searched_apart:
+        searched = [site_record(context, record.site, searched=True) for record in records]
         coarse, others = others[:n], others[n:]
         correction = CoarseToFine(coarse, own)
         ours = correction(coarse)
         fine = correction(others) if others else []
         others = [as_is if r.site.fitted else held for r, as_is, held in zip(records, others, fine)]
     sites = [SitePrediction(*parts) for parts in zip_longest(records, simulations[:n], ours, others)]
-    _write_fields(context, folder, [site.record for site in sites if site.own.completed], best, len(jobs))
+    whole = [job for site, job in zip(sites, jobs) if site.own.completed]
+    _write_fields(context, folder, whole, len(jobs))
     for site in sites:
         _write_curves(folder, site, best, known)
     rows = [_row(site) for site in sites]
@@ -74,47 +74,58 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _one_material(calibration: dict[str, Any], tissues: Sequence[str]) -> tuple[Array, Array | None] | None:
-    """The answer with one material, where the calibration started its simulation; None where it is best."""
-    stage, *others = calibration["stages"]
-    if not others:
-        return None
-    guess = stage["iterations"][-1]["first_guess"]
-    return to_vector(stage["parameters"], tissues), None if guess is None else to_vector(guess, tissues)
+@dataclass(frozen=True)
+class Answer:
+    """Identified ``parameters`` (p,), and those from which the calibration's simulation of them started."""
+
+    parameters: Array
+    first_guess: Array | None
+
+    @classmethod
+    def of(cls, stage: dict[str, Any], tissues: Sequence[str]) -> Answer:
+        """The answer of a stage as ``calibration.json`` holds it."""
+        guess = stage["iterations"][-1]["first_guess"]
+        return cls(
+            to_vector(stage["parameters"], tissues), None if guess is None else to_vector(guess, tissues)
+        )
 
 
-def _jobs(
-    context: Context,
-    records: Sequence[SiteRecord],
-    best: Array,
-    simple: tuple[Array, Array | None] | None,
-) -> list[SimulationJob]:
-    """Every record with all materials, then so on coarse meshes where there are, then with one (unless None).
+def answer_jobs(context: Context, records: Sequence[SiteRecord], answer: Answer) -> list[SimulationJob]:
+    """Every record at the answer, then so with derivatives where parameters are searched, if elsewhere.
 
-    At the fitted sites the calibration has simulated the one material already. With coarse meshes derivatives
-    are theirs, and so is the one material's force at held-out sites. Its simulation there starts from that
-    with all materials and derivatives, which has just been done.
+    At the fitted sites the calibration has simulated all of them already; elsewhere they start from rest.
     """
-    one, guess = (None, None) if simple is None else simple
-    if context.study.mesh.coarse is None:
-        jobs = [record.job(best) for record in records]
-        if one is not None:
-            jobs += [
-                r.job(one, start=guess) if r.site.fitted else r.job(one, sensitivities=False, start=best)
-                for r in records
-            ]
-        return jobs
-    coarse = [site_record(context, record.site, coarse=True) for record in records]
-    jobs = [record.job(best, sensitivities=False) for record in records]
-    jobs += [record.job(best) for record in coarse]
-    if one is not None:
-        jobs += [
-            fine.job(one, sensitivities=False)
-            if fine.site.fitted
-            else rough.job(one, sensitivities=False, start=best)
-            for fine, rough in zip(records, coarse, strict=True)
+    best = answer.parameters
+    if not context.study.is_searched_apart:
+        return [record.job(best) for record in records]
+    guesses = [answer.first_guess if record.site.fitted else None for record in records]
+    near = [site_record(context, record.site, searched=True) for record in records]
+    own = [record.own_job(best, guess) for record, guess in zip(records, guesses)]
+    return own + [record.job(best, start=guess) for record, guess in zip(near, guesses)]
+
+
+def _one_material_jobs(
+    context: Context, records: Sequence[SiteRecord], one: Answer, best: Array
+) -> list[SimulationJob]:
+    """Every record with one material: at the fitted sites as the calibration has simulated it already.
+
+    Elsewhere it is of where parameters are searched, and starts from that with all materials and derivatives,
+    which has just been done.
+    """
+    vector = one.parameters
+    if not context.study.is_searched_apart:
+        return [
+            r.job(vector, start=one.first_guess)
+            if r.site.fitted
+            else r.job(vector, sensitivities=False, start=best)
+            for r in records
         ]
-    return jobs
+    return [
+        r.own_job(vector, one.first_guess)
+        if r.site.fitted
+        else site_record(context, r.site, searched=True).job(vector, sensitivities=False, start=best)
+        for r in records
+    ]
 
 
 @dataclass(frozen=True)
@@ -146,27 +157,21 @@ class SitePrediction:
 
 @dataclass(frozen=True)
 class FieldJob:
-    """Fields at the deepest point of a site, to be stored by a worker, of what it has just simulated."""
+    """Fields at the deepest point of a site, to be stored by the worker that has just simulated it."""
 
-    model: SiteModel
-    parameters: Parameters
+    job: SimulationJob
     file: Path
-    sensitivities: bool
 
 
-def store_fields(job: FieldJob) -> str:
-    rested_fields(job.model, job.parameters, job.file, job.sensitivities)
-    return job.model.name
+def store_fields(wanted: FieldJob) -> str:
+    job_fields(wanted.job, wanted.file)
+    return wanted.job.model.name
 
 
-def _write_fields(
-    context: Context, folder: Path, records: Sequence[SiteRecord], vector: Array, before: int
-) -> None:
-    parameters = to_parameters(vector, context.study.tissues)
-    with_derivatives = context.study.mesh.coarse is None  # else those are the coarse mesh's
-    jobs = [FieldJob(r.model, parameters, folder / f"{r.site.name}.vtu", with_derivatives) for r in records]
-    missing = [job for job in jobs if not job.file.is_file()]
-    names = [job.model.name for job in missing]
+def _write_fields(context: Context, folder: Path, jobs: Sequence[SimulationJob], before: int) -> None:
+    wanted = [FieldJob(job, folder / f"{job.model.name}.vtu") for job in jobs]
+    missing = [one for one in wanted if not one.file.is_file()]
+    names = [one.job.model.name for one in missing]
     for i, name in enumerate(context.executor.map(store_fields, missing, keys=names)):
         total = before + len(missing)
         context.tell("predict", before + i + 1, total, f"fields of site {name}")

@@ -106,7 +106,8 @@ class SiteRecord:
 
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
-    blunts, would be taken for an error of the model.
+    blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
+    same mesh.
     """
 
     site: Site
@@ -116,6 +117,7 @@ class SiteRecord:
     displacement_mm: Array
     force_N: Array
     smoothing: Array
+    nested_mm: float | None = None
 
     @property
     def measured(self) -> Measured:
@@ -134,6 +136,18 @@ class SiteRecord:
         first = None if start is None else tuple(map(float, start))
         return SimulationJob(self.model, self.tissues, values, times, sensitivities, first)
 
+    def own_job(self, parameters: Array, start: Array | None = None) -> SimulationJob:
+        """The force on the whole of the study's own mesh, without derivatives.
+
+        Where parameters are searched on a part of that mesh, its simulation gives the first guesses, and
+        ``start`` is that one's; otherwise it is nothing.
+        """
+        job = self.job(parameters, sensitivities=False)
+        if self.nested_mm is None:
+            return job
+        nested = self.job(parameters, sensitivities=False, start=start)
+        return replace(nested, nested_mm=self.nested_mm)
+
 
 def as_response(simulation: Simulation) -> SiteResponse:
     """A simulation as it is; derivatives (n, 0) where it has none."""
@@ -143,15 +157,16 @@ def as_response(simulation: Simulation) -> SiteResponse:
     return SiteResponse.with_doubts(simulation.force_N, jacobian, *ended, simulation.site, doubts)
 
 
-def site_record(context: Context, site: Site, coarse: bool = False) -> SiteRecord:
-    """The stored record of a site and its model, on its coarse mesh where asked for."""
+def site_record(context: Context, site: Site, searched: bool = False) -> SiteRecord:
+    """The stored record of a site and its model; ``searched``: as parameters are searched (`site_model`)."""
     curves = read_curves(context.store["traces"] / f"{site.name}.csv")
     return SiteRecord(
         site=site,
         tissues=context.study.tissues,
-        model=recorded_model(context, site, coarse),
+        model=recorded_model(context, site, searched),
         times_s=curves["time_s"],
         displacement_mm=curves["displacement_mm"],
         force_N=curves["force_N"],
         smoothing=np.load(context.store["traces"] / SMOOTHING.format(site.name)),
+        nested_mm=context.study.within_mm if context.study.mesh.coarse is None else None,
     )

@@ -1,7 +1,6 @@
-"""A study's site as a mechanical problem, and what is observed in it.
+"""Simulations of a site, as jobs for any process; what a process keeps of a site between them.
 
-``SiteModel`` is everything about one indentation but the parameters; it travels to worker processes as paths
-and numbers. ``simulate`` is the one function that every stage, executor and phantom calls.
+`simulate` is the one function that every stage, executor and phantom calls.
 """
 
 from __future__ import annotations
@@ -14,84 +13,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkCommand
-from vtkmodules.vtkIOGeometry import vtkSTLReader
 
-from .errors import ProblemError, SurfaceError
-from .fe import (
-    Doubt,
-    History,
-    Indenter,
-    OgdenQLV,
-    Problem,
-    Result,
-    RigidSurface,
-    State,
-    StepControl,
-    System,
-    solve,
+from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
+from ..fields import Animation, write_fields
+from ..mesh import read_vtu
+from ..study import PARAMETERS
+from .neighbourhood import Extension, neighbourhood
+from .sites import (
+    KPA,
+    Parameters,
+    SiteModel,
+    build_problem,
+    flat_names,
+    materials,
+    steps_of,
+    to_parameters,
 )
-from .fields import Animation, write_fields
-from .mesh import Mesh, read_vtu
-from .phases import spread
-from .study import PARAMETERS, IndenterTable, SolverTable, Vector
 
-Parameters = dict[str, dict[str, float]]
 Array = NDArray[np.float64]
 
-KPA = 1e-3  # MPa
 _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
-
-
-def flat_names(tissues: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """(tissue, parameter) in the order of every flat vector: the first tissue's four, then the next one's."""
-    return tuple((tissue, name) for tissue in tissues for name in PARAMETERS)
-
-
-def to_vector(parameters: Parameters, tissues: Sequence[str]) -> Array:
-    """The 4 numbers of each tissue in flat order (c in kPa)."""
-    return np.array([parameters[tissue][name] for tissue, name in flat_names(tissues)])
-
-
-def to_parameters(vector: Array, tissues: Sequence[str]) -> Parameters:
-    """The flat vector as ``{tissue: {name: value}}``, tissues in their order."""
-    result: Parameters = {tissue: {} for tissue in tissues}
-    for (tissue, name), value in zip(flat_names(tissues), vector, strict=True):
-        result[tissue][name] = float(value)
-    return result
-
-
-@dataclass(frozen=True)
-class SiteModel:
-    """One indentation but for the material: mesh file, indenter and displacement history.
-
-    ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm`` are the piecewise linear
-    displacement since touch-down; ``indenter_digest`` is that of the indenter's file, where it has one.
-    """
-
-    name: str
-    mesh: Path
-    mesh_digest: str
-    position: tuple[float, float, float]
-    axis: tuple[float, float, float]
-    knots_s: tuple[float, ...]
-    knots_mm: tuple[float, ...]
-    edge: tuple[float, float, float] | None = None
-    indenter: IndenterTable = field(default_factory=IndenterTable)
-    indenter_digest: str = ""
-    kappa_ratio: float = 100.0
-    steps: SolverTable = field(default_factory=SolverTable)
-    element: str = ""  # row of the element table; by default that of the mesh's cell type
-
-    @property
-    def history(self) -> History:
-        """The advance of the indenter."""
-        return History(np.array(self.knots_s), np.array(self.knots_mm))
-
-    def curve_times(self, points: int) -> Array:
-        """About ``points`` times (k,) s that show the force, all phases and corners among them."""
-        return spread(self.history.phases, points, self.history.times)
 
 
 @dataclass(frozen=True)
@@ -100,6 +41,8 @@ class SimulationJob:
 
     ``start``: other parameters, whose simulation from rest gives the first guesses; several times quicker
     where they are near. Forces then differ within the solver's tolerance, and by nothing else.
+    ``nested_mm``: first guesses are those of the same job, with derivatives, on no more of the mesh than this
+    distance from the site; ``start`` is then that one's.
     """
 
     model: SiteModel
@@ -108,6 +51,15 @@ class SimulationJob:
     times_s: tuple[float, ...]
     sensitivities: bool = True
     start: tuple[float, ...] | None = None
+    nested_mm: float | None = None
+
+    @property
+    def nested(self) -> SimulationJob | None:
+        """The job on a part of the mesh whose simulation gives the first guesses, where there is one."""
+        if self.nested_mm is None:
+            return None
+        model = replace(self.model, within_mm=self.nested_mm)
+        return replace(self, model=model, sensitivities=True, nested_mm=None)
 
 
 @dataclass(frozen=True)
@@ -132,87 +84,9 @@ class Simulation:
         return tuple(doubt.text for doubt in self.doubts)
 
 
-def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
-    """The tissues for the solver, in MPa."""
-    return {
-        tissue: OgdenQLV(
-            c=values["c_kPa"] * KPA,
-            m=values["m"],
-            gamma=values["gamma"],
-            tau=values["tau_s"],
-            kappa_ratio=kappa_ratio,
-        )
-        for tissue, values in parameters.items()
-    }
-
-
-def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
-    """The site's boundary-value problem: node sets ``fixed_*`` held, skin in contact with the indenter.
-
-    Only skin near the indenter enters the contact: what it cannot reach costs time for nothing.
-    """
-    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    faces = mesh.face_sets["skin"]
-    reach = indenter.width * 0.71 + max(model.knots_mm) + 8.0
-    near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
-    return Problem(
-        mesh=mesh,
-        materials=materials(parameters, model.kappa_ratio),
-        fixed=np.unique(np.concatenate([n for s, n in mesh.node_sets.items() if s.startswith("fixed_")])),
-        contact_faces=faces[near],
-        indenter=indenter,
-        history=model.history,
-        friction=model.indenter.friction,
-        element=model.element,
-    )
-
-
-def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:
-    """The indenter at a site; reads the surface of shape ``stl``, whose path must be one of this machine.
-
-    Raises
-    ------
-    InputError
-        For a surface that cannot be read, or that is no indenter.
-    """
-    file, surface = table.file, None
-    if file is not None:
-        points, faces = _read_stl(file)
-        try:
-            surface = RigidSurface(points, faces)
-        except ProblemError as error:
-            raise ProblemError(error.what, file=file, remedy=error.remedy) from None
-    return Indenter(
-        shape=table.shape,
-        width=table.width_mm,
-        edge_radius=table.edge_radius_mm,
-        centre=np.array(position),
-        axis=np.array(axis),
-        edge=None if edge is None else np.array(edge),
-        surface=surface,
-    )
-
-
-def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 3) and faces (m, 3) of an STL file, coincident points merged.
-
-    The reader of `anatomy` would load images and graphics into every worker that only solves.
-    """
-    reader = vtkSTLReader()
-    reader.SetFileName(str(file))
-    reader.AddObserver(vtkCommand.ErrorEvent, lambda *_: None)  # the error below says it
-    reader.Update()
-    found = reader.GetOutput()
-    if not found.GetNumberOfPolys():
-        raise SurfaceError("holds no triangles", file=file, remedy="export the surface as STL again")
-    faces = vtk_to_numpy(found.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
-    a, b, c = faces.T
-    return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]
-
-
 _KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest usual ones, some 5 GB in all
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}  # tissue that sets a site's contact penalty
-_REFERENCE_STEPS = 4  # to the deepest point
+_REFERENCE_STEPS, _REFERENCE_MM = 4, 65.0  # to the deepest point; from the site
 # Of the penetration that is allowed: two of 24 tissues drawn over the bounds then go 1.3 times beyond it.
 _MARGIN = 0.3
 
@@ -222,14 +96,17 @@ class Prepared:
     """What a process keeps of a site for its next simulations.
 
     ``problem``, ``system`` and ``penalty`` (of contact, 1/mm; None: the solver's first) follow from the site
-    alone. ``rested``: the newest simulation from rest with its parameters; one with sensitivities (True) with
-    all of its states, one without (False) with the deepest.
+    alone. ``rested``: the newest simulation from rest with its parameters, ``latest``: the newest one from
+    first guesses with its job; with all of their states where they have sensitivities, else the deepest.
+    ``extension``: from a neighbourhood of that radius to the whole.
     """
 
     problem: Problem
     system: System
     penalty: float | None
     rested: dict[bool, tuple[tuple[float, ...], Result]] = field(default_factory=dict)
+    latest: tuple[SimulationJob, Result] | None = None
+    extension: tuple[float, Extension] | None = None
 
 
 _prepared: OrderedDict[tuple[SiteModel, tuple[str, ...]], Prepared] = OrderedDict()
@@ -244,7 +121,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         system = System(problem, control.threads)
         penalty = control.penalty
         if penalty is None:
-            penalty = _reference_penalty(problem, control, system)
+            penalty = _reference_penalty(model, tissues, control)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
     while (
@@ -254,17 +131,21 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     return known
 
 
-def _reference_penalty(problem: Problem, control: StepControl, system: System) -> float | None:
+def _reference_penalty(model: SiteModel, tissues: tuple[str, ...], control: StepControl) -> float | None:
     """The contact penalty that reference tissue needs at the deepest point it reaches; None where at none.
+
+    It is that of the tissue near the site, so that a part of the mesh and the whole of it hold the same.
 
     All simulations of a site hold it.  One that each found for itself would change in steps with the
     parameters, and the force by a percent with it; one taken over from the simulation before makes the answer
     depend on what that was.  Where other tissue lets the indenter sink in farther, the result says so.
     """
+    near = replace(model, within_mm=min(model.within_mm or _REFERENCE_MM, _REFERENCE_MM))
+    problem = build_problem(near, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
     deepest = problem.history.peak or float(problem.history.times[-1])
     times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
     control = replace(control, times=times, penetration=_MARGIN * control.penetration)
-    found = solve(problem, steps=control, store="peak", system=system)
+    found = solve(problem, steps=control, store="peak")
     return found.states[0].penalty if found.states else None
 
 
@@ -299,18 +180,40 @@ def _lightened(state: State) -> State:
     return replace(state, sensitivity=single)  # type: ignore[arg-type]
 
 
+def _result(job: SimulationJob) -> Result:
+    """A job's simulation, from the first guesses that it states; not done again if it was the newest one."""
+    model, tissues = job.model, job.tissues
+    if job.start is None and job.nested_mm is None:
+        return _solve_from_rest(model, tissues, job.parameters, job.sensitivities)
+    known, wanted = _prepare(model, tissues), replace(job, times_s=())
+    if known.latest is None or known.latest[0] != wanted:
+        parameters, store = (
+            to_parameters(np.array(job.parameters), tissues),
+            "all" if job.sensitivities else "peak",
+        )
+        warm = _guesses(job, known)
+        found = _solve(model, parameters, sensitivities=job.sensitivities, warm_start=warm, store=store)
+        known.latest = wanted, replace(found, states=tuple(map(_lightened, found.states)))
+    return known.latest[1]
+
+
+def _guesses(job: SimulationJob, known: Prepared) -> Result:
+    """The simulation that gives a job's first guesses, on its own mesh or carried on into it."""
+    if job.nested is None:
+        assert job.start is not None
+        return _solve_from_rest(job.model, job.tissues, job.start)
+    near = _result(job.nested)
+    radius, centre = job.nested_mm, np.array(job.model.position)
+    if known.extension is None or known.extension[0] != radius:
+        assert radius is not None
+        part = neighbourhood(known.problem.mesh, centre, radius)
+        known.extension = radius, Extension(known.system, part, centre, radius)
+    return known.extension[1].guesses(near)
+
+
 def first_steps(model: SiteModel, tissues: Sequence[str]) -> StepControl:
     """`steps_of`, with the contact penalty that every simulation of the site holds."""
     return replace(steps_of(model), penalty=_prepare(model, tuple(tissues)).penalty, hold_penalty=True)
-
-
-def steps_of(model: SiteModel) -> StepControl:
-    """How the solver steps through a site's history, before it adapts."""
-    table = model.steps
-    control = StepControl(load_steps=table.load_steps, unload_steps=table.unload_steps)
-    if table.penalty_per_mm is None:
-        return control
-    return replace(control, penalty=table.penalty_per_mm, hold_penalty=True)
 
 
 def simulate(job: SimulationJob) -> Simulation:
@@ -319,13 +222,7 @@ def simulate(job: SimulationJob) -> Simulation:
     The answer depends on the job alone: not on the process, nor on what it simulated before. The simulation
     that a job starts from is done again where this process has not kept it.
     """
-    model = job.model
-    if job.start is None:
-        result = _solve_from_rest(model, job.tissues, job.parameters, job.sensitivities)
-    else:
-        parameters = to_parameters(np.array(job.parameters), job.tissues)
-        warm = _solve_from_rest(model, job.tissues, job.start)
-        result = _solve(model, parameters, sensitivities=job.sensitivities, warm_start=warm, store="peak")
+    model, result = job.model, _result(job)
     times = np.array(job.times_s)
     return Simulation(
         site=model.name,
@@ -356,15 +253,10 @@ def simulate_fields(
     return result
 
 
-def rested_fields(model: SiteModel, parameters: Parameters, file: Path, sensitivities: bool) -> None:
-    """Fields as `simulate_fields` stores them, of a simulation from rest that `simulate` keeps.
-
-    Which of the two, with or without sensitivities, is to be stated: they differ within the solver's
-    tolerance. It is done where this process has not just done it.
-    """
-    tissues = tuple(parameters)
-    vector = tuple(map(float, to_vector(parameters, tissues)))
-    _write_deepest(_solve_from_rest(model, tissues, vector, sensitivities), file)
+def job_fields(job: SimulationJob, file: Path) -> None:
+    """Fields of a job's simulation as `simulate_fields` stores them; it is done where this process has not
+    just done it."""
+    _write_deepest(_result(job), file)
 
 
 def _write_deepest(result: Result, file: Path) -> None:

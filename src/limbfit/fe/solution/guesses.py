@@ -1,0 +1,79 @@
+"""First guesses of a step: from the last steps of the run, or from those of another simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..history import Memory
+from ..kernel.laws import Laws
+from ..problem import Problem
+from ..result import Result, State
+from ..system import System
+
+Array = NDArray[np.float64]
+_SAME_S = 1e-9
+
+
+def extrapolation(states: Sequence[State], displacement: float) -> Array:
+    """Weights (k,) of the last states' fields that foresee the field at an advance of the indenter.
+
+    Quadratic in the advance while it goes on steadily; linear where it has just turned or leaps.
+    """
+    weights = np.zeros(len(states))
+    weights[-1] = 1.0
+    d = np.array([state.displacement for state in states])
+    moved = np.diff(d)
+    if len(states) < 2 or moved[-1] == 0.0:
+        return weights
+    slope = float(np.clip((displacement - d[-1]) / moved[-1], -2.0, 8.0))
+    step = slope * moved[-1]
+    weights[-2:] += -slope, slope
+    if len(states) > 2 and 0.0 < slope <= 2.0 and moved[0] * moved[1] > 0.0:
+        bend = step * (step + moved[1]) / (d[2] - d[0])
+        weights += bend * np.array([1.0 / moved[0], -1.0 / moved[0] - 1.0 / moved[1], 1.0 / moved[1]])
+    return weights
+
+
+@dataclass(frozen=True)
+class Warm:
+    """The displacements ``u`` of another simulation at ``times`` (k,) s, ascending."""
+
+    times: Array
+    u: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, found: Result | None) -> Warm:
+        """Those of a result on the same mesh, moved to the new parameters along their sensitivities."""
+        if found is None or not len(found.states) or found.states[0].u.shape != problem.mesh.points.shape:
+            return cls(np.zeros(0), ())
+        new, old = problem.parameters, found.problem.parameters
+        with np.errstate(all="ignore"):  # moduli act by their ratio
+            change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
+        times = np.array([state.time for state in found.states])
+        return cls(
+            times, tuple(s.u if s.sensitivity is None else s.u + s.sensitivity @ change for s in found.states)
+        )
+
+    def at(self, t: float) -> Array | None:
+        """Displacement (n, 3) at a time, linear between the states; None outside of them."""
+        if not len(self.times) or not self.times[0] - _SAME_S <= t <= self.times[-1] + _SAME_S:
+            return None
+        after = min(int(np.searchsorted(self.times, t - _SAME_S)), len(self.times) - 1)
+        before = max(after - 1, 0)
+        if after == before or abs(self.times[after] - t) <= _SAME_S:
+            return self.u[after]
+        share = (t - self.times[before]) / (self.times[after] - self.times[before])
+        return self.u[before] + share * (self.u[after] - self.u[before])
+
+
+def tangent_at_rest(system: System) -> Array:
+    """Entries of the tangent of the undeformed body, before contact, with its problem's materials."""
+    problem = system.problem
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    start = float(problem.history.at(0.0))
+    increment = Memory.rest(system, laws).increment(system, laws, 1.0, 1.0, start, 0.0)
+    return system.evaluate(np.zeros_like(system.points), laws, increment).tangent

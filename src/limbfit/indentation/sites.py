@@ -1,0 +1,176 @@
+"""A study's site as a mechanical problem: everything about one indentation but the parameters.
+
+`SiteModel` travels to worker processes as paths and numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkCommand
+from vtkmodules.vtkIOGeometry import vtkSTLReader
+
+from ..errors import ProblemError, SurfaceError
+from ..fe import History, Indenter, OgdenQLV, Problem, RigidSurface, StepControl
+from ..mesh import Mesh
+from ..phases import spread
+from ..study import PARAMETERS, IndenterTable, SolverTable, Vector
+from .neighbourhood import held_cut, neighbourhood
+
+Parameters = dict[str, dict[str, float]]
+Array = NDArray[np.float64]
+
+KPA = 1e-3  # MPa
+
+
+def flat_names(tissues: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """(tissue, parameter) in the order of every flat vector: the first tissue's four, then the next one's."""
+    return tuple((tissue, name) for tissue in tissues for name in PARAMETERS)
+
+
+def to_vector(parameters: Parameters, tissues: Sequence[str]) -> Array:
+    """The 4 numbers of each tissue in flat order (c in kPa)."""
+    return np.array([parameters[tissue][name] for tissue, name in flat_names(tissues)])
+
+
+def to_parameters(vector: Array, tissues: Sequence[str]) -> Parameters:
+    """The flat vector as ``{tissue: {name: value}}``, tissues in their order."""
+    result: Parameters = {tissue: {} for tissue in tissues}
+    for (tissue, name), value in zip(flat_names(tissues), vector, strict=True):
+        result[tissue][name] = float(value)
+    return result
+
+
+@dataclass(frozen=True)
+class SiteModel:
+    """One indentation but for the material: mesh file, indenter and displacement history.
+
+    ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm`` are the piecewise linear
+    displacement since touch-down; ``indenter_digest`` is that of the indenter's file, where it has one.
+    """
+
+    name: str
+    mesh: Path
+    mesh_digest: str
+    position: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    knots_s: tuple[float, ...]
+    knots_mm: tuple[float, ...]
+    edge: tuple[float, float, float] | None = None
+    indenter: IndenterTable = field(default_factory=IndenterTable)
+    indenter_digest: str = ""
+    kappa_ratio: float = 100.0
+    steps: SolverTable = field(default_factory=SolverTable)
+    element: str = ""  # row of the element table; by default that of the mesh's cell type
+    within_mm: float | None = None  # no more of the mesh than this far from the site
+
+    @property
+    def history(self) -> History:
+        """The advance of the indenter."""
+        return History(np.array(self.knots_s), np.array(self.knots_mm))
+
+    def curve_times(self, points: int) -> Array:
+        """About ``points`` times (k,) s that show the force, all phases and corners among them."""
+        return spread(self.history.phases, points, self.history.times)
+
+
+def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
+    """The tissues for the solver, in MPa."""
+    return {
+        tissue: OgdenQLV(
+            c=values["c_kPa"] * KPA,
+            m=values["m"],
+            gamma=values["gamma"],
+            tau=values["tau_s"],
+            kappa_ratio=kappa_ratio,
+        )
+        for tissue, values in parameters.items()
+    }
+
+
+def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
+    """The site's boundary-value problem: node sets ``fixed_*`` held, skin in contact with the indenter.
+
+    Only skin near the indenter enters the contact: what it cannot reach costs time for nothing. Where the
+    model goes no farther than ``within_mm``, so is the cut below the indenter.
+    """
+    cut = np.empty(0, dtype=np.int64)
+    if model.within_mm is not None:
+        centre, axis = np.array(model.position), np.array(model.axis)
+        part = neighbourhood(mesh, centre, model.within_mm)
+        mesh, cut = part.mesh, held_cut(part, centre, axis)
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
+    faces = mesh.face_sets["skin"]
+    reach = indenter.width * 0.71 + max(model.knots_mm) + 8.0
+    near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
+    return Problem(
+        mesh=mesh,
+        materials=materials(parameters, model.kappa_ratio),
+        fixed=np.union1d(_held(mesh), cut),
+        contact_faces=faces[near],
+        indenter=indenter,
+        history=model.history,
+        friction=model.indenter.friction,
+        element=model.element,
+    )
+
+
+def _held(mesh: Mesh) -> NDArray[np.int64]:
+    return np.unique(np.concatenate([n for s, n in mesh.node_sets.items() if s.startswith("fixed_")]))
+
+
+def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:
+    """The indenter at a site; reads the surface of shape ``stl``, whose path must be one of this machine.
+
+    Raises
+    ------
+    InputError
+        For a surface that cannot be read, or that is no indenter.
+    """
+    file, surface = table.file, None
+    if file is not None:
+        points, faces = _read_stl(file)
+        try:
+            surface = RigidSurface(points, faces)
+        except ProblemError as error:
+            raise ProblemError(error.what, file=file, remedy=error.remedy) from None
+    return Indenter(
+        shape=table.shape,
+        width=table.width_mm,
+        edge_radius=table.edge_radius_mm,
+        centre=np.array(position),
+        axis=np.array(axis),
+        edge=None if edge is None else np.array(edge),
+        surface=surface,
+    )
+
+
+def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Points (n, 3) and faces (m, 3) of an STL file, coincident points merged.
+
+    The reader of `anatomy` would load images and graphics into every worker that only solves.
+    """
+    reader = vtkSTLReader()
+    reader.SetFileName(str(file))
+    reader.AddObserver(vtkCommand.ErrorEvent, lambda *_: None)  # the error below says it
+    reader.Update()
+    found = reader.GetOutput()
+    if not found.GetNumberOfPolys():
+        raise SurfaceError("holds no triangles", file=file, remedy="export the surface as STL again")
+    faces = vtk_to_numpy(found.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    a, b, c = faces.T
+    return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]
+
+
+def steps_of(model: SiteModel) -> StepControl:
+    """How the solver steps through a site's history, before it adapts."""
+    table = model.steps
+    control = StepControl(load_steps=table.load_steps, unload_steps=table.unload_steps)
+    if table.penalty_per_mm is None:
+        return control
+    return replace(control, penalty=table.penalty_per_mm, hold_penalty=True)
