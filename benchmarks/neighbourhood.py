@@ -43,7 +43,7 @@ def row(record: Any, best: np.ndarray, moved: np.ndarray, radius: float | None) 
     part = replace(record, model=model)
     problem = build_problem(model, read_vtu(model.mesh), to_parameters(best, record.tissues))
     here, rest_s = timed(part.job(best))
-    there, warm_s = timed(part.job(moved, start=best))
+    there, warm_s = timed(part.job(moved, starts=[best]))
     return {
         "nodes": len(problem.mesh.points),
         "here": here,

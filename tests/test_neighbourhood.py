@@ -108,7 +108,7 @@ def test_first_guesses_of_the_part_save_iterations_and_change_no_force(site):
 def test_first_guesses_do_not_depend_on_what_was_simulated_before(site):
     """The part's simulation is at hand in one process, and not in the other."""
     start = tuple(1.2 * to_vector(TRUTH, TISSUES))
-    wanted = job(site, sensitivities=False, start=start, nested_mm=RADIUS_MM)
+    wanted = job(site, sensitivities=False, starts=(start,), nested_mm=RADIUS_MM)
     simulating._prepared.clear()
     fresh = simulate(wanted)
     simulating._prepared.clear()

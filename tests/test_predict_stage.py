@@ -124,7 +124,7 @@ def blocks(tmp_path_factory) -> Blocks:
 def calibration() -> dict:
     """What the stage ``calibrate`` would have stored."""
     stages = [
-        {"parameters": to_parameters(vector, TISSUES), "iterations": [{"first_guess": None}]}
+        {"parameters": to_parameters(vector, TISSUES), "iterations": [{"starts": []}]}
         for vector in (ONE, BEST)
     ]
     residuals = {

@@ -49,7 +49,7 @@ def test_the_order_of_simulations_changes_nothing(jobs):
 def test_a_first_guess_is_the_job_s_own_and_changes_nothing_but_the_work(jobs):
     known = simulate(jobs[0])
     near = replace(jobs[0], parameters=tuple(1.05 * p for p in PARAMETERS[0]))
-    warm = replace(near, start=jobs[0].parameters)
+    warm = replace(near, starts=(jobs[0].parameters,))
     after_its_start = simulate(warm)
     cold = simulate(near)  # now this is the newest simulation from rest, and the start has to be done again
     without = simulate(warm)
@@ -64,7 +64,7 @@ def test_the_way_to_an_answer_does_not_change_its_force(jobs):
     deep = replace(jobs[1], parameters=PARAMETERS[2])
     stiffening = (1.0, 18.0, 0.02, 1.0) * 2
     cold, before = simulate(deep), simulate(replace(deep, parameters=stiffening))
-    warm = simulate(replace(deep, start=stiffening))
+    warm = simulate(replace(deep, starts=(stiffening,)))
     assert warm.force_N == pytest.approx(cold.force_N, abs=1e-4 * cold.force_N.max())
     assert [doubt.kind for doubt in before.doubts] == ["sunk"]
     assert len({one.facts["penalty_per_mm"] for one in (cold, before, warm)}) == 1

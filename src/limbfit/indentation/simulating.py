@@ -39,10 +39,10 @@ _FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
 class SimulationJob:
     """A simulation to be done: parameters (flat over ``tissues``, kPa), the times of the wanted force.
 
-    ``start``: other parameters, whose simulation from rest gives the first guesses; several times quicker
-    where they are near. Forces then differ within the solver's tolerance, and by nothing else.
-    ``nested_mm``: first guesses are those of the same job, with derivatives, on no more of the mesh than this
-    distance from the site; ``start`` is then that one's.
+    ``starts``: other parameters, whose simulation gives the first guesses, and those that gave them theirs,
+    the first from rest; several times quicker where they are near. Forces then differ within the solver's
+    tolerance, and by nothing else. ``nested_mm``: first guesses are those of the same job, with derivatives,
+    on no more of the mesh than this distance from the site; ``starts`` are then that one's.
     """
 
     model: SiteModel
@@ -50,8 +50,13 @@ class SimulationJob:
     parameters: tuple[float, ...]
     times_s: tuple[float, ...]
     sensitivities: bool = True
-    start: tuple[float, ...] | None = None
+    starts: tuple[tuple[float, ...], ...] = ()
     nested_mm: float | None = None
+
+    @property
+    def before(self) -> SimulationJob:
+        """The job on the same mesh whose simulation gives the first guesses; there are ``starts``."""
+        return replace(self, parameters=self.starts[-1], starts=self.starts[:-1], sensitivities=True)
 
     @property
     def nested(self) -> SimulationJob | None:
@@ -97,7 +102,8 @@ class Prepared:
 
     ``problem``, ``system`` and ``penalty`` (of contact, 1/mm; None: the solver's first) follow from the site
     alone. ``rested``: the newest simulation from rest with its parameters, ``latest``: the newest one from
-    first guesses with its job; with all of their states where they have sensitivities, else the deepest.
+    first guesses with its job, ``link`` the newest of those that gave such to others; with all of their
+    states where they have sensitivities, else the deepest.
     ``extension``: from a neighbourhood of that radius to the whole.
     """
 
@@ -106,6 +112,7 @@ class Prepared:
     penalty: float | None
     rested: dict[bool, tuple[tuple[float, ...], Result]] = field(default_factory=dict)
     latest: tuple[SimulationJob, Result] | None = None
+    link: tuple[SimulationJob, Result] | None = None
     extension: tuple[float, Extension] | None = None
 
 
@@ -183,9 +190,11 @@ def _lightened(state: State) -> State:
 def _result(job: SimulationJob) -> Result:
     """A job's simulation, from the first guesses that it states; not done again if it was the newest one."""
     model, tissues = job.model, job.tissues
-    if job.start is None and job.nested_mm is None:
+    if not job.starts and job.nested_mm is None:
         return _solve_from_rest(model, tissues, job.parameters, job.sensitivities)
     known, wanted = _prepare(model, tissues), replace(job, times_s=())
+    if known.link is not None and known.link[0] == wanted:
+        return known.link[1]
     if known.latest is None or known.latest[0] != wanted:
         parameters, store = (
             to_parameters(np.array(job.parameters), tissues),
@@ -200,8 +209,10 @@ def _result(job: SimulationJob) -> Result:
 def _guesses(job: SimulationJob, known: Prepared) -> Result:
     """The simulation that gives a job's first guesses, on its own mesh or carried on into it."""
     if job.nested is None:
-        assert job.start is not None
-        return _solve_from_rest(job.model, job.tissues, job.start)
+        found = _result(job.before)
+        if job.before.starts:
+            known.link = replace(job.before, times_s=()), found
+        return found
     near = _result(job.nested)
     radius, centre = job.nested_mm, np.array(job.model.position)
     if known.extension is None or known.extension[0] != radius:

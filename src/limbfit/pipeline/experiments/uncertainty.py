@@ -18,7 +18,7 @@ from ...identify.uncertainty.evidence import Evidence, candidate, compare
 from ...identify.uncertainty.explore import Explored, ExploreSettings, explore
 from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.sources import Gain
-from ...indentation import Parameters, to_vector
+from ...indentation import to_vector
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
@@ -38,7 +38,11 @@ class FittedSites(Laboratory):
     """The fitted sites, simulated with derivatives; brought to the fine meshes' forces where those exist."""
 
     def __init__(
-        self, context: Context, folder: Path, best: Array, earlier: Mapping[tuple[float, ...], Array | None]
+        self,
+        context: Context,
+        folder: Path,
+        best: Array,
+        earlier: Mapping[tuple[float, ...], Sequence[Array]],
     ) -> None:
         """``earlier``: parameters that the calibration simulated, and where it started them from."""
         super().__init__(context, experiment_cache(context, folder), context.study.fitted, NAME)
@@ -48,7 +52,7 @@ class FittedSites(Laboratory):
     def simulate(self, points: Sequence[Array]) -> list[list[SiteResponse]]:
         """Responses of all sites at several parameters (p,)."""
         jobs = [
-            record.job(point, start=self._first_guess(point)) for point in points for record in self.searched
+            record.job(point, starts=self._starts_of(point)) for point in points for record in self.searched
         ]
         found: list[SiteResponse] = []
         done = self.cache.run(jobs, self.context.executor)
@@ -58,11 +62,11 @@ class FittedSites(Laboratory):
         n = len(self.searched)
         return [self.at_best.as_fine(found[i : i + n]) for i in range(0, len(found), n)]
 
-    def _first_guess(self, point: Array) -> Array | None:
-        """Where a simulation starts from: as in the calibration, or from the answer; None: from rest."""
+    def _starts_of(self, point: Array) -> Sequence[Array]:
+        """Where a simulation starts from: as in the calibration, or from the answer, itself from rest."""
         if np.array_equal(point, self.best):
-            return None
-        return self.earlier.get(tuple(point.tolist()), self.best)
+            return ()
+        return self.earlier.get(tuple(point.tolist()), (self.best,))
 
 
 def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
@@ -97,17 +101,18 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     return {"runs": explored.rounds[-1].runs}
 
 
-def _earlier_points(context: Context, calibration: dict[str, Any]) -> dict[tuple[float, ...], Array | None]:
-    """Parameters of the calibration's iterates that came near the records, with their first guesses."""
+def _earlier_points(
+    context: Context, calibration: dict[str, Any]
+) -> dict[tuple[float, ...], Sequence[Array]]:
+    """Parameters of the calibration's iterates that came near the records, and where it started them from."""
     tissues = context.study.tissues
-
-    def vector(parameters: Parameters | None) -> Array | None:
-        return None if parameters is None else to_vector(parameters, tissues)
-
     iterates = [iterate for stage in calibration["stages"] for iterate in stage["iterations"]]
     least = min(iterate["error_percent"] for iterate in iterates)
-    near = [i for i in iterates if i["error_percent"] <= _NEAR * least + 3.0]
-    return {tuple(to_vector(i["parameters"], tissues).tolist()): vector(i["first_guess"]) for i in near}
+    return {
+        tuple(to_vector(one["parameters"], tissues).tolist()): [to_vector(s, tissues) for s in one["starts"]]
+        for one in iterates
+        if one["error_percent"] <= _NEAR * least + 3.0
+    }
 
 
 def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evidence:

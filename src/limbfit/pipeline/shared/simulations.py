@@ -120,7 +120,14 @@ def job_digest(job: SimulationJob) -> str:
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
     return digest(
-        code_digest(simulate), model, job.tissues, job.parameters, job.times_s, job.sensitivities, job.start
+        code_digest(simulate),
+        model,
+        job.tissues,
+        job.parameters,
+        job.times_s,
+        job.sensitivities,
+        job.starts,
+        job.nested_mm,
     )
 
 

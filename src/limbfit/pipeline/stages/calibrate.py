@@ -97,9 +97,8 @@ def _stage_record(
     before = np.array(found.stages[number - 1].parameters) if number else start
     iterates = [iterate for iterate in found.history if iterate.stage == number]
 
-    def first_guess(parameters: Sequence[float]) -> Parameters | None:
-        rested = laboratory.first_guess(np.array(parameters))
-        return None if rested is None else to_parameters(rested, tissues)
+    def starts(parameters: Sequence[float]) -> list[Parameters]:
+        return [to_parameters(one, tissues) for one in laboratory.starts(np.array(parameters))]
 
     return {
         "name": stage_titles(tissues)[number],
@@ -113,7 +112,7 @@ def _stage_record(
             {
                 "iteration": i,
                 "parameters": to_parameters(np.array(iterate.parameters), tissues),
-                "first_guess": first_guess(iterate.parameters),
+                "starts": starts(iterate.parameters),
                 "cost": iterate.cost,
                 "error_percent": float(np.mean(iterate.errors_percent)),
                 "error_percent_by_site": dict(zip(found.sites, iterate.errors_percent, strict=True)),

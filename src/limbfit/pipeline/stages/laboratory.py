@@ -34,7 +34,9 @@ from .traces import SiteRecord, site_record
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
 COARSER = 1.3  # times the edges: another mesh that tells the error of the study's own
-NEAR = 0.7  # in logarithms of parameters: as far as another simulation's states save work as first guesses
+# In logarithms of parameters: another simulation's states save work as first guesses as far as NEAR, and half
+# of it within CLOSE; one that is farther than that is the next one's start.
+NEAR, CLOSE, MOST_STARTS = 1.5, 0.35, 4
 ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too sure"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
@@ -76,8 +78,8 @@ class Laboratory:
         self.penalties: dict[str, float | None] = {}
         self.doubts: list[Doubted] = []
         self.kept = Kept()
-        self._rested: Array | None = None
-        self._starts: dict[bytes, Array | None] = {}
+        self._chain: tuple[Array, ...] = ()
+        self._starts: dict[bytes, tuple[Array, ...]] = {}
 
     @property
     def is_apart(self) -> bool:
@@ -91,25 +93,30 @@ class Laboratory:
     def search(self, parameters: Array) -> Responses:
         """Force and derivatives where parameters are searched."""
         self.evaluations += 1
-        start = self.first_guess(parameters)
-        jobs = [record.job(parameters, start=start) for record in self.searched]
+        starts = self.starts(parameters)
+        jobs = [record.job(parameters, starts=starts) for record in self.searched]
         found = self._run(jobs, f"evaluation {self.evaluations}", searched=parameters)
         self.kept.add(parameters, found)
         return found
 
-    def first_guess(self, parameters: Array) -> Array | None:
-        """Parameters simulated from rest near these; None where these are to be simulated so themselves.
+    def starts(self, parameters: Array) -> tuple[Array, ...]:
+        """Parameters whose simulations give the first guesses of these, each the next one's; none: from rest.
 
-        It follows from the parameters asked for before: a run taken up again asks for the same ones.
+        They follow from the parameters asked for before: a run taken up again asks for the same ones.
         """
+
+        def is_within(distance: float) -> bool:
+            return bool(np.max(np.abs(np.log(parameters / self._chain[-1]))) <= distance)
+
         key = parameters.tobytes()
         if key not in self._starts:
-            rested = self._rested
-            if rested is not None and np.max(np.abs(np.log(parameters / rested))) > NEAR:
-                rested = None
-            if rested is None:
-                self._rested = parameters
-            self._starts[key] = rested
+            if self._chain and not is_within(NEAR):
+                self._chain = ()
+            if len(self._chain) == MOST_STARTS and not is_within(CLOSE):
+                self._chain = ()
+            self._starts[key] = self._chain
+            if not self._chain or not is_within(CLOSE):
+                self._chain = (*self._chain, parameters)
         return self._starts[key]
 
     def answer(self, parameters: Array) -> Responses:
@@ -121,8 +128,8 @@ class Laboratory:
     def check(self, parameters: Array) -> Responses:
         """Force on the study's own meshes; what failed before is tried again."""
         self.corrections += 1
-        start = self.first_guess(parameters)
-        jobs = [record.own_job(parameters, start) for record in self.records]
+        starts = self.starts(parameters)
+        jobs = [record.own_job(parameters, starts) for record in self.records]
         return self._run(jobs, f"correction {self.corrections}", again=True)
 
     def anchored(self, parameters: Array) -> Anchored:

@@ -51,7 +51,7 @@ def outlier_record(
     def simulate(parameters: Array) -> list[SiteResponse]:
         if np.array_equal(parameters, best):
             return known
-        found = _run(context, cache, [record.job(parameters, start=best) for record in searched])
+        found = _run(context, cache, [record.job(parameters, starts=[best]) for record in searched])
         found = found if correction is None else correction.of(whole)(found)
         failed.extend(f"site {r.site}, one material: {r.reason}" for r in found if not r.completed)
         return found

@@ -76,18 +76,16 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Answer:
-    """Identified ``parameters`` (p,), and those from which the calibration's simulation of them started."""
+    """Identified ``parameters`` (p,), and those from which its simulation in the calibration ``starts``."""
 
     parameters: Array
-    first_guess: Array | None
+    starts: tuple[Array, ...]
 
     @classmethod
     def of(cls, stage: dict[str, Any], tissues: Sequence[str]) -> Answer:
         """The answer of a stage as ``calibration.json`` holds it."""
-        guess = stage["iterations"][-1]["first_guess"]
-        return cls(
-            to_vector(stage["parameters"], tissues), None if guess is None else to_vector(guess, tissues)
-        )
+        starts = stage["iterations"][-1]["starts"]
+        return cls(to_vector(stage["parameters"], tissues), tuple(to_vector(one, tissues) for one in starts))
 
 
 def answer_jobs(context: Context, records: Sequence[SiteRecord], answer: Answer) -> list[SimulationJob]:
@@ -98,10 +96,10 @@ def answer_jobs(context: Context, records: Sequence[SiteRecord], answer: Answer)
     best = answer.parameters
     if not context.study.is_searched_apart:
         return [record.job(best) for record in records]
-    guesses = [answer.first_guess if record.site.fitted else None for record in records]
+    starts = [answer.starts if record.site.fitted else () for record in records]
     near = [site_record(context, record.site, searched=True) for record in records]
-    own = [record.own_job(best, guess) for record, guess in zip(records, guesses)]
-    return own + [record.job(best, start=guess) for record, guess in zip(near, guesses)]
+    own = [record.own_job(best, before) for record, before in zip(records, starts)]
+    return own + [record.job(best, starts=before) for record, before in zip(near, starts)]
 
 
 def _one_material_jobs(
@@ -115,15 +113,15 @@ def _one_material_jobs(
     vector = one.parameters
     if not context.study.is_searched_apart:
         return [
-            r.job(vector, start=one.first_guess)
+            r.job(vector, starts=one.starts)
             if r.site.fitted
-            else r.job(vector, sensitivities=False, start=best)
+            else r.job(vector, sensitivities=False, starts=[best])
             for r in records
         ]
     return [
-        r.own_job(vector, one.first_guess)
+        r.own_job(vector, one.starts)
         if r.site.fitted
-        else site_record(context, r.site, searched=True).job(vector, sensitivities=False, start=best)
+        else site_record(context, r.site, searched=True).job(vector, sensitivities=False, starts=[best])
         for r in records
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -130,22 +131,24 @@ class SiteRecord:
         force_N, jacobian = (self.smoothing @ values for values in (plain.force_N, plain.jacobian))
         return replace(plain, force_N=force_N, jacobian=jacobian)
 
-    def job(self, parameters: Array, sensitivities: bool = True, start: Array | None = None) -> SimulationJob:
-        """The simulation with these parameters; ``start``: those whose simulation gives first guesses."""
+    def job(
+        self, parameters: Array, sensitivities: bool = True, starts: Sequence[Array] = ()
+    ) -> SimulationJob:
+        """The simulation with these parameters; ``starts``: those whose simulations give first guesses."""
         values, times = tuple(map(float, parameters)), tuple(map(float, self.times_s))
-        first = None if start is None else tuple(map(float, start))
+        first = tuple(tuple(map(float, start)) for start in starts)
         return SimulationJob(self.model, self.tissues, values, times, sensitivities, first)
 
-    def own_job(self, parameters: Array, start: Array | None = None) -> SimulationJob:
+    def own_job(self, parameters: Array, starts: Sequence[Array] = ()) -> SimulationJob:
         """The force on the whole of the study's own mesh, without derivatives.
 
         Where parameters are searched on a part of that mesh, its simulation gives the first guesses, and
-        ``start`` is that one's; otherwise it is nothing.
+        ``starts`` are that one's; otherwise they are nothing.
         """
         job = self.job(parameters, sensitivities=False)
         if self.nested_mm is None:
             return job
-        nested = self.job(parameters, sensitivities=False, start=start)
+        nested = self.job(parameters, sensitivities=False, starts=starts)
         return replace(nested, nested_mm=self.nested_mm)
 
 
