@@ -165,7 +165,7 @@ def test_nothing_is_missing_where_nothing_fails(whole):
 def test_a_lost_coarse_simulation_takes_the_interval_with_it(blocks, whole, tmp_path):
     """Its scale was 0/0."""
     rows = blocks.predicted(tmp_path / "p", lost=of("aside", coarse=True))
-    check_without_interval(rows, whole, tmp_path / "p", "aside", f"coarse mesh: {LIMIT}")
+    check_without_interval(rows, whole, tmp_path / "p", "aside", f"in the search: {LIMIT}")
     assert rows["near"] == whole[0]["near"]
 
 
@@ -185,7 +185,7 @@ def test_a_coarse_simulation_that_the_solver_gives_up_takes_the_interval_with_it
     indentation._prepared.clear()
     rows = blocks.predicted(tmp_path / "p", anew=chosen)
     indentation._prepared.clear()
-    check_without_interval(rows, whole, tmp_path / "p", "aside", "coarse mesh: ")
+    check_without_interval(rows, whole, tmp_path / "p", "aside", "in the search: ")
 
 
 def check_without_interval(rows, whole, folder: Path, site: str, reason: str) -> None:
@@ -217,7 +217,7 @@ def test_a_lost_simulation_of_a_held_out_site_gives_no_force(blocks, whole, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("site", "mesh"), [("near", ""), ("aside", "coarse mesh: ")])
+@pytest.mark.parametrize(("site", "mesh"), [("near", ""), ("aside", "in the search: ")])
 def test_a_lost_simulation_with_one_material_leaves_the_rest(blocks, whole, tmp_path, site, mesh):
     """At fitted sites it is the site's own mesh's, at others the coarse one's."""
     rows = blocks.predicted(tmp_path / "p", lost=of(site, coarse=bool(mesh), one=True))
@@ -238,5 +238,5 @@ def test_folded_elements_of_a_coarse_mesh_are_told(blocks, whole, tmp_path):
         rows = blocks.predicted(tmp_path / "p")
     finally:
         file.write_bytes(content)
-    assert any("coarse mesh" in text and "inside out" in text for text in rows["aside"]["warnings"])
+    assert any("in the search" in text and "inside out" in text for text in rows["aside"]["warnings"])
     assert rows["near"]["warnings"] == []

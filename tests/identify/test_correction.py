@@ -47,12 +47,12 @@ def test_the_scale_is_the_least_squares_ratio():
 @pytest.mark.parametrize(
     ("coarse", "fine", "reason"),
     [
-        (response(0 * FORCE, completed=False, reason="lost"), response(FORCE), "coarse mesh: lost"),
-        (response(FORCE, completed=False), response(FORCE), "coarse mesh: simulation failed"),
-        (response(FORCE), response(FORCE, completed=False, reason="folded"), "fine mesh: folded"),
-        (response(FORCE * np.nan), response(FORCE), "coarse mesh: the simulated force is not finite"),
-        (response(0 * FORCE), response(FORCE), "coarse mesh: there is no force"),
-        (response(FORCE), response(0 * FORCE), "fine mesh: there is no force"),
+        (response(0 * FORCE, completed=False, reason="lost"), response(FORCE), "in the search: lost"),
+        (response(FORCE, completed=False), response(FORCE), "in the search: simulation failed"),
+        (response(FORCE), response(FORCE, completed=False, reason="folded"), "on the whole mesh: folded"),
+        (response(FORCE * np.nan), response(FORCE), "in the search: the simulated force is not finite"),
+        (response(0 * FORCE), response(FORCE), "in the search: there is no force"),
+        (response(FORCE), response(0 * FORCE), "on the whole mesh: there is no force"),
     ],
 )
 def test_a_site_without_an_anchor_has_a_reason_and_no_numbers(coarse, fine, reason):
@@ -72,14 +72,14 @@ def test_a_site_without_an_anchor_has_a_reason_and_no_numbers(coarse, fine, reas
 def test_what_fails_later_has_no_numbers_either():
     correction = CoarseToFine([response(FORCE)], [response(1.2 * FORCE)])
     (found,) = correction([response(FORCE, completed=False, reason="did not converge")])
-    assert (found.completed, found.reason) == (False, "coarse mesh: did not converge")
+    assert (found.completed, found.reason) == (False, "in the search: did not converge")
     assert np.all(np.isnan(found.force_N))
 
 
 def test_doubts_of_all_three_simulations_are_carried():
     coarse, fine = response(FORCE, doubts=("slips",)), response(FORCE, doubts=("folds",))
     (found,) = CoarseToFine([coarse], [fine])([response(FORCE, doubts=("slips", "sinks in"))])
-    assert found.doubts == ("folds", "coarse mesh: slips", "coarse mesh: sinks in")
+    assert found.doubts == ("folds", "in the search: slips", "in the search: sinks in")
 
 
 @pytest.mark.parametrize(

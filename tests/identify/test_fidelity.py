@@ -135,7 +135,7 @@ def test_a_fine_simulation_that_always_fails_is_told():
 
     found = calibrate_corrected(coarsened, fails, records(), PAPER)
     assert not found.calibration.converged
-    assert "the correction fails: s2: fine mesh: folded" in found.calibration.reason
+    assert "the correction fails: s2: on the whole mesh: folded" in found.calibration.reason
     json.dumps(found.to_dict(), allow_nan=False)  # as it is stored
 
 
@@ -180,10 +180,10 @@ def test_a_coarse_simulation_lost_half_way_back_leaves_the_correction_before():
     found = calibrate_corrected(coarse, counting(plain, fine), data, PAPER)
     failed = [one for one in found.rounds if one.reason]
     assert failed
-    assert all("s0: coarse mesh: lost" in one.reason for one in failed)
+    assert all("s0: in the search: lost" in one.reason for one in failed)
     assert all(one.scales == one.expected_percent == (None,) * 4 for one in failed)
     json.dumps(found.to_dict(), allow_nan=False)
-    assert "the correction fails: s0: coarse mesh: lost" in found.calibration.reason
+    assert "the correction fails: s0: in the search: lost" in found.calibration.reason
     whole = [one for one in found.rounds if one.stage == 1 and not one.reason]
     costs = [fine_cost(one.parameters, data) for one in whole]
     assert fine_cost(found.calibration.parameters, data) == pytest.approx(min(costs))

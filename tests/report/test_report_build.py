@@ -295,7 +295,7 @@ def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
     file = copy / "predict" / "predict.json"
     content = json.loads(file.read_text())
     row = content["sites"][5]
-    why = "coarse mesh: went over its limits"
+    why = "in the search: went over its limits"
     row |= {"error_one_material_percent": None, "not_predicted": {"interval": why, "one_material": why}}
     row["warnings"] = [f"no force with one material: {why}"]
     content |= {"flags": [], "failed": ["site PO-6, one material: lost"]}

@@ -17,6 +17,8 @@ import numpy as np
 from ...errors import CalibrationError
 from .objective import SiteResponse
 
+SEARCH, OWN = "in the search", "on the whole mesh"  # of the coarse and of the fine simulations, in reasons
+
 
 @dataclass(frozen=True)
 class CoarseToFine:
@@ -41,7 +43,7 @@ class CoarseToFine:
     def reasons(self) -> tuple[str, ...]:
         """Per site why it cannot be corrected; empty where it can."""
         pairs = zip(self.coarse, self.fine)
-        return tuple(_unusable(c, "coarse") or _unusable(f, "fine") for c, f in pairs)
+        return tuple(_unusable(c, SEARCH) or _unusable(f, OWN) for c, f in pairs)
 
     @cached_property
     def scales(self) -> tuple[float | None, ...]:
@@ -75,11 +77,11 @@ class CoarseToFine:
 def _corrected(
     response: SiteResponse, coarse: SiteResponse, fine: SiteResponse, scale: float | None, reason: str
 ) -> SiteResponse:
-    reason = reason or ("" if response.completed else f"coarse mesh: {_told(response)}")
+    reason = reason or ("" if response.completed else f"{SEARCH}: {_told(response)}")
     if scale is None or reason:
         nothing = np.full_like(response.force_N, np.nan), np.full_like(response.jacobian, np.nan)
         return SiteResponse(*nothing, False, reason, response.site)
-    doubtful = dict.fromkeys(f"coarse mesh: {text}" for text in (*coarse.doubts, *response.doubts))
+    doubtful = dict.fromkeys(f"{SEARCH}: {text}" for text in (*coarse.doubts, *response.doubts))
     return replace(
         response,
         force_N=fine.force_N + scale * (response.force_N - coarse.force_N),
@@ -88,13 +90,13 @@ def _corrected(
     )
 
 
-def _unusable(response: SiteResponse, mesh: str) -> str:
+def _unusable(response: SiteResponse, where: str) -> str:
     """Why a response cannot be an anchor; else an empty text."""
     if not response.completed:
-        return f"{mesh} mesh: {_told(response)}"
+        return f"{where}: {_told(response)}"
     if not (np.all(np.isfinite(response.force_N)) and np.all(np.isfinite(response.jacobian))):
-        return f"{mesh} mesh: the simulated force is not finite"
-    return "" if np.any(response.force_N) else f"{mesh} mesh: there is no force"
+        return f"{where}: the simulated force is not finite"
+    return "" if np.any(response.force_N) else f"{where}: there is no force"
 
 
 def _told(response: SiteResponse) -> str:

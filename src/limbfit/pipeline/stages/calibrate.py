@@ -123,7 +123,7 @@ def _stage_record(
 
 
 def _round_record(one: Round, sites: Sequence[str], tissues: Sequence[str]) -> dict[str, Any]:
-    """One correction of the coarse meshes' forces; percentages are of each site's largest force."""
+    """One correction of the search by the whole meshes; percentages are of each site's largest force."""
     return {
         "stage": stage_titles(tissues)[one.stage] if one.stage >= 0 else "start",
         "parameters": to_parameters(np.array(one.parameters), tissues),

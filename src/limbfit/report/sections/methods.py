@@ -161,11 +161,17 @@ def _meshes(store: Results) -> str:
             f"Each site has a mesh of its own of {_element(element)}{edges}.",
             f"They have {_range(facts, 'nodes', 0)} nodes and {_range(facts, 'cells', 0)} elements, with a "
             f"smallest dihedral angle of {_range(facts, 'min_dihedral_deg', 1)} degrees.",
-            f"Parameters were searched on coarser meshes ({_pairs(coarse)}), corrected by the finer ones."
-            if coarse
-            else "",
+            _search(store, coarse),
         )
     )
+
+
+def _search(store: Results, coarse: Json | None) -> str:
+    """On what parameters were searched, where that was not the meshes themselves."""
+    radius = _settings(store, "calibration").get("search_radius_mm")
+    of = f"coarser meshes ({_pairs(coarse)})" if coarse else "these meshes" if radius else ""
+    within = f"what of {of} is within {radius} mm of the site" if radius else of
+    return f"Parameters were searched on {within}, corrected by the whole meshes." if of else ""
 
 
 def _element(name: object) -> str:

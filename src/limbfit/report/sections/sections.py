@@ -252,7 +252,9 @@ def solver(store: Results) -> Section:
         "Objective": store.calibration.get("objective"),
         "Forward simulations of the identification": store.calibration.get("forward_runs"),
         "Of them with derivatives": store.calibration.get("forward_runs_with_sensitivities"),
-        "Corrections of coarse meshes": _corrections(store.calibration.get("corrections") or []),
+        "Corrections of the search by the whole meshes": _corrections(
+            store.calibration.get("corrections") or []
+        ),
         "Starts": (store.calibration.get("multistart") or {}).get("summary"),
         "Linear solver": store.calibration.get("linear_solver"),
         "Element": store.calibration.get("element"),
