@@ -13,6 +13,7 @@ import typer
 from limbfit import __version__
 from limbfit.cli import main
 from limbfit.cli.app import app
+from limbfit.cli.commands import show_summary
 from limbfit.cli.groups import GROUPS
 
 HEADER = "time_s,displacement_mm,force_N"
@@ -291,3 +292,10 @@ def test_an_amputation_shortens_given_surfaces(limbfit, study):
     # From the plane at 30 mm the pad of 15 mm reaches to 15 mm: the limb is 120 - 15 mm long.
     assert float(extent[1].split(" x ")[2]) == pytest.approx(105, abs=2)
     assert float(extent[0].split(" x ")[2]) > 145
+
+
+def test_a_run_that_ends_with_the_calibration_shows_the_parameters(capsys):
+    """There are no predictions yet; it ended in an internal error."""
+    values = {"c_kPa": 6.5, "m": 7.0, "gamma": 2.5, "tau_s": 0.5}
+    show_summary({"parameters": {"skin": values}, "until": "calibrate", "results": "results"}, as_json=False)
+    assert "skin, identified" in capsys.readouterr().out

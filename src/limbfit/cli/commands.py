@@ -231,10 +231,11 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
         STDOUT.print(f"done until {summary['until']}; results in {summary['results']}")
         return
     show_parameters(summary)
-    show_sites(summary)
-    show_warnings(summary["sites"])
+    if "sites" in summary:  # as the report, not before its stage
+        show_sites(summary)
+        show_warnings(summary["sites"])
     show_flags(summary.get("flags", ()))
-    if "report" in summary:  # not before its stage
+    if "report" in summary:
         STDOUT.print(f"report: {summary['report']}")
 
 
