@@ -141,11 +141,10 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
 def _reference_penalty(model: SiteModel, tissues: tuple[str, ...], control: StepControl) -> float | None:
     """The contact penalty that reference tissue needs at the deepest point it reaches; None where at none.
 
-    It is that of the tissue near the site, so that a part of the mesh and the whole of it hold the same.
-
-    All simulations of a site hold it.  One that each found for itself would change in steps with the
-    parameters, and the force by a percent with it; one taken over from the simulation before makes the answer
-    depend on what that was.  Where other tissue lets the indenter sink in farther, the result says so.
+    All simulations of a site hold it, on a part of its mesh and on the whole: it is that of the tissue near
+    the site.  One that each found for itself would change in steps with the parameters, and the force by a
+    percent with it; one taken over from the simulation before makes the answer depend on what that was.
+    Where other tissue lets the indenter sink in farther, the result says so.
     """
     near = replace(model, within_mm=min(model.within_mm or _REFERENCE_MM, _REFERENCE_MM))
     problem = build_problem(near, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
@@ -196,12 +195,9 @@ def _result(job: SimulationJob) -> Result:
     if known.link is not None and known.link[0] == wanted:
         return known.link[1]
     if known.latest is None or known.latest[0] != wanted:
-        parameters, store = (
-            to_parameters(np.array(job.parameters), tissues),
-            "all" if job.sensitivities else "peak",
-        )
-        warm = _guesses(job, known)
-        found = _solve(model, parameters, sensitivities=job.sensitivities, warm_start=warm, store=store)
+        values, with_slopes = to_parameters(np.array(job.parameters), tissues), job.sensitivities
+        store, warm = "all" if with_slopes else "peak", _guesses(job, known)
+        found = _solve(model, values, sensitivities=with_slopes, warm_start=warm, store=store)
         known.latest = wanted, replace(found, states=tuple(map(_lightened, found.states)))
     return known.latest[1]
 
