@@ -155,19 +155,16 @@ def _meshes(store: Results) -> str:
         if "edge_near_mm" in table
         else ""
     )
-    coarse = table.get("coarse")
-    return _said(
-        (
-            f"Each site has a mesh of its own of {_element(element)}{edges}.",
-            f"They have {_range(facts, 'nodes', 0)} nodes and {_range(facts, 'cells', 0)} elements, with a "
-            f"smallest dihedral angle of {_range(facts, 'min_dihedral_deg', 1)} degrees.",
-            _search(store, coarse),
-        )
+    size = (
+        f"They have {_range(facts, 'nodes', 0)} nodes and {_range(facts, 'cells', 0)} elements, with a "
+        f"smallest dihedral angle of {_range(facts, 'min_dihedral_deg', 1)} degrees."
     )
+    return _said((f"Each site has a mesh of its own of {_element(element)}{edges}.", size, _search(store)))
 
 
-def _search(store: Results, coarse: Json | None) -> str:
+def _search(store: Results) -> str:
     """On what parameters were searched, where that was not the meshes themselves."""
+    coarse = _settings(store, "mesh").get("coarse")
     radius = _settings(store, "calibration").get("search_radius_mm")
     of = f"coarser meshes ({_pairs(coarse)})" if coarse else "these meshes" if radius else ""
     within = f"what of {of} is within {radius} mm of the site" if radius else of
