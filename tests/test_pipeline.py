@@ -174,7 +174,7 @@ def test_three_tissues_from_surfaces_to_report(coarse):
     )
     report = (results / "report/report.html").read_text()
     assert "first as one material, then as skin, fat and calf." in report
-    assert "skin (2.0 mm) and fat (6.0 mm)" in report
+    assert "outermost first: skin (2.0 mm), fat (6.0 mm)" in report
     before = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
     assert set(before.values()) == {"done"}
     file.write_text(file.read_text().replace('"calf"', '"muscle"'))
