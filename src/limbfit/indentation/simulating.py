@@ -123,12 +123,15 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     """The site's discretisation and contact penalty; sites not used for longest are forgotten."""
     known = _prepared.get((model, tissues))
     if known is None:
-        problem = build_problem(model, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
-        control = steps_of(model)
+        mesh, reference, control = read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE), steps_of(model)
+        problem = build_problem(model, mesh, reference)
         system = System(problem, control.threads)
         penalty = control.penalty
         if penalty is None:
-            penalty = _reference_penalty(model, tissues, control)
+            near = problem
+            if model.within_mm is None or model.within_mm > _REFERENCE_MM:
+                near = build_problem(replace(model, within_mm=_REFERENCE_MM), mesh, reference)
+            penalty = _reference_penalty(near, control, system)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
     while (
@@ -138,7 +141,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     return known
 
 
-def _reference_penalty(model: SiteModel, tissues: tuple[str, ...], control: StepControl) -> float | None:
+def _reference_penalty(problem: Problem, control: StepControl, system: System) -> float | None:
     """The contact penalty that reference tissue needs at the deepest point it reaches; None where at none.
 
     All simulations of a site hold it, on a part of its mesh and on the whole: it is that of the tissue near
@@ -146,12 +149,10 @@ def _reference_penalty(model: SiteModel, tissues: tuple[str, ...], control: Step
     percent with it; one taken over from the simulation before makes the answer depend on what that was.
     Where other tissue lets the indenter sink in farther, the result says so.
     """
-    near = replace(model, within_mm=min(model.within_mm or _REFERENCE_MM, _REFERENCE_MM))
-    problem = build_problem(near, read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
     deepest = problem.history.peak or float(problem.history.times[-1])
     times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
     control = replace(control, times=times, penetration=_MARGIN * control.penetration)
-    found = solve(problem, steps=control, store="peak")
+    found = solve(problem, steps=control, store="peak", system=system)
     return found.states[0].penalty if found.states else None
 
 

@@ -196,7 +196,7 @@ class _Outer:
                 break
             if best is None or self._cost() < best.cost:
                 best = self._standing()
-            if settled and (not is_last or not loose):
+            if settled and not (is_last and loose):
                 break
         if best is not None and best.cost < self._cost():
             self._return_to(best)

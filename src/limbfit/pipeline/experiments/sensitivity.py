@@ -20,7 +20,7 @@ from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..shared.store import write_json
 from ..shared.tabular import write_table
-from ..stages.traces import site_record
+from ..stages.traces import as_searched, site_record
 from .variants import (
     ChosenSite,
     Variant,
@@ -82,9 +82,8 @@ def _derivatives(context: Context, folder: Path, identified: Parameters) -> list
     They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
-    apart = study.is_searched_apart
-    records = [site_record(context, site, apart) for site in study.sites if site.trace is not None]
-    best = to_vector(identified, study.tissues)
+    own = [site_record(context, site) for site in study.sites if site.trace is not None]
+    records, best = as_searched(context, own), to_vector(identified, study.tissues)
     cache = experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []
     for record, found in zip(

@@ -24,7 +24,7 @@ from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
 from ..stages.predict import Answer, answer_jobs
 from ..stages.record_noise import site_noise
-from ..stages.traces import as_response, site_record
+from ..stages.traces import as_response, as_searched, site_record
 from .uncertainty_record import Found, Predicted, write_results
 from .uncertainty_sources import Change, changes, variants
 
@@ -134,14 +134,13 @@ def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evi
 def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
     """Every recorded site at the identified parameters, from what the stage ``predict`` has simulated."""
     study = context.study
-    apart = study.is_searched_apart
-    recorded = [site for site in study.sites if site.trace is not None]
-    searched = [site_record(context, site, apart) for site in recorded]
+    records = [site_record(context, site) for site in study.sites if site.trace is not None]
+    searched = as_searched(context, records)
     answer = Answer.of(context.stored("calibrate", "calibration.json")["stages"][-1], study.tissues)
-    jobs = answer_jobs(context, [site_record(context, site) for site in recorded], answer)
+    jobs = answer_jobs(records, searched, answer)
     ends = [as_response(end) for end in sites.cache.run(jobs, context.executor)]
-    n = len(searched)
-    responses = CoarseToFine(ends[n:], ends[:n])(ends[n:]) if apart else ends
+    n = len(records)
+    responses = ends if searched is records else CoarseToFine(ends[n:], ends[:n])(ends[n:])
     return [
         Predicted(r, end, site_noise(study, r, end.force_N) if end.completed else None)
         for r, end in zip(searched, responses)

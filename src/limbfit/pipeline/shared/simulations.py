@@ -141,11 +141,8 @@ def site_model(
     """
     study: Study = context.study
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
-    mesh = (
-        context.store["mesh"]
-        / (COARSE if searched and study.mesh.coarse is not None else "")
-        / f"{site.name}.vtu"
-    )
+    folder = COARSE if searched and study.mesh.coarse is not None else ""
+    mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
     file = None if study.indenter.file is None else study.path(study.indenter.file)
     return SiteModel(
         name=site.name,

@@ -29,7 +29,7 @@ from .doubted import Doubted
 from .mesh import mesh_settings
 from .record_noise import site_noise
 from .remesh import meshed_models, scaled_edges
-from .traces import SiteRecord, site_record
+from .traces import SiteRecord, as_searched, site_record
 
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
@@ -66,12 +66,9 @@ class Laboratory:
     def __init__(
         self, context: Context, cache: SimulationCache, sites: Sequence[Site], title: str = "calibrate"
     ) -> None:
-        study = context.study
         self.context, self.cache, self.title = context, cache, title
         self.records = [site_record(context, site) for site in sites]
-        self.searched = self.records
-        if study.is_searched_apart:
-            self.searched = [site_record(context, site, searched=True) for site in sites]
+        self.searched = as_searched(context, self.records)
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
         self.latest: dict[str, Simulation] = {}
@@ -110,9 +107,8 @@ class Laboratory:
 
         key = parameters.tobytes()
         if key not in self._starts:
-            if self._chain and not is_within(NEAR):
-                self._chain = ()
-            if len(self._chain) == MOST_STARTS and not is_within(CLOSE):
+            reach = CLOSE if len(self._chain) == MOST_STARTS else NEAR
+            if self._chain and not is_within(reach):
                 self._chain = ()
             self._starts[key] = self._chain
             if not self._chain or not is_within(CLOSE):

@@ -24,7 +24,7 @@ from ..shared.context import Context
 from ..shared.simulations import SimulationCache
 from ..shared.store import write_json
 from .outliers import outlier_record
-from .traces import SiteRecord, as_response, site_record, write_curves
+from .traces import SiteRecord, as_response, as_searched, site_record, write_curves
 
 Array = NDArray[np.float64]
 _MISSING = {
@@ -45,9 +45,10 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
-    jobs = answer_jobs(context, records, answers[-1])
+    searched = as_searched(context, records)
+    jobs = answer_jobs(records, searched, answers[-1])
     if len(answers) > 1:
-        jobs += _one_material_jobs(context, records, answers[0], best)
+        jobs += _one_material_jobs(records, searched, answers[0], best)
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
@@ -55,9 +56,8 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     n = len(records)
     ours = own = [as_response(simulation) for simulation in simulations[:n]]
     others = [as_response(simulation) for simulation in simulations[n:]]
-    searched, correction = records, None
-    if study.is_searched_apart:
-        searched = [site_record(context, record.site, searched=True) for record in records]
+    correction = None
+    if searched is not records:
         coarse, others = others[:n], others[n:]
         correction = CoarseToFine(coarse, own)
         ours = correction(coarse)
@@ -88,42 +88,37 @@ class Answer:
         return cls(to_vector(stage["parameters"], tissues), tuple(to_vector(one, tissues) for one in starts))
 
 
-def answer_jobs(context: Context, records: Sequence[SiteRecord], answer: Answer) -> list[SimulationJob]:
-    """Every record at the answer, then so with derivatives where parameters are searched, if elsewhere.
+def answer_jobs(
+    records: Sequence[SiteRecord], searched: Sequence[SiteRecord], answer: Answer
+) -> list[SimulationJob]:
+    """Every record at the answer, then so with derivatives as it is ``searched``, if that is another model.
 
     At the fitted sites the calibration has simulated all of them already; elsewhere they start from rest.
     """
     best = answer.parameters
-    if not context.study.is_searched_apart:
+    if searched is records:
         return [record.job(best) for record in records]
     starts = [answer.starts if record.site.fitted else () for record in records]
-    near = [site_record(context, record.site, searched=True) for record in records]
     own = [record.own_job(best, before) for record, before in zip(records, starts)]
-    return own + [record.job(best, starts=before) for record, before in zip(near, starts)]
+    return own + [record.job(best, starts=before) for record, before in zip(searched, starts)]
 
 
 def _one_material_jobs(
-    context: Context, records: Sequence[SiteRecord], one: Answer, best: Array
+    records: Sequence[SiteRecord], searched: Sequence[SiteRecord], one: Answer, best: Array
 ) -> list[SimulationJob]:
     """Every record with one material: at the fitted sites as the calibration has simulated it already.
 
     Elsewhere it is of where parameters are searched, and starts from that with all materials and derivatives,
     which has just been done.
     """
-    vector = one.parameters
-    if not context.study.is_searched_apart:
-        return [
-            r.job(vector, starts=one.starts)
-            if r.site.fitted
-            else r.job(vector, sensitivities=False, starts=[best])
-            for r in records
-        ]
-    return [
-        r.own_job(vector, one.starts)
-        if r.site.fitted
-        else site_record(context, r.site, searched=True).job(vector, sensitivities=False, starts=[best])
-        for r in records
-    ]
+
+    def job(record: SiteRecord, near: SiteRecord) -> SimulationJob:
+        if not record.site.fitted:
+            return near.job(one.parameters, sensitivities=False, starts=[best])
+        simulated = record.job if near is record else record.own_job
+        return simulated(one.parameters, starts=one.starts)
+
+    return [job(*pair) for pair in zip(records, searched)]
 
 
 @dataclass(frozen=True)

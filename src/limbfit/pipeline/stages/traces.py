@@ -145,11 +145,9 @@ class SiteRecord:
         Where parameters are searched on a part of that mesh, its simulation gives the first guesses, and
         ``starts`` are that one's; otherwise they are nothing.
         """
-        job = self.job(parameters, sensitivities=False)
         if self.nested_mm is None:
-            return job
-        nested = self.job(parameters, sensitivities=False, starts=starts)
-        return replace(nested, nested_mm=self.nested_mm)
+            return self.job(parameters, sensitivities=False)
+        return replace(self.job(parameters, sensitivities=False, starts=starts), nested_mm=self.nested_mm)
 
 
 def as_response(simulation: Simulation) -> SiteResponse:
@@ -160,16 +158,23 @@ def as_response(simulation: Simulation) -> SiteResponse:
     return SiteResponse.with_doubts(simulation.force_N, jacobian, *ended, simulation.site, doubts)
 
 
-def site_record(context: Context, site: Site, searched: bool = False) -> SiteRecord:
-    """The stored record of a site and its model; ``searched``: as parameters are searched (`site_model`)."""
+def site_record(context: Context, site: Site) -> SiteRecord:
+    """The stored record of a site and its model, on the whole of its own mesh."""
     curves = read_curves(context.store["traces"] / f"{site.name}.csv")
     return SiteRecord(
         site=site,
         tissues=context.study.tissues,
-        model=recorded_model(context, site, searched),
+        model=recorded_model(context, site),
         times_s=curves["time_s"],
         displacement_mm=curves["displacement_mm"],
         force_N=curves["force_N"],
         smoothing=np.load(context.store["traces"] / SMOOTHING.format(site.name)),
         nested_mm=context.study.within_mm if context.study.mesh.coarse is None else None,
     )
+
+
+def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[SiteRecord]:
+    """The records as parameters are searched (`site_model`); ``records`` itself where that is the same."""
+    if not context.study.is_searched_apart:
+        return records
+    return [replace(one, model=recorded_model(context, one.site, searched=True)) for one in records]
