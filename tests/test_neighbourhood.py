@@ -84,6 +84,15 @@ def test_a_site_beside_its_mesh_is_told(wide):
         neighbourhood(wide, CENTRE - 500.0 * AXIS, RADIUS_MM)
 
 
+def test_a_part_that_nothing_else_carries_is_held_at_its_cut(wide, site):
+    """Thin tissue far from bone: no cut below the indenter, no bone in reach."""
+    far = replace(wide, node_sets={"fixed_side": wide.nodes_where(lambda p: p[:, 0] < -59.9)})
+    part = neighbourhood(far, CENTRE, RADIUS_MM)
+    problem = build_problem(replace(site, within_mm=RADIUS_MM), far, TRUTH)
+    assert len(part.cut) > 0
+    assert set(problem.fixed) == set(part.cut)
+
+
 def test_the_force_of_the_part_is_nearly_in_proportion_to_the_whole_one(site):
     whole = simulate(job(site))
     near = simulate(job(replace(site, within_mm=RADIUS_MM)))

@@ -104,6 +104,8 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         centre, axis = np.array(model.position), np.array(model.axis)
         part = neighbourhood(mesh, centre, model.within_mm)
         mesh, cut = part.mesh, held_cut(part, centre, axis)
+        if not len(cut) and not len(_held(mesh)):  # nothing else carries it
+            cut = part.cut
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     faces = mesh.face_sets["skin"]
     reach = indenter.width * 0.71 + max(model.knots_mm) + 8.0
