@@ -143,17 +143,6 @@ def fields_below(fields: object, anatomy: Anatomy) -> np.ndarray:
     return anatomy.height(anatomy.bones["tibia"].points) <= 0
 
 
-def test_local_radius_keeps_the_neighbourhood_and_fixes_where_it_was_cut(oblique: Anatomy) -> None:
-    position, axis = site_of(oblique, np.array([0, 1.0, 0.1]), -35.0)
-    mesh, report = mesh_site(oblique, position, axis, replace(COARSE, local_radius_mm=30.0))
-    conforms(mesh)
-    distance = np.linalg.norm(mesh.points[mesh.node_sets["fixed_truncation"]] - position, axis=1)
-    assert 24 < distance.min() <= distance.max() < 36
-    assert np.linalg.norm(mesh.points - position, axis=1).max() < 36
-    assert report.volume_error is None
-    assert report.min_dihedral_deg >= 8.0
-
-
 def test_cutting_a_grid_keeps_volume_and_signs() -> None:
     def ball(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         distance = np.linalg.norm(points, axis=1)

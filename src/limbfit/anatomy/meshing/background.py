@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
 
-PLANE, LAYER, BONE, FAR = 1, 2, 4, 8
+PLANE, LAYER, BONE = 1, 2, 4
 TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 # Kuhn's subdivision of a cube into six tetrahedra; corner bits are (x, y, z), all share the diagonal 0-7.
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])

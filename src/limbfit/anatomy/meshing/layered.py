@@ -79,10 +79,7 @@ def _with_sets(mesh: Mesh, core: VolumeMesh, stack: Columns) -> Mesh:
     outermost = (faces >= stack.top[0]) & (faces <= stack.top[-1])
     on_skin = outermost.all(axis=1) & ~on_plane
     on_bone = same_faces(faces, core.triangles[core.triangle_refs == BONE], len(mesh.points)) & ~on_plane
-    rest = ~(on_plane | on_skin | on_bone)
     sets = {"fixed_bone": on_bone, "fixed_proximal": on_plane}
-    if rest.any():
-        sets["fixed_truncation"] = rest
     node_sets = {name: np.unique(faces[chosen]) for name, chosen in sets.items()}
     return replace(mesh, node_sets=node_sets, face_sets={"skin": faces[on_skin]})
 

@@ -19,14 +19,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, to_tet10
 from ..surfaces.surfaces import Anatomy
 from . import background
-from .background import BONE, FAR, LAYER, PLANE, TetGrid
+from .background import BONE, LAYER, PLANE, TetGrid
 from .curving import curved, with_diagonals
 from .engines import ENGINES, VolumeMesh, VolumeTask
 from .layered import core_mesh, curved_target, with_layers
@@ -39,7 +37,7 @@ from .untangling import inverted, repaired, unrepaired
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SURFACES = (PLANE, LAYER, BONE, FAR)
+SURFACES = (PLANE, LAYER, BONE)
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
 LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
@@ -52,9 +50,8 @@ class MeshSettings:
 
     The edge length is ``edge_near_mm`` within ``near_radius_mm`` of the site and grows from there by
     ``growth`` mm per mm up to ``edge_far_mm``. ``curved`` puts mid-edge nodes on the smooth surfaces.
-    With ``local_radius_mm`` only the limb within that distance of the site is meshed, and the nodes where it
-    was cut off are fixed (node set ``fixed_truncation``); that stiffens the answer. ``flatness`` is how much
-    flatter than by default elements may be away from the site: fewer nodes, smaller angles.
+    ``flatness`` is how much flatter than by default elements may be away from the site: fewer nodes, smaller
+    angles.
     """
 
     element: Literal["tet4", "tet10"] = "tet10"
@@ -68,7 +65,6 @@ class MeshSettings:
     bone_clearance_mm: float = 1.5
     time_limit_s: float = 600.0
     curved: bool = True
-    local_radius_mm: float | None = None
     flatness: float = 1.0
     engine: str = "mmg"
 
@@ -155,8 +151,7 @@ def mesh_site(
     Returns
     -------
     mesh : regions ``skin`` and ``muscle``; node sets ``fixed_bone`` (on bones) and ``fixed_proximal`` (on the
-        cut plane) and, with ``local_radius_mm``, ``fixed_truncation``; face set ``skin`` (outward, without
-        the cut plane).
+        cut plane); face set ``skin`` (outward, without the cut plane).
     report : quality and what was trimmed.
 
     Raises
@@ -168,11 +163,8 @@ def mesh_site(
     base = base or base_mesh(anatomy, settings)
     fields, frame = base.fields, base.fields.frame
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
-    grid, limit = base.grid, base.size_limit
-    if settings.local_radius_mm is not None:
-        grid = _near(grid, site, settings.local_radius_mm)
-        limit = size_limit(fields, grid, settings)
-    task = _task(grid, site_size(grid.points, limit, site, inward, settings), settings)
+    size = site_size(base.grid.points, base.size_limit, site, inward, settings)
+    task = _task(base.grid, size, settings)
     core = _snapped(ENGINES[settings.engine](task, settings.time_limit_s), fields)
     mesh, stack = with_layers(core, fields, settings.regions)
     mesh = polished(mesh, fields, stack)
@@ -182,9 +174,8 @@ def mesh_site(
         if settings.curved:
             mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack))
     _check_usable(mesh, fields)
-    enclosed = base.enclosed_mm3 if settings.local_radius_mm is None else None
     seconds = time.perf_counter() - start
-    report = mesh_report(mesh, fields, base.trimmed, enclosed, seconds, settings.engine)
+    report = mesh_report(mesh, fields, base.trimmed, base.enclosed_mm3, seconds, settings.engine)
     report = replace(report, repairs=repairs)
     return mesh.with_points(frame.to_patient(mesh.points)), report
 
@@ -226,22 +217,6 @@ def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
     common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
     surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
     return VolumeTask(grid.points, grid.tets, triangles, surfaces, size, settings.hausdorff_mm)
-
-
-def _near(grid: TetGrid, site: Array, radius: float) -> TetGrid:
-    """The connected part of a grid within a distance of a site."""
-
-    def ball(points: Array) -> tuple[Array, Array]:
-        offset = points - site
-        distance = np.linalg.norm(offset, axis=1)
-        return radius - distance, -offset / np.maximum(distance, 1e-12)[:, None]
-
-    grid, inside = background.cut(grid, ball, FAR)
-    grid = grid.kept(inside)
-    rows = grid.tets[:, [0, 1, 2]].ravel(), grid.tets[:, [1, 2, 3]].ravel()
-    links = coo_array((np.ones(len(rows[0])), rows), shape=(len(grid.points),) * 2)
-    label = connected_components(links, directed=False)[1][grid.tets[:, 0]]
-    return grid.kept(label == np.bincount(label).argmax())
 
 
 def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:

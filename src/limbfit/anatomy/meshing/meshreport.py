@@ -26,7 +26,7 @@ GOOD_VOLUME = 0.005
 class MeshReport:
     """What a mesh is like: counts, angles (degrees), volumes (mm3), lengths (mm), time (s).
 
-    ``volume_error`` is relative to the volume that the surfaces enclose (None with ``local_radius_mm``).
+    ``volume_error`` is relative to the volume that the surfaces enclose.
     ``layer_mean_mm`` and ``layer_std_mm`` are the thickness of all layers together, measured from points all
     over their meshed inner face to the meshed skin; ``layer_thickness_mm`` gives mean, deviation, least and
     greatest of each. ``interface_error_mm`` is how far that inner face is from where it was asked for.
@@ -41,7 +41,7 @@ class MeshReport:
     min_scaled_jacobian: float
     volume_mm3: float
     region_volumes_mm3: Mapping[str, float]
-    volume_error: float | None
+    volume_error: float
     layer_mean_mm: float
     layer_std_mm: float
     layer_thickness_mm: Mapping[str, Mapping[str, float]]
@@ -58,13 +58,13 @@ def mesh_report(
     mesh: Mesh,
     fields: LimbFields,
     trimmed: Mapping[str, TrimmedBone],
-    enclosed_mm3: float | None,
+    enclosed_mm3: float,
     seconds: float,
     engine: str,
 ) -> MeshReport:
-    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have, if known."""
+    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have."""
     found = quality(mesh)
-    volume_error = None if enclosed_mm3 is None else found.volume_mm3 / enclosed_mm3 - 1.0
+    volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
     layers = len(mesh.region_names) - 1
     faces = [_facets(mesh.face_sets["skin"]), *(_facets(inner_faces(mesh, i)) for i in range(layers))]
     whole = _thickness(mesh, faces[-1], faces[0])
@@ -91,7 +91,7 @@ def mesh_report(
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
-        warnings=_warnings(found, volume_error or 0.0),
+        warnings=_warnings(found, volume_error),
     )
 
 
