@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from conftest import COARSE
-from limbfit import run_experiment
+from limbfit import report_study, run_experiment
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
-from limbfit.report import build_report
 from limbfit.study import load_study
 
 QUICK = (
@@ -31,7 +30,7 @@ def done(study):
 
 
 @pytest.mark.slow
-def test_the_experiment_on_a_stump(done, tmp_path):
+def test_the_experiment_on_a_stump(done):
     study, content = done
     folder = study / "results/uncertainty"
     stored = json.loads((folder / "uncertainty.json").read_text())
@@ -61,7 +60,8 @@ def test_the_experiment_on_a_stump(done, tmp_path):
     for profile in stored["profiles"].values():
         assert len(profile["extrapolated"]) == len(profile["values"])
     assert [check["why"] for check in stored["checks"]] == ["narrowest", "widest"]
-    page = build_report(study / "results", tmp_path).read_text()
+    report_study(load_study(study), listener=lambda event: None)
+    page = (study / "results/report/report.html").read_text()
     assert "What the records determine" in page
     assert "Profile likelihood" in page
     # Done once: the second time nothing is simulated.
