@@ -28,13 +28,13 @@ from ..surfaces.surfaces import Anatomy
 from . import background
 from .background import BONE, FAR, LAYER, PLANE, TetGrid
 from .curving import curved, with_diagonals
-from .engines import ENGINES, VolumeMesh, VolumeTask
+from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .layered import core_mesh, curved_target, with_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
 from .projection import guarded, projected
 from .smoothing import polished
-from .untangling import inverted, repaired, unrepaired
+from .untangling import inverted, narrowest, repaired, unrepaired
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -173,7 +173,7 @@ def mesh_site(
         grid = _near(grid, site, settings.local_radius_mm)
         limit = size_limit(fields, grid, settings)
     task = _task(grid, site_size(grid.points, limit, site, inward, settings), settings)
-    core = _snapped(ENGINES[settings.engine](task, settings.time_limit_s), fields)
+    core = _snapped(_adapted(task, fields, settings), fields)
     mesh, stack = with_layers(core, fields, settings.regions)
     mesh = polished(mesh, fields, stack)
     mesh, repairs = repaired(mesh, fields, stack)
@@ -187,6 +187,15 @@ def mesh_site(
     report = mesh_report(mesh, fields, base.trimmed, enclosed, seconds, settings.engine)
     report = replace(report, repairs=repairs)
     return mesh.with_points(frame.to_patient(mesh.points)), report
+
+
+def _adapted(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
+    """The core, graded; a mesher that fails does so, as a rule, where what it was given is flattest."""
+    try:
+        return ENGINES[settings.engine](task, settings.time_limit_s)
+    except MesherError as error:
+        where = narrowest(task.points, task.tets, fields)
+        raise MeshingError(f"{error}; what it was given is flattest {where}") from None
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
