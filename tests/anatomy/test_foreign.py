@@ -181,6 +181,17 @@ def test_two_long_triangles_that_cross_are_parted_gently():
 
 @needs_limbs
 @pytest.mark.slow
+def test_a_node_that_the_mesher_left_on_the_skin_is_put_back():
+    """Over a ridge MMG put a node of the inner face 0.1 mm under the skin: an angle of 0.5 degrees."""
+    found = foreign_meshes.read_limb("limb-6", foreign_meshes.limb_files(SHARED)["limb-6"], 0.0, False)
+    settings = foreign_meshes.default_settings()["own"]
+    site = foreign_meshes.random_sites(found.anatomy, 10)[9]
+    row = foreign_meshes.site_row(found, base_mesh(found.anatomy, settings), settings, site)
+    assert row["sound"], row["failure"]
+
+
+@needs_limbs
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*(f"limb-{i}" for i in range(1, 10)), "mean"])
 def test_limbs_of_an_atlas_are_meshed_as_they_come(name):
     file = foreign_meshes.limb_files(SHARED)[name]
