@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,13 @@ def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, anatomy, s
         mesh_site(anatomy, *site, COARSE)
 
 
+def test_a_mesher_that_fails_is_told_with_a_place(anatomy, site):
+    hurried = replace(COARSE, time_limit_s=0.01)
+    told = r"did not end in 0\.01 s; .*; what it was given is flattest at \(.*\) mm, [\d.]+ mm from the "
+    with pytest.raises(MeshingError, match=told):
+        mesh_site(anatomy, *site, hurried)
+
+
 def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, site):
     kept = []
 
@@ -160,6 +168,26 @@ def test_a_tangled_star_is_untangled():
     found = untangled(points, tets, np.zeros((7, 3)), movable)
     assert (volumes(found, tets) > 0).all()
     assert np.array_equal(found[:6], tips)
+
+
+@needs_limbs
+def test_two_long_triangles_that_cross_are_parted_gently():
+    """Half the triangles and 0.3 mm of noise: sheets of skin in a fold meet, and hardly need to move."""
+    file = foreign_meshes.limb_files(SHARED)["limb-2"]
+    found = foreign_meshes.read_limb("limb-2", file, 0.3, True)
+    told = next(note for note in found.notes if note.startswith("skin: 1 pairs of crossing faces"))
+    assert float(told.rpartition("by ")[2].removesuffix(" mm")) < 1.5
+
+
+@needs_limbs
+@pytest.mark.slow
+def test_a_node_that_the_mesher_left_on_the_skin_is_put_back():
+    """Over a ridge MMG put a node of the inner face 0.1 mm under the skin: an angle of 0.5 degrees."""
+    found = foreign_meshes.read_limb("limb-6", foreign_meshes.limb_files(SHARED)["limb-6"], 0.0, False)
+    settings = foreign_meshes.default_settings()["own"]
+    site = foreign_meshes.random_sites(found.anatomy, 10)[9]
+    row = foreign_meshes.site_row(found, base_mesh(found.anatomy, settings), settings, site)
+    assert row["sound"], row["failure"]
 
 
 @needs_limbs

@@ -113,7 +113,7 @@ def dented_through(surface):
         (with_inner_wall, "more than two faces"),
         (half_flipped, "oriented against"),
         (doubled, "2 separate bodies"),
-        (dented_through, "crosses itself"),
+        (dented_through, r"crosses itself \(\d+ pairs of faces, the first at \(.*\) mm\)"),
         (lambda s: Surface(s.points / 1000, s.faces), "metres.*millimetres"),
         (lambda s: Surface(s.points * 1000, s.faces), "millimetres"),
     ],

@@ -26,7 +26,8 @@ FEB = """<?xml version="1.0"?>
 <Boundary><bc node_set="ground" type="zero displacement"><x_dof>1</x_dof><y_dof>1</y_dof><z_dof>1</z_dof></bc>
 <bc node_set="top" type="zero displacement"><x_dof>1</x_dof><y_dof>0</y_dof><z_dof>0</z_dof></bc>
 <bc node_set="top" type="prescribed displacement"><dof>y</dof><value lc="1">0.5</value></bc></Boundary>
-<Rigid><rigid_bc type="rigid_fixed"><rb>steel</rb></rigid_bc>
+<Rigid><rigid_bc type="rigid_fixed"><rb>steel</rb><Rx_dof>1</Rx_dof><Ry_dof>1</Ry_dof><Ru_dof>1</Ru_dof>
+<Rv_dof>1</Rv_dof><Rw_dof>1</Rw_dof></rigid_bc>
 <rigid_bc type="rigid_displacement"><rb>steel</rb><dof>z</dof><value lc="1">-1</value></rigid_bc></Rigid>
 <Contact><contact type="sliding-elastic" surface_pair="pair"/></Contact>
 <LoadData><load_controller id="1" type="loadcurve"><interpolate>LINEAR</interpolate>

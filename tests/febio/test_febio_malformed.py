@@ -48,6 +48,8 @@ CASES = {
     "nodal strain": ('<SolidDomain name="body"', '<SolidDomain type="ut4-solid" name="body"', "ut4-solid"),
     "set without node": (">8,9,11</NodeSet>", ">8,9,99</NodeSet>", "<NodeSet>: there is no node 99"),
     "set of words": (">8,9,11</NodeSet>", ">all</NodeSet>", "'all' is no number"),
+    "list without part": ("</Mesh>", '<PartList name="l">body,bone</PartList></Mesh>', "no part 'bone'"),
+    "set of no elements": ('node_set="ground"', 'node_set="@elem_set:none"', "no node set '@elem_set:none'"),
     "set backwards": (">8,9,11</NodeSet>", ">5:1</NodeSet>", "no items 5 to 1"),
     "set of billions": (">8,9,11</NodeSet>", ">1:9000000000</NodeSet>", "no items 1 to 9000000000"),
     "surface without node": ('<tri3 id="1">9,11,12', '<tri3 id="1">9,11,77', "there is no node 77"),

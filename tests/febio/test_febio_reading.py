@@ -85,7 +85,8 @@ V3 = (
     ),
     ('<NodeSet name="top">12</NodeSet>', '<NodeSet name="top"><n id="12"/></NodeSet>'),
     (
-        '<rigid_bc type="rigid_fixed"><rb>steel</rb></rigid_bc>',
+        '<rigid_bc type="rigid_fixed"><rb>steel</rb><Rx_dof>1</Rx_dof><Ry_dof>1</Ry_dof><Ru_dof>1</Ru_dof>\n'
+        "<Rv_dof>1</Rv_dof><Rw_dof>1</Rw_dof></rigid_bc>",
         '<rigid_constraint type="fix"><rb>2</rb><dofs>Rx,Ry,Ru,Rv,Rw</dofs></rigid_constraint>',
     ),
     (
@@ -117,6 +118,22 @@ def test_an_input_of_febio_3_is_the_same_problem(tmp_path):
     sphere = Indenter("sphere", 8.0)
     old, new = (to_problem(read_feb(written(tmp_path, t)), sphere) for t in (text, FEB))
     same(old, new)
+
+
+@pytest.mark.parametrize(
+    ("given", "asked", "expected"),
+    [
+        ("", "@elem_set:body", [1, 2, 3, 4]),
+        ('<ElementSet name="one">1</ElementSet>', "@elem_set:one", [1, 2, 3, 4]),
+        ('<PartList name="soft">body</PartList>', "@part_list:soft", [1, 2, 3, 4]),
+        ('<NodeSet name="rows">8\n 9, 11\n 12</NodeSet>', "rows", [1, 2, 3, 4]),
+        ("", "all", [0, 1, 2, 3, 4, 5]),
+    ],
+)
+def test_node_sets_of_elements_parts_and_nodes(tmp_path, given, asked, expected):
+    text = FEB.replace("</Mesh>", f"{given}</Mesh>").replace('node_set="ground"', f'node_set="{asked}"')
+    held = [m.nodes.tolist() for m in read_feb(written(tmp_path, text)).motions if m.target == asked]
+    assert held == [expected] * 3
 
 
 ELASTIC = '<elastic type="Ogden"><k>0.2</k><c1>0.004</c1><m1>6</m1><c2>0.004</c2><m2>-6</m2></elastic>'

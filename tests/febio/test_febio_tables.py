@@ -14,7 +14,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import History
 from limbfit.febio import FebSettings, read_feb, run_feb, write_feb
 from limbfit.febio.geometry import Part
-from limbfit.febio.mass import centre_of_mass
+from limbfit.febio.rigid import centre_of_mass
 
 TABLES = """<Output><logfile>
 <node_data data="z;uz" file="nodes.txt" delim=","></node_data>

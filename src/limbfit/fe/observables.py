@@ -43,18 +43,37 @@ class ElementFields:
 
 def element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     """Fields of a state that kept its memory (``store="peak"``, or a step of `iterate`)."""
-    if state.memory is None:
-        raise ValueError("the state was stored without its stresses")
-    history = np.zeros_like(state.memory.elastic)
-    gamma = laws.prony[..., 0][system.regions]
-    for l in range(gamma.shape[1]):
-        history += gamma[:, l, None, None] * state.memory.prony[l]
+    history = _relaxing(system, laws, state)
     out = np.zeros((len(system.cells), 11))
     _fields(
         system.cells, system.gradients, system.weights, system.element.mean_dilatation, system.regions,
         laws.tables, history, state.u, out,
     )  # fmt: skip
     return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
+
+
+def nodal_forces(system: System, laws: Laws, state: State) -> Array:
+    """Force (n, 3) from outside that every node of a state needs to stay where it is, N, but for contact.
+
+    At supports their reactions; at free nodes what Newton's iteration left.  The state must have kept its
+    memory, as for `element_fields`.
+    """
+    increment = Increment(
+        state.time, state.displacement, np.ones(len(laws.terms)), _relaxing(system, laws, state),
+        state.penalty * laws.modulus,
+    )  # fmt: skip
+    return system.evaluate(state.u, laws, increment, tangent=False).residual
+
+
+def _relaxing(system: System, laws: Laws, state: State) -> Array:
+    """Deviatoric second Piola-Kirchhoff stress (m, q, 6) of the Prony terms, MPa."""
+    if state.memory is None:
+        raise ValueError("the state was stored without its stresses")
+    stress = np.zeros_like(state.memory.elastic)
+    gamma = laws.prony[..., 0][system.regions]
+    for l in range(gamma.shape[1]):
+        stress += gamma[:, l, None, None] * state.memory.prony[l]
+    return stress
 
 
 def contact_pressure(system: System, laws: Laws, state: State) -> Array:

@@ -50,7 +50,8 @@ class Part:
 class Geometry:
     """What stands in ``<Mesh>`` and ``<MeshDomains>``; nodes are numbered from 0 in the order of the file.
 
-    ``element_sets`` hold FEBio's numbers; every part is one, too.
+    ``element_sets`` hold FEBio's numbers; every part is one, too. ``blocks`` are ``<Nodes>`` with a name,
+    which FEBio takes as node sets; ``part_lists`` name parts.
     """
 
     points: Array
@@ -60,6 +61,8 @@ class Geometry:
     element_sets: Mapping[str, Indices]
     surfaces: Mapping[str, Indices]
     pairs: Mapping[str, tuple[str, str]]
+    blocks: Mapping[str, Indices]
+    part_lists: Mapping[str, tuple[str, ...]]
 
 
 def read_geometry(root: Node, materials: Iterable[str]) -> Geometry:
@@ -93,10 +96,13 @@ def read_geometry(root: Node, materials: Iterable[str]) -> Geometry:
                 raise pair.refuse(f"there is no surface {surface!r}")
         pairs[name] = both
     sets = {name: _node_set(group, numbers) for name, group in _named(mesh, "NodeSet")}
+    named = [group for group in mesh.all("Nodes") if group.attributes.get("name")]
+    blocks = {group.attributes["name"]: np.array(numbers.of(group, _identities(group))) for group in named}
     elements = {name: part.ids for name, part in parts.items()}
     elements |= {name: np.array(_listed(group)) for name, group in _named(mesh, "ElementSet")}
     points = np.array([node.numbers(3) for node in nodes])
-    return Geometry(points, numbers.ids, parts, sets, elements, surfaces, pairs)
+    lists = _part_lists(mesh, parts)
+    return Geometry(points, numbers.ids, parts, sets, elements, surfaces, pairs, blocks, lists)
 
 
 class _Numbers:
@@ -124,6 +130,16 @@ def _named(mesh: Node, tag: str) -> list[tuple[str, Node]]:
             raise group.refuse(f"{name!r} is there twice")
         found[name] = group
     return list(found.items())
+
+
+def _part_lists(mesh: Node, parts: Mapping[str, Part]) -> dict[str, tuple[str, ...]]:
+    lists = {}
+    for name, group in _named(mesh, "PartList"):
+        lists[name] = tuple(part.strip() for part in group.text.split(","))
+        for part in lists[name]:
+            if part not in parts:
+                raise group.refuse(f"there is no part {part!r}")
+    return lists
 
 
 def _owners(section: Node, materials: Iterable[str]) -> dict[str, Node]:
@@ -204,29 +220,46 @@ def _node_set(group: Node, numbers: _Numbers) -> Indices:
 def _listed(group: Node, most: int = 10**7) -> list[int]:
     """The numbers of a set; ``most`` are in a range."""
     if group.children:  # FEBio 3: <n id="1"/>
-        return [node.identity() for node in group]
+        return _identities(group)
     ids: list[int] = []
-    for text in group.text.split(","):
-        first, _, last = text.strip().partition(":")
+    for text in group.text.replace(",", " ").split():
+        first, _, last = text.partition(":")
         try:
             low, high = int(first), int(last or first)
         except ValueError:
-            raise group.refuse(f"{text.strip()[:40]!r} is no number") from None
+            raise group.refuse(f"{text[:40]!r} is no number") from None
         if not 0 <= high - low < most:
             raise group.refuse(f"there are no items {low} to {high}")
         ids += range(low, high + 1)
     return ids
 
 
+def _identities(group: Node) -> list[int]:
+    return [node.identity() for node in group]
+
+
 def node_set(geometry: Geometry, name: str, node: Node) -> Indices:
-    """Nodes of a set, or, as ``@surface:name``, of a surface; ``node`` is what asks for it."""
-    kind, _, surface = name.partition(":")
-    found = geometry.node_sets.get(name)
-    if kind == "@surface" and surface in geometry.surfaces:
-        found = np.unique(geometry.surfaces[surface])
-    if found is None:
-        raise node.refuse(f"there is no node set {name!r}")
-    return found
+    """Nodes of a set, or, as ``@surface:name``, of a surface; ``node`` is what asks for it.
+
+    ``@elem_set:`` and ``@part_list:`` stand for the nodes of elements (FEBio User Manual 4.0, section 3.6).
+    """
+    kind, _, of = name.partition(":")
+    for known in (geometry.node_sets, geometry.blocks):
+        if name in known:
+            return known[name]
+    if kind == "@surface" and of in geometry.surfaces:
+        return np.unique(geometry.surfaces[of])
+    if kind == "@elem_set" and of in geometry.element_sets:
+        return nodes_of(geometry.parts.values(), geometry.element_sets[of])
+    if kind == "@part_list" and of in geometry.part_lists:
+        return nodes_of([geometry.parts[part] for part in geometry.part_lists[of]])
+    raise node.refuse(f"there is no node set {name!r}")
+
+
+def nodes_of(parts: Iterable[Part], elements: Indices | None = None) -> Indices:
+    """Nodes of the cells of parts, or of those among them that have these of FEBio's numbers."""
+    cells = [part.cells if elements is None else part.cells[np.isin(part.ids, elements)] for part in parts]
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *(cell.ravel() for cell in cells)]))
 
 
 def boundary(parts: Iterable[Part]) -> list[Indices]:

@@ -18,9 +18,9 @@ from ..fe import Material
 from .controls import Phase, read_phases
 from .curves import Curve, read_curves
 from .geometry import Geometry, Indices, Part, node_set, read_geometry
-from .mass import centre_of_mass
 from .materials import RigidBody, read_materials
 from .requests import Request, read_requests
+from .rigid import FREEDOMS, carried_nodes, centre_of_mass, fixed_freedoms
 from .tree import Node, read_tree
 
 Array = NDArray[np.float64]
@@ -31,6 +31,8 @@ _READ = (
     "Module", "Control", "Globals", "Material", "Mesh", "MeshDomains", "Boundary", "Rigid", "Contact",
     "LoadData", "Step", "Output",
 )  # fmt: skip
+# Read by `_tied`, and what only shells have.
+_ELSEWHERE = ("rigid", "zero rotation", "zero shell displacement")
 # What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
 _CONTACT_ZERO = ("tension", "fric_coeff", "offset", "node_reloc")
 
@@ -64,7 +66,8 @@ class FebModel:
     """A ``.feb`` in mm, N, s, MPa.
 
     ``materials`` are the deformable ones, ``rigid`` the others, both by name; ``motions`` those of nodes,
-    ``rigid_motions`` those of rigid bodies; ``notes`` what was read and has no meaning for limbfit.
+    ``rigid_motions`` those of rigid bodies; ``carried`` nodes of tissue that move with a rigid body, by its
+    name; ``notes`` what was read and has no meaning for limbfit.
     """
 
     geometry: Geometry
@@ -72,6 +75,7 @@ class FebModel:
     rigid: Mapping[str, RigidBody]
     motions: tuple[Motion, ...]
     rigid_motions: tuple[Motion, ...]
+    carried: Mapping[str, Indices]
     contact: Contact | None
     curves: Mapping[int, Curve]
     phases: tuple[Phase, ...]
@@ -127,7 +131,8 @@ def _model(root: Node) -> FebModel:
         materials,
         rigid,
         tuple(_node_motions(root.find("Boundary"), geometry, curves)),
-        tuple(_rigid_motions(root.find("Rigid"), rigid, curves)),
+        _rigid_motions(root, rigid, geometry, curves),
+        carried_nodes(geometry, materials, rigid, _tied(root.find("Boundary"), rigid)),
         _contact(root.find("Contact"), geometry),
         curves,
         read_phases(root, curves),
@@ -149,7 +154,7 @@ def _node_motions(section: Node | None, geometry: Geometry, curves: Mapping[int,
                     yield Motion(target, nodes, i, 0.0, 0, bc.line)
         elif kind in ("prescribed displacement", "prescribe"):
             yield Motion(target, nodes, *_driven(bc, curves), bc.line)
-        else:
+        elif kind not in _ELSEWHERE:
             raise bc.refuse(f"boundary condition {kind!r} is not supported")
 
 
@@ -160,8 +165,7 @@ def _driven(bc: Node, curves: Mapping[int, Curve]) -> tuple[int, float, int]:
         raise bc.refuse(f"degree of freedom {bc.string('dof')!r} is not supported")
     if bc.flag("relative"):
         raise bc.child("relative").refuse("relative displacements are not supported")
-    value = bc.find("value")
-    value = bc.child("scale") if value is None else value
+    value = _amount(bc)
     factor, number = value.scalar(), value.attributes.get("lc", "")
     if factor == 0.0:
         return COMPONENTS.index(dof), 0.0, 0
@@ -170,22 +174,58 @@ def _driven(bc: Node, curves: Mapping[int, Curve]) -> tuple[int, float, int]:
     return COMPONENTS.index(dof), factor, int(number)
 
 
-def _rigid_motions(
-    section: Node | None, rigid: Mapping[str, RigidBody], curves: Mapping[int, Curve]
-) -> Iterator[Motion]:
-    """Motions of rigid bodies; what does not move is held, as it is in every indentation."""
-    nothing = np.zeros(0, np.int64)
+def _amount(bc: Node) -> Node:
+    """What a prescribed motion amounts to; FEBio 3 calls it a scale."""
+    value = bc.find("value")
+    return bc.child("scale") if value is None else value
+
+
+def _tied(section: Node | None, rigid: Mapping[str, RigidBody]) -> list[tuple[str, Node]]:
+    """Sets of nodes that are tied to a rigid body: its name, and the condition."""
+    return [(_body_of(bc, rigid), bc) for bc in section or () if bc.attributes.get("type") == "rigid"]
+
+
+def _body_of(condition: Node, rigid: Mapping[str, RigidBody]) -> str:
+    """The name of the rigid body that a condition is about; it gives its name or its number."""
     names = {str(body.number): name for name, body in rigid.items()}
-    for bc in section or ():
+    name = names.get(condition.string("rb"), condition.string("rb"))
+    if name not in rigid:
+        raise condition.refuse(f"there is no rigid body {name!r}")
+    return name
+
+
+def _rigid_motions(
+    root: Node, rigid: Mapping[str, RigidBody], geometry: Geometry, curves: Mapping[int, Curve]
+) -> tuple[Motion, ...]:
+    """Displacements of rigid bodies; what is not displaced must be held, since limbfit solves for no body."""
+    nothing, motions = np.zeros(0, np.int64), list[Motion]()
+    free = {name: set(FREEDOMS) for name in rigid}
+    for bc in root.find("Rigid") or ():
         kind = bc.attribute("type")
-        name = names.get(bc.string("rb"), bc.string("rb"))
-        if name not in rigid:
-            raise bc.refuse(f"there is no rigid body {name!r}")
+        if bc.tag not in ("rigid_bc", "rigid_constraint"):
+            raise bc.refuse(f"{kind!r} is not supported", "limbfit moves rigid bodies as prescribed only")
+        name = _body_of(bc, rigid)
         if kind in ("rigid_fixed", "fix"):
+            free[name] -= fixed_freedoms(bc)
             continue
-        if kind not in ("rigid_displacement", "prescribe"):
+        if kind not in ("rigid_displacement", "rigid_rotation", "prescribe"):
             raise bc.refuse(f"rigid condition {kind!r} is not supported")
-        yield Motion(name, nothing, *_driven(bc, curves), bc.line)
+        dof = bc.string("dof").lower().removeprefix("r")
+        free[name].discard(dof)
+        if dof in FREEDOMS[3:]:
+            if _amount(bc).scalar() != 0.0:
+                raise bc.refuse("the rotation of a rigid body is not supported")
+            continue
+        motions.append(Motion(name, nothing, *_driven(bc, curves), bc.line))
+    for material in root.child("Material"):
+        name = material.attributes.get("name", "")
+        left = [f"R{letter}" for letter in FREEDOMS if letter in free.get(name, ())]
+        if left and any(part.material == name for part in geometry.parts.values()):
+            raise material.refuse(
+                f"the rigid body {name!r} is neither fixed nor displaced in {', '.join(left)}",
+                "limbfit solves for no rigid body: fix it there with rigid_fixed",
+            )
+    return tuple(motions)
 
 
 def _contact(section: Node | None, geometry: Geometry) -> Contact | None:

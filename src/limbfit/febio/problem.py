@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,12 +38,14 @@ class Body:
 class Drive:
     """The one history of a problem: advance (mm) in time, and the ``axis (3,)`` of the rigid body, if any.
 
-    ``factors`` of the node motions with respect to it, in their order.
+    ``factors`` of the node motions with respect to it, in their order; ``travel (3,)`` of every rigid body
+    per mm of it, by the body's name.
     """
 
     history: History
     axis: Array | None
     factors: tuple[float, ...]
+    travel: Mapping[str, Array]
 
 
 def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: Any) -> Problem:
@@ -69,8 +72,6 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         placed = (
             _tool(model, driven, name, depth) if indenter is None else _placed(model, driven, name, indenter)
         )
-    elif model.rigid_motions:
-        raise ProblemError("the rigid body touches nothing: the input has no contact")
     fixed, supports = _supports(model, body.number, driven)
     element = next(iter(model.parts_of(model.materials).values())).element
     rule = "gauss7" if body.mesh.cell_type == "tet10" else "gauss"  # FEBio's quadrature
@@ -176,22 +177,25 @@ def drive(model: FebModel) -> Drive:
     if not base.any():
         raise ProblemError("nothing moves: the load curve is zero", place=f"line {moving[0].line}")
     scales = {m.curve: _multiple(model.curves[m.curve].at(times), base, m) for m in moving}
-    axis, length = None, 1.0
-    bodies = {m.target for m in model.rigid_motions if m.factor != 0.0}
-    if bodies:
-        place = f"line {model.rigid_motions[-1].line}"
-        if len(bodies) > 1:
-            raise ProblemError("more than one rigid body moves", place=place)
-        axis = np.zeros(3)
-        for m in model.rigid_motions:
-            axis[m.component] += m.factor * scales.get(m.curve, 0.0)
-        length = float(np.linalg.norm(axis))
-        if length == 0.0:
-            raise ProblemError("the motions of the rigid body cancel", place=place)
-        axis /= length
     sign = float(np.sign(base[np.abs(base).argmax()]))
+    travel = {name: np.zeros(3) for name in model.rigid}
+    for m in model.rigid_motions:
+        travel[m.target][m.component] += m.factor * scales.get(m.curve, 0.0)
+    axis, length = _advance(model, travel)
     factors = tuple(m.factor * scales.get(m.curve, 0.0) * sign / length for m in model.motions)
-    return Drive(History(times, sign * length * base), None if axis is None else sign * axis, factors)
+    travel = {name: sign / length * way for name, way in travel.items()}
+    return Drive(History(times, sign * length * base), None if axis is None else sign * axis, factors, travel)
+
+
+def _advance(model: FebModel, travel: Mapping[str, Array]) -> tuple[Array | None, float]:
+    """Direction (3,) of the rigid body that touches tissue and its length, from ``travel`` of all bodies."""
+    touching = "" if model.contact is None else touching_body(model)
+    for m in model.rigid_motions:
+        if travel[m.target].any() and m.target != touching and m.target not in model.carried:
+            what = f"the rigid body {m.target!r} moves, and neither touches nor carries tissue"
+            raise ProblemError(what, place=f"line {m.line}")
+    length = float(np.linalg.norm(travel[touching])) if touching else 0.0
+    return (travel[touching] / length, length) if length > 0.0 else (None, 1.0)
 
 
 def _multiple(values: Array, base: Array, motion: Motion) -> float:
@@ -206,7 +210,7 @@ def _multiple(values: Array, base: Array, motion: Motion) -> float:
 
 
 def _supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices, tuple[Support, ...]]:
-    """Nodes held in all directions, and single components held or moved."""
+    """Nodes held in all directions, and single components held or moved; rigid bodies carry theirs."""
     held: dict[str, set[int]] = {}
     for m in model.motions:
         if (number[m.nodes] < 0).any():
@@ -215,12 +219,29 @@ def _supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices,
             held.setdefault(m.target, set()).add(m.component)
     clamped = {target: nodes for target, nodes in held.items() if len(nodes) == 3}
     nodes = [number[m.nodes] for m in model.motions if m.target in clamped]
-    single = tuple(
+    supports = [
         Support(number[m.nodes], m.component, factor)
         for m, factor in zip(model.motions, driven.factors)
         if m.target not in clamped
-    )
-    return np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64), single
+    ]
+    for name, carried in model.carried.items():
+        way = driven.travel[name]
+        _check_agreement(model, driven, name)
+        if way.any():
+            supports += [Support(number[carried], i, float(way[i])) for i in range(3)]
+        else:
+            nodes.append(number[carried])
+    return np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64), tuple(supports)
+
+
+def _check_agreement(model: FebModel, driven: Drive, name: str) -> None:
+    """Refuse conditions on nodes that a rigid body carries elsewhere."""
+    for m, factor in zip(model.motions, driven.factors):
+        both = np.isin(m.nodes, model.carried[name])
+        if both.any() and not np.isclose(factor, driven.travel[name][m.component]):
+            node = model.geometry.node_ids[m.nodes[both][0]]
+            what = f"node {node} of {m.target!r} moves with the rigid body {name!r}, which goes elsewhere"
+            raise ProblemError(what, place=f"line {m.line}")
 
 
 def rigid_corners(model: FebModel, name: str) -> Array:
@@ -228,8 +249,8 @@ def rigid_corners(model: FebModel, name: str) -> Array:
     return np.asarray(model.geometry.points[triangles(boundary(model.parts_of({name: None}).values()))])
 
 
-def _along(model: FebModel, driven: Drive, name: str) -> Array:
-    if driven.axis is None or any(m.target != name for m in model.rigid_motions if m.factor != 0.0):
+def _along(driven: Drive, name: str) -> Array:
+    if driven.axis is None:
         raise ProblemError(f"the rigid body {name!r} that touches the tissue does not move")
     return driven.axis
 
@@ -239,7 +260,7 @@ def _tool(model: FebModel, driven: Drive, name: str, depth: float) -> Indenter:
 
     Its sharp edges are rounded by no more than the elements that it touches are deep (``depth``, mm).
     """
-    axis = _along(model, driven, name)
+    axis = _along(driven, name)
     faces = triangles(boundary(model.parts_of({name: None}).values()))
     used, faces = np.unique(faces, return_inverse=True)
     frame = Indenter("sphere", axis=axis).frame
@@ -256,7 +277,7 @@ def _tool(model: FebModel, driven: Drive, name: str, depth: float) -> Indenter:
 
 
 def _placed(model: FebModel, driven: Drive, name: str, indenter: Indenter) -> Indenter:
-    axis = _along(model, driven, name)
+    axis = _along(driven, name)
     centre = model.rigid[name].centre
     foremost = float(((rigid_corners(model, name) - centre) @ axis).max())
     return replace(indenter, centre=centre + foremost * axis, axis=axis)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..fe import Step, System
 from ..fe.kernel.laws import Laws
-from ..fe.observables import ElementFields, element_fields
+from ..fe.observables import ElementFields, element_fields, nodal_forces
 from ..fe.system import Increment
 from .model import FebModel
 from .problem import Body, deformable_body, drive, touching_body
@@ -32,10 +32,8 @@ class Tables:
         self.model, self.problem, self.system = model, problem, system
         self.body: Body = deformable_body(model)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-        self.moving, axis = "", drive(model).axis
-        self.axis = np.zeros(3)
-        if model.contact is not None and axis is not None:
-            self.moving, self.axis = touching_body(model), axis
+        self.travel = drive(model).travel
+        self.touching = "" if model.contact is None else touching_body(model)
         self.count = 0
         names = [request.file or f"{stem}.log" for request in model.requests]
         self.paths = [folder / name for name in names]
@@ -75,16 +73,16 @@ class Tables:
             stream.flush()
         self.count += 1
 
-    def _advance(self, step: Step | None) -> Array:
-        """How far the rigid body that moves has gone (3,), mm."""
+    def _advance(self, body: str, step: Step | None) -> Array:
+        """How far a rigid body has gone (3,), mm."""
         gone = float(self.problem.history.at(0.0)) if step is None else step.displacement
-        return np.asarray(gone * self.axis)
+        return gone * self.travel[body]
 
     def _displacement(self, step: Step | None) -> Array:
         """Displacement (n, 3) of all nodes of the file, mm; nodes of no element stay."""
         u = np.zeros_like(self.model.geometry.points)
-        for part in self.model.parts_of({self.moving: None}).values():
-            u[part.cells] = self._advance(step)
+        for part in self.model.parts_of(self.model.rigid).values():
+            u[part.cells] = self._advance(part.material, step)
         if step is not None:
             u[self.body.nodes] = step.state.u
         return u
@@ -132,15 +130,19 @@ class Tables:
         moved = np.array([body.centre for body in self.model.rigid.values()]).reshape(-1, 3)
         force = np.zeros_like(moved)
         for i, name in enumerate(self.model.rigid):
-            if name == self.moving:
-                moved[i] += self._advance(step)
-                if step is not None:
-                    force[i] = self._force(step)
+            moved[i] += self._advance(name, step)
+            if step is not None:
+                force[i] = self._force(name, step)
         return dict(zip(("x", "y", "z", "Fx", "Fy", "Fz"), np.hstack([moved, force]).T))
 
-    def _force(self, step: Step) -> Array:
-        """Force (3,) of the indenter on the tissue, N."""
-        nothing, state = np.zeros(0), step.state
-        penalty = state.penalty * self.laws.modulus
-        increment = Increment(state.time, state.displacement, nothing, nothing, penalty)
-        return -np.asarray(self.system.contact_force(state.u, increment)).sum(axis=0)
+    def _force(self, body: str, step: Step) -> Array:
+        """Force (3,) of a rigid body on the tissue that it touches and carries, N."""
+        force, state = np.zeros(3), step.state
+        if body == self.touching:
+            nothing, penalty = np.zeros(0), state.penalty * self.laws.modulus
+            increment = Increment(state.time, state.displacement, nothing, nothing, penalty)
+            force -= np.asarray(self.system.contact_force(state.u, increment)).sum(axis=0)
+        if body in self.model.carried:
+            nodes = self.body.number[self.model.carried[body]]
+            force += nodal_forces(self.system, self.laws, state)[nodes].sum(axis=0)
+        return force

@@ -24,6 +24,10 @@ MMG_WORKER = Path(__file__).with_name("_mmg_worker.py")
 NETGEN_WORKER = Path(__file__).with_name("_netgen_worker.py")
 
 
+class MesherError(MeshingError):
+    """A mesher was started and gave no mesh."""
+
+
 @dataclass(frozen=True)
 class VolumeTask:
     """A tetrahedral mesh to be adapted to a size.
@@ -59,7 +63,7 @@ def mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
 
     Raises
     ------
-    MeshingError
+    MesherError
         When MMG crashes, gives nothing or exceeds the time limit.
     """
     return _in_worker(MMG_WORKER, "MMG", task, time_limit_s)
@@ -71,7 +75,7 @@ def netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     Raises
     ------
     MeshingError
-        When Netgen is not installed, crashes, gives nothing or exceeds the time limit.
+        When Netgen is not installed, or crashes, gives nothing or exceeds the time limit (`MesherError`).
     """
     if find_spec("netgen") is None:
         raise MeshingError(
@@ -87,7 +91,7 @@ def _in_worker(worker: Path, name: str, task: VolumeTask, time_limit_s: float) -
         np.savez(source, **{name: getattr(task, name) for name in task.__dataclass_fields__})
         run_worker([sys.executable, str(worker), str(source), str(target)], time_limit_s)
         if not target.is_file():
-            raise MeshingError(f"the mesher {name} gave no mesh; choose larger edges or thicker layers")
+            raise MesherError(f"the mesher {name} gave no mesh; choose larger edges or thicker layers")
         with np.load(target) as stored:
             return VolumeMesh(**{name: stored[name] for name in VolumeMesh.__dataclass_fields__})
 
@@ -100,12 +104,12 @@ def run_worker(command: list[str], time_limit_s: float) -> None:
             command, timeout=time_limit_s, capture_output=True, check=False, env={**os.environ, **threads}
         )
     except subprocess.TimeoutExpired:
-        raise MeshingError(
+        raise MesherError(
             f"the mesher did not end in {time_limit_s:g} s; raise mesh.time_limit_s or choose larger edges"
         ) from None
     if done.returncode:
         last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no message"])[-1]
-        raise MeshingError(
+        raise MesherError(
             f"the mesher stopped with code {done.returncode} ({last}); "
             "check the surfaces for self-intersections or choose other edge lengths"
         )

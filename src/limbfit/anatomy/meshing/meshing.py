@@ -24,15 +24,15 @@ from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, to_tet10
 from ..surfaces.surfaces import Anatomy
 from . import background
-from .background import BONE, LAYER, PLANE, TetGrid
+from .background import BONE, LAYER, PLANE, TetGrid, volumes
 from .curving import curved, with_diagonals
-from .engines import ENGINES, VolumeMesh, VolumeTask
+from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .layered import core_mesh, curved_target, with_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
 from .projection import guarded, projected
 from .smoothing import polished
-from .untangling import inverted, repaired, unrepaired
+from .untangling import inverted, narrowest, repaired, unrepaired, untangled
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -41,6 +41,7 @@ SURFACES = (PLANE, LAYER, BONE)
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
 LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
+STRAY = 0.5  # of the layers' thickness: a node of their inner face so far outside it is put back
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
 
 
@@ -165,7 +166,7 @@ def mesh_site(
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
     size = site_size(base.grid.points, base.size_limit, site, inward, settings)
     task = _task(base.grid, size, settings)
-    core = _snapped(ENGINES[settings.engine](task, settings.time_limit_s), fields)
+    core = _snapped(_adapted(task, fields, settings), fields)
     mesh, stack = with_layers(core, fields, settings.regions)
     mesh = polished(mesh, fields, stack)
     mesh, repairs = repaired(mesh, fields, stack)
@@ -178,6 +179,15 @@ def mesh_site(
     report = mesh_report(mesh, fields, base.trimmed, base.enclosed_mm3, seconds, settings.engine)
     report = replace(report, repairs=repairs)
     return mesh.with_points(frame.to_patient(mesh.points)), report
+
+
+def _adapted(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
+    """The core, graded; a mesher that fails does so, as a rule, where what it was given is flattest."""
+    try:
+        return ENGINES[settings.engine](task, settings.time_limit_s)
+    except MesherError as error:
+        where = narrowest(task.points, task.tets, fields)
+        raise MeshingError(f"{error}; what it was given is flattest {where}") from None
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
@@ -230,7 +240,24 @@ def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
         target[nodes] = projected(level, target[nodes], free[nodes])
     points = guarded(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
     points[in_plane, 2] = 0.0
-    return replace(core, points=points)
+    return replace(core, points=_recovered(points, target, core, fields))
+
+
+def _recovered(points: Array, target: Array, core: VolumeMesh, fields: LimbFields) -> Array:
+    """Points (n, 3) with nodes that a mesher left far outside the layers' inner face put on it all the same.
+
+    Bending its triangles over a ridge, MMG may put a node almost on the skin; inner nodes make room for it.
+    """
+    layer = np.flatnonzero(_nodes_on(core, LAYER))
+    stray = layer[fields.layer(points[layer])[0] < -STRAY * fields.floor(points[layer])]
+    if not len(stray):
+        return points
+    inner = np.ones(len(points), dtype=bool)
+    inner[core.triangles] = False
+    moved = points.copy()
+    moved[stray] = target[stray]
+    moved = untangled(moved, core.tets, np.zeros_like(moved), inner)
+    return moved if (volumes(moved, core.tets) > 0.0).all() else points
 
 
 def _nodes_on(core: VolumeMesh, surface: int) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from ...mesh import Mesh, node_jacobians
 from ..frame import Frame
 from .background import volumes
 from .columns import Columns
-from .layers import LimbFields
+from .layers import LimbFields, signed_distance
 from .smoothing import DIRECTIONS, held, put_back
 
 Array = NDArray[np.float64]
@@ -162,23 +162,32 @@ def thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: 
 def unrepaired(mesh: Mesh, fields: LimbFields) -> str:
     """Where the inverted cells of a mesh in the limb frame are (LPS mm), next to what, and why."""
     bad = inverted(mesh)
-    where = mesh.points[mesh.corners[bad]].mean(axis=1)[:1]
-    place = ", ".join(f"{x:.1f}" for x in fields.frame.to_patient(where[0]))
-    region = mesh.region_names[int(mesh.regions[bad][0])]
-    near = {
-        "the skin": abs(fields.depth(where)[0][0]),
-        "the layers' inner face": abs(fields.layer(where)[0][0]),
-        "bone": abs(fields.void(where)[0][0]),
-        "the proximal cut": abs(where[0, 2]),
-    }
-    surface = min(near, key=lambda name: near[name])
-    core = mesh.region_names[-1]
+    region, core = mesh.region_names[int(mesh.regions[bad][0])], mesh.region_names[-1]
     why = (
         f"there is too little {core} for its elements"
         if region == core
         else "the skin is folded, or bent more sharply than its layers are thick"
     )
-    return (
-        f"{int(bad.sum())} of {len(mesh.cells)} cells are inverted, the first in {region} at ({place}) mm, "
-        f"{near[surface]:.1f} mm from {surface}: {why}"
-    )
+    where = _place(mesh.points[mesh.corners[bad]].mean(axis=1)[0], fields)
+    return f"{int(bad.sum())} of {len(mesh.cells)} cells are inverted, the first in {region} {where}: {why}"
+
+
+def narrowest(points: Array, tets: Ints, fields: LimbFields) -> str:
+    """Where the flattest of tetrahedra in the limb frame is (LPS mm), and next to what."""
+    corners = points[tets]
+    return _place(corners[np.argmin(_roundness(corners))].mean(axis=0), fields)
+
+
+def _place(point: Array, fields: LimbFields) -> str:
+    """Where a point (3,) of the limb frame is (LPS mm), and how far from which surface."""
+    where = point[None]
+    near = {
+        "the skin": abs(fields.depth(where)[0][0]),
+        "the layers' inner face": abs(fields.layer(where)[0][0]),
+        "the proximal cut": abs(point[2]),
+    }
+    bones = {name: abs(signed_distance(bone, where)[0][0]) for name, bone in fields.bones.items()}
+    near |= {f"the bone {name}": distance for name, distance in bones.items()}
+    surface = min(near, key=lambda name: near[name])
+    place = ", ".join(f"{x:.1f}" for x in fields.frame.to_patient(point))
+    return f"at ({place}) mm, {near[surface]:.1f} mm from {surface}"

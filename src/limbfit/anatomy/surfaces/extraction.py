@@ -159,8 +159,8 @@ def remesh(
     return Surface(points, faces)
 
 
-def untangled(surface: Surface) -> Surface:
-    """Without faces that cross: their points go half-way to the mean of their neighbours, until none do.
+def untangled(surface: Surface, share: float = 0.5) -> Surface:
+    """Without faces that cross: their points go a share of the way to their neighbours' mean, until none do.
 
     Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at a patella's rim.
     What still crosses after that is left to the check of the anatomy.
@@ -175,7 +175,7 @@ def untangled(surface: Surface) -> Surface:
         np.add.at(means, edges[:, 0], surface.points[edges[:, 1]])
         means /= np.bincount(edges[:, 0], minlength=len(means))[:, None]
         points = surface.points.copy()
-        points[moved] = 0.5 * (points[moved] + means[moved])
+        points[moved] += share * (means[moved] - points[moved])
         surface = Surface(points, surface.faces)
     return surface
 

@@ -29,6 +29,7 @@ SMALL_MM = 10.0  # a hole that is no wider is filled
 FEW_EDGES, FEW_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
 LOOSE_SHARE = 0.01  # of the faces: open pieces that hold less are left out
 MOST_CROSSING, MOST_SMOOTHED_MM = 200, 4.0  # pairs of faces that are smoothed until they do not cross
+GENTLE, FIRM = 0.1, 0.5  # of the way to the neighbours' mean, each time; long triangles need little
 END_SHARE = 0.03  # of the skin's area: a smaller opening is a hole in its side and not its proximal end
 WIDENED = 2.0  # a cap so much larger than the opening cuts through the body
 INSIDE_MM = 0.5  # of the loop's lowest point, where the cap lies
@@ -255,9 +256,12 @@ def _uncrossed(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     crossing = self_intersections(surface)
     if not 0 < len(crossing) <= MOST_CROSSING:
         return surface, ()
-    smooth = untangled(surface)
-    moved = np.linalg.norm(smooth.points - surface.points, axis=1).max()
-    if moved > MOST_SMOOTHED_MM:
+    for share in (GENTLE, FIRM):
+        smooth = untangled(surface, share)
+        moved = np.linalg.norm(smooth.points - surface.points, axis=1).max()
+        if moved <= MOST_SMOOTHED_MM and not len(self_intersections(smooth)):
+            break
+    else:
         return surface, ()
     where = _place(surface.triangles[crossing[0, 0]].mean(axis=0))
     note = (

@@ -149,12 +149,13 @@ def check_closed(surface: Surface, name: str = "skin", file: str | Path | None =
             file=file,
             remedy="flip the normals so that they point outward",
         )
-    crossing = len(self_intersections(surface))
-    if crossing:
+    crossing = self_intersections(surface)
+    if len(crossing):
+        place = ", ".join(f"{x:.1f}" for x in surface.triangles[crossing[0, 0]].mean(axis=0))
         raise SurfaceError(
-            f"{name}: the surface crosses itself ({crossing} pairs of faces)",
+            f"{name}: the surface crosses itself ({len(crossing)} pairs of faces, the first at ({place}) mm)",
             file=file,
-            remedy="remesh or repair it",
+            remedy="remesh, smooth or repair it",
         )
 
 
