@@ -213,12 +213,12 @@ def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, floa
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    wanted = len(study.parameters)
+    wanted, keys = len(study.parameters), ",".join(study.law.keys)
     if len(values) != wanted or not all(0 <= v < float("inf") for v in values):
         raise InputError(
             f"{text!r} is not {wanted} numbers",
             place="--parameters",
-            remedy=f"give {','.join(study.law.keys)} of {', then of '.join(study.tissues)}, without spaces",
+            remedy=f"give {keys} of {', then of '.join(study.tissues)}, separated by commas",
         )
     return study.by_tissue(values)
 
