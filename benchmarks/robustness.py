@@ -34,7 +34,7 @@ from mapped_bodies import Array, Body, Indices, limb, slab
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, solve
 from limbfit.fe.doubts import slipped
 from limbfit.mesh import node_jacobians
-from limbfit.study import PARAMETERS, MaterialTable
+from limbfit.study import MaterialTable
 
 SITES = (
     "slab-mid", "slab-slanted", "slab-thin", "ridge-edge", "ridge-thin", "limb-mid", "limb-slanted",
@@ -127,8 +127,8 @@ def draw(seed: int, number: int) -> Case:
 def _parameters(rng: np.random.Generator) -> dict[str, float]:
     """One tissue, logarithmically even over the bounds of the calibration."""
     bounds = MaterialTable()
-    ends = [(getattr(bounds.lower, name), getattr(bounds.upper, name)) for name in PARAMETERS]
-    return {name: float(np.exp(rng.uniform(*np.log(end)))) for name, end in zip(PARAMETERS, ends)}
+    ends = [(bounds.lower[name], bounds.upper[name]) for name in bounds.keys]
+    return {name: float(np.exp(rng.uniform(*np.log(end)))) for name, end in zip(bounds.keys, ends)}
 
 
 def _measures(site: str, thin: float, rng: np.random.Generator) -> dict[str, float]:

@@ -13,7 +13,7 @@ from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.bench.blocks import SIX_TETS, block_site, boxes, upright
 from limbfit.execution import SerialExecutor
-from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
+from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.shared.context import Context
@@ -87,7 +87,8 @@ def store_blocks(
             write_vtu(
                 layered_block(thickness, tissues, divisions=coarse), store["mesh"] / COARSE / f"{name}.vtu"
             )
-        _write_record(study, replace(model, indenter=study.indenter), truth, np.random.default_rng(i))
+        model = replace(model, indenter=study.indenter, law=study.material.law, extensions=study.extensions)
+        _write_record(study, model, truth, np.random.default_rng(i))
         places.append(
             {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}
             | {"off_skin_mm": 0.0, "marker": None}
@@ -100,7 +101,7 @@ def store_blocks(
 def _write_record(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
     """What a robot writes down of the true forces."""
     times = np.linspace(0.0, model.knots_s[-1], 201)
-    job = SimulationJob(model, study.tissues, tuple(to_vector(truth, study.tissues)), tuple(times), False)
+    job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
     force = simulate(job).force_N
     made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, force), random)
     made.write(study.path(Path(f"{model.name}.csv")))

@@ -21,7 +21,8 @@ FLOORS = [
     {"indentation", "notebook"},
     {"study", "febio", "fields", "acquire"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
-    {"mesh", "phases", "autoregressive"},
+    {"mesh", "phases", "autoregressive", "laws"},
+    {"extensions"},
     {"errors", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}

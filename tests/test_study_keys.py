@@ -16,6 +16,7 @@ import pytest
 import limbfit
 from limbfit.acquire import Settings
 from limbfit.errors import StudyError
+from limbfit.extensions import load_extensions
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, experiment_key
 from limbfit.pipeline.shared.keys import Keys
 from limbfit.pipeline.verbs.run import keys
@@ -54,6 +55,7 @@ START = {"c_kPa": 4.0, "m": 3.5, "gamma": 1.1, "tau_s": 1.9}
 ACTS: dict[str, tuple[str, Any]] = {
     "study.name": ("report", "two"),
     "study.description": ("report", "a limb"),
+    "study.extensions": ("segment", ["extension.py"]),
     "image.path": ("segment", "marked"),
     "image.series": ("segment", "1.2.3"),
     "image.markers": ("segment", "same"),
@@ -109,6 +111,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "sites.0.near": ("sites", [0.0, -51.0, 10.0]),
     "sites.0.axis": ("sites", [0.0, 1.0, 0.0]),
     "sites.0.edge": ("calibrate", [0.0, 0.0, 1.0]),
+    "material.law": ("calibrate", "other"),
     "material.kappa_ratio": ("calibrate", 200.0),
     "material.start": ("calibrate", START),
     "material.lower": ("calibrate", {**START, "m": 2.5, "gamma": 0.5, "tau_s": 0.5}),
@@ -169,11 +172,6 @@ READ: dict[str, str] = {
 OTHER_NAMES = {
     "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
     "indenter.file": "indenter",
-    **{
-        f"material.{which}.{name}": f"material.{which}"
-        for which in ("start", "lower", "upper")
-        for name in START
-    },
     "calibration.prior.median": "calibration.prior.skin.c_kPa.median",
     "calibration.prior.factor": "calibration.prior.skin.c_kPa.factor",
 }
@@ -292,6 +290,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study")
     for name in FILES:
         (folder / name).write_text(name)
+    (folder / "extension.py").write_text(
+        "from dataclasses import replace\nfrom limbfit.laws import LAWS, register_law\n"
+        'register_law(replace(LAWS["ogden"], name="other"))\n'
+    )
+    load_extensions([folder / "extension.py"])
     for name in ("mri", "marked"):
         (folder / name).mkdir()
         (folder / name / "image").write_text(name)

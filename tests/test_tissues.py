@@ -13,7 +13,7 @@ from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.identify import Unknowns, separate, shared, two_stages
-from limbfit.indentation import SimulationJob, simulate, to_parameters, to_vector
+from limbfit.indentation import SimulationJob, flat_names, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.stages.calibrate import run_calibrate
@@ -21,7 +21,7 @@ from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.pipeline.verbs.run import keys
 from limbfit.report import build_report
-from limbfit.study import PARAMETERS, SolverTable, Study, load_study
+from limbfit.study import SolverTable, Study, load_study
 
 LAYERS = """
 [geometry]
@@ -70,7 +70,7 @@ def test_flat_vectors_go_by_tissue_then_parameter():
 
 
 def test_stages_share_by_parameter_and_a_single_tissue_has_one():
-    names = tuple(f"{tissue}.{name}" for tissue in TISSUES for name in PARAMETERS)
+    names = tuple(f"{tissue}.{name}" for tissue, name in flat_names(TISSUES))
     assert shared(names) == (0, 1, 2, 3) * 3
     assert separate(names) == tuple(range(12))
     assert two_stages(names) == (shared(names), separate(names))
@@ -192,16 +192,17 @@ def test_places_that_share_markers_decide_together(tmp_path):
     assert "calibrate" in stale(before, marked(1.0))
 
 
-def test_parameters_of_the_command_line_go_by_the_studys_tissues():
+def test_parameters_of_the_command_line_go_by_the_studys_tissues(tmp_path):
+    two, three = write_study(tmp_path), write_study(tmp_path, LAYERS)
     text = "12,6,2,0.6, 2,4,1,1.2, 5,5,3,0.3"
-    assert parse_parameters(text, TISSUES) == TRUTH
-    assert parse_parameters(None, TISSUES) is None
+    assert parse_parameters(text, three) == TRUTH
+    assert parse_parameters(None, three) is None
     with pytest.raises(InputError, match=r"not 12 numbers; give .* of skin, then of fat, then of muscle"):
-        parse_parameters("1,2,3,4,5,6,7,8", TISSUES)
+        parse_parameters("1,2,3,4,5,6,7,8", three)
     with pytest.raises(InputError, match="not 8 numbers"):
-        parse_parameters(text, ("skin", "muscle"))
+        parse_parameters(text, two)
     with pytest.raises(InputError, match="not 12 numbers"):
-        parse_parameters(text.replace("12,", "-12,"), TISSUES)
+        parse_parameters(text.replace("12,", "-12,"), three)
 
 
 # thickness of skin, fat and muscle, depth, whether fitted

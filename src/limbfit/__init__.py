@@ -39,6 +39,9 @@ from ._version import __version__
 _HOME = {
     "LimbfitError": "errors",
     "InputError": "errors",
+    "Parameter": "laws",
+    "TissueLaw": "laws",
+    "register_law": "laws",
     "Study": "study",
     "load_study": "study",
     "Progress": "pipeline",

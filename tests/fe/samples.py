@@ -5,9 +5,13 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from limbfit.fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from limbfit.fe.kernel.kinematics import invert, principal_axes
+from limbfit.fe.kernel.response import respond, stress_rates
+from limbfit.fe.lanes import LANES, workspace
 
 SIX = ((0.004, 4.8), (0.003, -4.8), (-0.001, 2.5), (0.002, -1.7), (0.0005, 9.0), (0.0015, 0.7))
 SAMPLES: dict[str, Material] = {
@@ -61,6 +65,46 @@ def kirchhoff(material: Material, stretches: NDArray) -> NDArray:
     """Deviatoric principal Kirchhoff stresses (..., 3): ``dW/d ln lambda_i`` by complex steps; MPa."""
     steps = np.exp(1e-30j * np.eye(3))
     return np.stack([energy(material, stretches * step).imag for step in steps], axis=-1) / 1e-30
+
+
+def slopes(material: Material, stretches: NDArray) -> NDArray:
+    """``d2W/de_i^2`` (..., 3) of a sum of Ogden terms; MPa."""
+    e = np.log(stretches) - np.log(stretches).mean(axis=-1, keepdims=True)
+    return sum(c * np.exp(m * e) for c, m in material.table().terms)
+
+
+def quotients(material: Material, c2: NDArray) -> NDArray:
+    """``(beta_i - beta_j)/(c2_i - c2_j)`` for ij = 12, 20, 01 of a sum of Ogden terms; MPa.
+
+    A difference quotient is the mean of the derivative over the interval, here by Gauss's rule.
+    """
+    x, w = np.polynomial.legendre.leggauss(100)
+    found = []
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        between = c2[i] + (c2[j] - c2[i]) * (x + 1) / 2
+        e = 0.5 * np.log(between) - np.log(c2).sum() / 6
+        slope = sum(c * np.exp(m * e) for c, m in material.table().terms)
+        found.append((w / 2 * slope / (2 * between)).sum())
+    return np.array(found)
+
+
+@njit
+def _respond(points, law, numbers, rates):
+    invert(points[0])
+    principal_axes(points[0])
+    respond(points[0], law[0], numbers)
+    stress_rates(points[0], law[0], numbers, rates)
+
+
+def point(material: Material, F: NDArray):
+    """The kernels' POINT, and RATEs, of deformation gradients (lanes, 3, 3), or of one in all lanes."""
+    table = material.table()
+    points, law, numbers, *_, rates = workspace(1, 1, len(table.numbers))
+    law["response"], law["rates"] = np.array(table.elastic.addresses)[:, None, None]
+    numbers["v"] = table.numbers[:, None]
+    points["F"] = np.moveaxis(np.broadcast_to(F, (LANES, 3, 3)), 0, -1)
+    _respond(points, law, numbers, rates)
+    return points[0], rates
 
 
 def pressure(law: str, kappa: float, J: NDArray) -> NDArray:

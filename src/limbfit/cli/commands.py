@@ -14,8 +14,8 @@ from rich.table import Table
 import limbfit
 
 from ..errors import InputError
-from ..study import PARAMETERS
-from .console import STDERR, STDOUT, AsJson, listening, print_json
+from ..study import Study
+from .console import STDERR, STDOUT, AsJson, listening, parameter_heads, print_json
 
 StudyPath = Annotated[
     Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
@@ -157,8 +157,9 @@ def simulate(
     parameters: Annotated[
         str | None,
         typer.Option(
-            help="c_kPa,m,gamma,tau_s of each tissue, outermost first (skin, then muscle, unless the study "
-            "has layers); default: identified, or the study's start where nothing is"
+            help="the law's parameters of each tissue (c_kPa,m,gamma,tau_s unless the study has another), "
+            "outermost first (skin, then muscle, unless the study has layers); default: identified, or the "
+            "study's start where nothing is"
         ),
     ] = None,
     animation: Annotated[
@@ -175,7 +176,7 @@ def simulate(
         found = limbfit.simulate_site(
             checked,
             site,
-            parameters=parse_parameters(parameters, checked.tissues),
+            parameters=parse_parameters(parameters, checked),
             animation=animation,
             solver=None if solver is None else solver.value,
             listener=listener,
@@ -204,23 +205,22 @@ def report(study: StudyPath, as_json: AsJson = False) -> None:
     show_summary(summary, as_json)
 
 
-def parse_parameters(text: str | None, tissues: tuple[str, ...]) -> dict[str, dict[str, float]] | None:
-    """``--parameters``: four numbers of each tissue, in the order of the study's tissues."""
+def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, float]] | None:
+    """``--parameters``: the numbers of each tissue, in the order of the study's tissues."""
     if text is None:
         return None
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    wanted = len(tissues) * len(PARAMETERS)
+    wanted, keys = len(study.parameters), ",".join(study.law.keys)
     if len(values) != wanted or not all(0 <= v < float("inf") for v in values):
         raise InputError(
             f"{text!r} is not {wanted} numbers",
             place="--parameters",
-            remedy=f"give c_kPa,m,gamma,tau_s of {', then of '.join(tissues)}, separated by commas",
+            remedy=f"give {keys} of {', then of '.join(study.tissues)}, separated by commas",
         )
-    numbers = iter(values)
-    return {tissue: {name: next(numbers) for name in PARAMETERS} for tissue in tissues}
+    return study.by_tissue(values)
 
 
 def show_summary(summary: dict[str, Any], as_json: bool) -> None:
@@ -253,13 +253,14 @@ def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:
 
 
 def show_parameters(summary: dict[str, Any]) -> None:
-    table = Table("tissue", "c (kPa)", "m", "gamma", "tau (s)", box=None)
+    names = list(next(iter(summary["parameters"].values())))
+    table = Table("tissue", *parameter_heads(names), box=None)
     rows = [("identified", summary["parameters"])]
     if "truth" in summary:
         rows.append(("truth", summary["truth"]))
     for kind, values in rows:
         for tissue, known in values.items():
-            table.add_row(f"{tissue}, {kind}", *(f"{known[name]:.3g}" for name in PARAMETERS))
+            table.add_row(f"{tissue}, {kind}", *(f"{known[name]:.3g}" for name in names))
     STDOUT.print(table)
 
 

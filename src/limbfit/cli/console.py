@@ -7,7 +7,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from threading import Event, Thread
 from time import perf_counter, sleep
@@ -26,6 +26,8 @@ from rich.progress import (
 )
 
 import limbfit
+
+from ..laws import split_key
 
 INTERRUPTED = "interrupted; run the same command again to go on"
 _PATIENCE_S = 3.0  # for an interrupt to be heard
@@ -123,6 +125,12 @@ def prompt_interrupt() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
         signal.set_wakeup_fd(wakeup)
         far.close()  # which ends the watch
+
+
+def parameter_heads(keys: Iterable[str]) -> list[str]:
+    """Parameters as heads of columns: ``tau_s`` is ``tau (s)``."""
+    split = [split_key(key) for key in keys]
+    return [f"{name} ({unit})" if unit else name for name, unit in split]
 
 
 def fail(text: str, code: int) -> None:

@@ -14,7 +14,7 @@ import limbfit
 
 from ..errors import InputError
 from .commands import StudyPath
-from .console import STDERR, STDOUT, AsJson, listening, print_json
+from .console import STDERR, STDOUT, AsJson, listening, parameter_heads, print_json
 
 
 def run_verb(
@@ -81,9 +81,8 @@ def regions(
 
 
 def show_regions(found: dict[str, Any]) -> None:
-    table = Table(
-        "region", "sites", "tissue", "c (kPa)", "m", "gamma", "tau (s)", "error (%)", "whole (%)", box=None
-    )
+    names = parameter_heads(next(iter(found["whole"]["parameters"].values())))
+    table = Table("region", "sites", "tissue", *names, "error (%)", "whole (%)", box=None)
     rows = [("whole limb", found["whole"]["fitted_sites"], found["whole"]["parameters"], None, None)]
     errors = ("own_error_percent", "whole_error_percent")
     rows += [

@@ -79,7 +79,7 @@ def export(
             to.value,
             site=site,
             output=output,
-            parameters=parse_parameters(parameters, checked.tissues),
+            parameters=parse_parameters(parameters, checked),
             listener=listener,
         )
     if as_json:
@@ -110,7 +110,7 @@ def compare(
         found = limbfit.compare_site(
             checked,
             site,
-            parameters=parse_parameters(parameters, checked.tissues),
+            parameters=parse_parameters(parameters, checked),
             febio_log=febio_log,
             listener=listener,
         )

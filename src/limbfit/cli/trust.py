@@ -60,7 +60,7 @@ def design(
     ] = None,
     parameters: Annotated[
         str | None,
-        typer.Option(help="c_kPa,m,gamma,tau_s of each tissue; default: identified, or the study's start"),
+        typer.Option(help="the law's parameters of each tissue; default: identified, or the study's start"),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -71,7 +71,7 @@ def design(
             checked,
             sites=sites,
             depths_mm=parse_depths(depths),
-            parameters=parse_parameters(parameters, checked.tissues),
+            parameters=parse_parameters(parameters, checked),
             listener=listener,
         )
     if as_json:

@@ -42,36 +42,65 @@ POINT = np.dtype(
         ("n", "f8", (3, 3, _L)),  # columns: spatial principal directions
         ("e", "f8", (3, _L)),  # isochoric logarithmic stretches
         ("energy", "f8", _L),
-        ("beta", "f8", (3, _L)),  # this and the next two as in `materials.ogden`
-        ("slope", "f8", (3, _L)),
+        (
+            "beta",
+            "f8",
+            (3, _L),
+        ),  # this and the next two as `materials.elastic` says; then see `kernel.response`
+        ("slope", "f8", (6, _L)),
         ("quotient", "f8", (3, _L)),
         ("volumetric", "f8", _L),  # U
         ("pressure", "f8", _L),  # J U' or, with one pressure per element, J p
         ("stiffening", "f8", _L),  # derivative of the pressure with respect to ln J at this point
         ("tau", "f8", (6, _L)),  # Kirchhoff stress
-        ("axes", "f8", (6, 6, _L)),  # dyads of the principal directions, three normal and three of shear
-        ("along", "f8", (6, _L)),  # weighted moduli along those dyads
-        ("D", "f8", (6, 6, _L)),  # weighted spatial moduli
+        ("D", "f8", (6, 6, _L)),  # moduli
     ],
     align=True,
 )
-TERM = np.dtype([("c", "f8", _L), ("m", "f8", _L)], align=True)  # modulus and exponent of each element's law
+# The elastic law of every element: where its two functions are (`materials.elastic`), and what the first
+# answered, kept where others answer for other lanes.
+LAW = np.dtype(
+    [
+        ("response", "i8", _L),
+        ("rates", "i8", _L),
+        ("energy", "f8", _L),
+        ("beta", "f8", (3, _L)),
+        ("slope", "f8", (6, _L)),
+        ("quotient", "f8", (3, _L)),
+    ],
+    align=True,
+)
+NUMBER = np.dtype([("v", "f8", _L)], align=True)  # one of the numbers in each element's law
+# How a point's stress changes with one of those numbers: along the principal axes, and Se.
+RATE = np.dtype([("beta", "f8", (3, _L)), ("kept", "f8", (3, _L)), ("S", "f8", (6, _L))], align=True)
 # A node at a point: gradient of its shape function, and the weighted traction on it.
 NODE = np.dtype([("g", "f8", (3, _L)), ("traction", "f8", (3, _L))], align=True)
 # A node of the element: its internal force, and the derivative of the element's volume with respect to it.
 FORCE = np.dtype([("f", "f8", (3, _L)), ("volume", "f8", (3, _L))], align=True)
-# What one node strains at one point gives rise to: D B; and the pressure's derivative of the whole element.
-ELEMENT = np.dtype([("DB", "f8", (6, 3, _L)), ("factor", "f8", _L)], align=True)
+# What one node strains at one point gives rise to: D B; the pressure's derivative of the whole element; and
+# what a point's moduli are made of: dyads of the principal axes, three normal and three of shear, moduli
+# along pairs of the normal ones (as xx, yy, zz, xy, yz, zx) and of shear, and both together.
+ELEMENT = np.dtype(
+    [
+        ("DB", "f8", (6, 3, _L)),
+        ("factor", "f8", _L),
+        ("axes", "f8", (6, 6, _L)),
+        ("along", "f8", (9, _L)),
+        ("across", "f8", (6, 6, _L)),
+    ],
+    align=True,
+)
 BLOCK = np.dtype([("K", "f8", (9, _L))], align=True)  # stiffness between two nodes
 
 
-def workspace(nodes: int, points: int, terms: int) -> tuple[NDArray[Any], ...]:
-    """Records for elements of so many nodes and points: POINT, TERM, NODE, FORCE, ELEMENT, BLOCK.
+def workspace(nodes: int, points: int, numbers: int) -> tuple[NDArray[Any], ...]:
+    """Records for elements of so many nodes, points and numbers of the law.
 
-    NODE goes point by point; the block of nodes a <= b is number ``b (b + 1)/2 + a``.
+    POINT, LAW, NUMBER, NODE, FORCE, ELEMENT, BLOCK, RATE.  NODE and RATE go point by point; the block of
+    nodes a <= b is number ``b (b + 1)/2 + a``.
     """
-    sizes = {POINT: points, TERM: terms, NODE: points * nodes, FORCE: nodes, ELEMENT: 1}
-    sizes[BLOCK] = nodes * (nodes + 1) // 2
+    sizes = {POINT: points, LAW: 1, NUMBER: numbers, NODE: points * nodes, FORCE: nodes, ELEMENT: 1}
+    sizes |= {BLOCK: nodes * (nodes + 1) // 2, RATE: points * numbers}
     return tuple(_aligned(kind, count) for kind, count in sizes.items())
 
 
@@ -90,6 +119,34 @@ def block_places(nodes: int) -> NDArray[np.int64]:
     entry = np.where(a <= b, 3 * i + j, 3 * j + i)
     a, b = np.minimum(a, b), np.maximum(a, b)
     return np.asarray(((b * (b + 1) // 2 + a) * 9 + entry) * LANES)
+
+
+def address(function: Any, signature: Any) -> int:
+    """Where the machine code of a compiled function for arguments of ``signature`` is in this process."""
+    function.compile(signature)
+    made = function.overloads[signature.args]
+    return int(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))
+
+
+def _at_address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Call the function at the first of ``values`` with the others."""
+    kinds = signature.args[1:]
+    pointer = context.call_conv.get_function_type(types.void, kinds).as_pointer()
+    function = builder.inttoptr(values[0], pointer)
+    context.call_conv.call_function(builder, function, types.void, kinds, values[1:])
+    return context.get_dummy_value()
+
+
+@_inlined
+def call_with_two(context, where, point, numbers):  # type: ignore[no-untyped-def]
+    """Call the function at an `address`; compiled code that does so need not be compiled for it."""
+    return types.void(types.int64, point, numbers), _at_address
+
+
+@_inlined
+def call_with_three(context, where, point, numbers, rates):  # type: ignore[no-untyped-def]
+    """`call_with_two`, with three arguments."""
+    return types.void(types.int64, point, numbers, rates), _at_address
 
 
 @_inlined

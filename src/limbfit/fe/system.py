@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
 from .contact.indenter import Indenter
 from .contact.sticky import Anchors
-from .kernel.assembly import assemble
+from .kernel.assembly import Elements, assemble
 from .kernel.elements import Element, reference_gradients
 from .kernel.laws import Laws
 from .problem import Problem, ProblemError, check
@@ -155,6 +155,10 @@ class System:
         """``u`` with the supported components at their values."""
         return np.where(self.supported, self.factors * displacement, u)
 
+    def elements(self, cells: slice) -> Elements:
+        """Some of the elements, as the kernels take them."""
+        return self.cells[cells], self.gradients[cells], self.weights[cells], self.regions[cells]
+
     def over_cells(self, work: Callable[[slice], T]) -> list[T]:
         """``work`` done on as many parts of the cells as there are threads, side by side."""
         ends = np.linspace(0, len(self.cells), self.threads + 1).astype(int)
@@ -169,9 +173,8 @@ class System:
         def part(cells: slice) -> tuple[float, Array, Array]:
             residual, data = np.zeros_like(u), np.zeros(size)
             energy = assemble(
-                self.cells[cells], self.gradients[cells], self.weights[cells], mean, self.regions[cells],
-                laws.tables, increment.scale, increment.history[cells], u, tangent,
-                self.cell_positions[cells], residual, data,
+                self.elements(cells), mean, laws.tables, increment.scale, increment.history[cells], u,
+                tangent, self.cell_positions[cells], residual, data,
             )  # fmt: skip
             return energy, residual, data
 

@@ -16,23 +16,18 @@ from numpy.typing import NDArray
 
 from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
 from ..fields import Animation, write_fields
+from ..laws import LAWS, OGDEN, to_parameters
 from ..mesh import read_vtu
-from ..study import PARAMETERS
 from .neighbourhood import Extension, neighbourhood
 from .sites import (
-    KPA,
     Parameters,
     SiteModel,
     build_problem,
-    flat_names,
-    materials,
+    materials_of,
     steps_of,
-    to_parameters,
 )
 
 Array = NDArray[np.float64]
-
-_FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
 
 
 @dataclass(frozen=True)
@@ -69,7 +64,7 @@ class SimulationJob:
 
 @dataclass(frozen=True)
 class Simulation:
-    """What came back: force (n,) N and its derivatives (n, 4 x tissues) at the job's times.
+    """What came back: force (n,) N and its derivatives (n, p) at the job's times.
 
     Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
     """
@@ -90,7 +85,8 @@ class Simulation:
 
 
 _KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest usual ones, some 5 GB in all
-_REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}  # tissue that sets a site's contact penalty
+# The tissue that sets a site's contact penalty, whatever law the site's own have.
+_REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}
 _REFERENCE_STEPS, _REFERENCE_MM = 4, 65.0  # to the deepest point; from the site
 # Of the penetration that is allowed: two of 24 tissues drawn over the bounds then go 1.3 times beyond it.
 _MARGIN = 0.3
@@ -124,13 +120,14 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     known = _prepared.get((model, tissues))
     if known is None:
         mesh, reference, control = read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE), steps_of(model)
-        problem = build_problem(model, mesh, reference)
+        usual = replace(model, law=OGDEN)
+        problem = build_problem(usual, mesh, reference)
         system = System(problem, control.threads)
         penalty = control.penalty
         if penalty is None:
             near = problem
             if model.within_mm is None or model.within_mm > _REFERENCE_MM:
-                near = build_problem(replace(model, within_mm=_REFERENCE_MM), mesh, reference)
+                near = build_problem(replace(usual, within_mm=_REFERENCE_MM), mesh, reference)
             penalty = _reference_penalty(near, control, system)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
@@ -160,7 +157,7 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     """Simulate a site with what is prepared for it: the same answer, whatever was simulated before."""
     known = _prepare(model, tuple(parameters))
     return solve(
-        known.problem.with_materials(materials(parameters, model.kappa_ratio)),
+        known.problem.with_materials(materials_of(model, parameters)),
         steps=first_steps(model, tuple(parameters)),
         system=known.system,
         **how,
@@ -174,7 +171,10 @@ def _solve_from_rest(
     known = _prepare(model, tissues)
     kept = known.rested.get(sensitivities)
     if kept is None or kept[0] != parameters:
-        values, store = to_parameters(np.array(parameters), tissues), "all" if sensitivities else "peak"
+        values, store = (
+            to_parameters(np.array(parameters), tissues, model.law),
+            "all" if sensitivities else "peak",
+        )
         found = _solve(model, values, sensitivities=sensitivities, store=store)
         kept = parameters, replace(found, states=tuple(map(_lightened, found.states)))
         known.rested[sensitivities] = kept
@@ -196,7 +196,7 @@ def _result(job: SimulationJob) -> Result:
     if known.link is not None and known.link[0] == wanted:
         return known.link[1]
     if known.latest is None or known.latest[0] != wanted:
-        values, with_slopes = to_parameters(np.array(job.parameters), tissues), job.sensitivities
+        values, with_slopes = to_parameters(np.array(job.parameters), tissues, model.law), job.sensitivities
         store, warm = "all" if with_slopes else "peak", _guesses(job, known)
         found = _solve(model, values, sensitivities=with_slopes, warm_start=warm, store=store)
         known.latest = wanted, replace(found, states=tuple(map(_lightened, found.states)))
@@ -235,7 +235,7 @@ def simulate(job: SimulationJob) -> Simulation:
     return Simulation(
         site=model.name,
         force_N=result.force_at(times),
-        jacobian=_in_user_units(result, job.tissues, times) if job.sensitivities else None,
+        jacobian=_in_user_units(result, job, times) if job.sensitivities else None,
         completed=result.completed,
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
@@ -255,7 +255,7 @@ def simulate_fields(
     frames = None
     if animation is not None:
         prepared = _prepare(model, tuple(parameters)).problem
-        frames = Animation(prepared.with_materials(materials(parameters, model.kappa_ratio)), animation)
+        frames = Animation(prepared.with_materials(materials_of(model, parameters)), animation)
     result = _solve(model, parameters, on_step=None if frames is None else frames.add, store="peak")
     _write_deepest(result, file)
     return result
@@ -272,16 +272,17 @@ def _write_deepest(result: Result, file: Path) -> None:
         write_fields(result.system, result.problem, result.deepest, file)
 
 
-def _in_user_units(result: Result, tissues: Sequence[str], times: Array) -> Array:
+def _in_user_units(result: Result, job: SimulationJob, times: Array) -> Array:
     """Sensitivities in flat order, per kPa where the parameter is a modulus.
 
     A tissue that does not reach the site is no region of its mesh: the force does not depend on it.
     """
     order = {name: i for i, name in enumerate(result.parameter_names)}
     found = result.sensitivity_at(times)
-    columns = np.zeros((len(times), len(PARAMETERS) * len(tissues)))
-    for i, (tissue, name) in enumerate(flat_names(tissues)):
-        j = order.get((tissue, _FE_NAME[name]))
+    wanted = [(tissue, p) for tissue in job.tissues for p in LAWS[job.model.law].parameters]
+    columns = np.zeros((len(times), len(wanted)))
+    for i, (tissue, parameter) in enumerate(wanted):
+        j = order.get((tissue, parameter.name))
         if j is not None:
-            columns[:, i] = found[:, j] * (KPA if name == "c_kPa" else 1.0)
+            columns[:, i] = found[:, j] * parameter.scale
     return columns

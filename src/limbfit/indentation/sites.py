@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,34 +15,15 @@ from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from ..errors import ProblemError, SurfaceError
-from ..fe import History, Indenter, OgdenQLV, Problem, RigidSurface, StepControl
+from ..extensions import load_extensions
+from ..fe import History, Indenter, Material, OgdenQLV, Problem, RigidSurface, StepControl
+from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
-from ..study import PARAMETERS, IndenterTable, SolverTable, Vector
+from ..study import IndenterTable, SolverTable, Vector
 from .neighbourhood import held_cut, neighbourhood
 
-Parameters = dict[str, dict[str, float]]
 Array = NDArray[np.float64]
-
-KPA = 1e-3  # MPa
-
-
-def flat_names(tissues: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """(tissue, parameter) in the order of every flat vector: the first tissue's four, then the next one's."""
-    return tuple((tissue, name) for tissue in tissues for name in PARAMETERS)
-
-
-def to_vector(parameters: Parameters, tissues: Sequence[str]) -> Array:
-    """The 4 numbers of each tissue in flat order (c in kPa)."""
-    return np.array([parameters[tissue][name] for tissue, name in flat_names(tissues)])
-
-
-def to_parameters(vector: Array, tissues: Sequence[str]) -> Parameters:
-    """The flat vector as ``{tissue: {name: value}}``, tissues in their order."""
-    result: Parameters = {tissue: {} for tissue in tissues}
-    for (tissue, name), value in zip(flat_names(tissues), vector, strict=True):
-        result[tissue][name] = float(value)
-    return result
 
 
 @dataclass(frozen=True)
@@ -68,6 +48,9 @@ class SiteModel:
     steps: SolverTable = field(default_factory=SolverTable)
     element: str = ""  # row of the element table; by default that of the mesh's cell type
     within_mm: float | None = None  # no more of the mesh than this far from the site
+    law: str = OGDEN  # of all tissues
+    extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
+    extensions_digest: str = ""
 
     @property
     def history(self) -> History:
@@ -79,18 +62,20 @@ class SiteModel:
         return spread(self.history.phases, points, self.history.times)
 
 
-def materials(parameters: Parameters, kappa_ratio: float) -> dict[str, OgdenQLV]:
+def materials(parameters: Parameters, kappa_ratio: float, law: str = OGDEN) -> dict[str, Material]:
     """The tissues for the solver, in MPa."""
+    stated = LAWS[law]
+    make = stated.material or OgdenQLV
     return {
-        tissue: OgdenQLV(
-            c=values["c_kPa"] * KPA,
-            m=values["m"],
-            gamma=values["gamma"],
-            tau=values["tau_s"],
-            kappa_ratio=kappa_ratio,
-        )
+        tissue: make(**stated.in_solver_units(values), kappa_ratio=kappa_ratio)
         for tissue, values in parameters.items()
     }
+
+
+def materials_of(model: SiteModel, parameters: Parameters) -> dict[str, Material]:
+    """The tissues of a site for the solver, whose law may be the study's own."""
+    load_extensions(model.extensions)
+    return materials(parameters, model.kappa_ratio, model.law)
 
 
 def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
@@ -112,7 +97,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
     return Problem(
         mesh=mesh,
-        materials=materials(parameters, model.kappa_ratio),
+        materials=materials_of(model, parameters),
         fixed=np.union1d(_held(mesh), cut),
         contact_faces=faces[near],
         indenter=indenter,

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..laws import split_key
 from .page import Cell
 
 NOTHING = "–"
+_GREEK = {
+    "alpha": "α",
+    "beta": "β",
+    "gamma": "γ",
+    "delta": "δ",
+    "eta": "η",
+    "kappa": "κ",
+    "mu": "μ",
+    "tau": "τ",
+}
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -26,6 +37,17 @@ def fixed(value: Any, decimals: int = 1) -> str:
     if not isinstance(value, int | float) or value != value:
         return NOTHING
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def symbol(key: str) -> str:
+    """A parameter as formulas write it: ``tau_s`` is τ."""
+    name, _ = split_key(key)
+    return _GREEK.get(name, name)
+
+
+def unit_of(key: str) -> str:
+    """Its unit: ``tau_s`` is in s."""
+    return split_key(key)[1] or NOTHING
 
 
 def duration(seconds: Any) -> str:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-
-PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
+from ..laws import TissueLaw
 
 Curves = dict[str, NDArray[np.float64]]
 Json = dict[str, Any]
@@ -64,6 +63,11 @@ class Results:
     def tissues(self) -> tuple[str, ...]:
         """Names of the identified tissues, outermost first; none where nothing was identified."""
         return tuple(self.stages[-1].get("parameters", ())) if self.stages else ()
+
+    @property
+    def law(self) -> TissueLaw:
+        """What the identification says of the tissues' law."""
+        return TissueLaw.of_record(self.calibration.get("law") or {})
 
     @property
     def materials(self) -> str:

@@ -5,18 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from .formats import NOTHING, duration, fixed, heading, number, numeric, vector
+from .formats import NOTHING, duration, fixed, heading, number, numeric, symbol, unit_of, vector
 from .page import Cell, Row, Table
-from .store import PARAMETERS, Json, Results
+from .store import Json, Results
 
-SYMBOLS = {"c_kPa": "c", "m": "m", "gamma": "γ", "tau_s": "τ"}
-UNITS = {"c_kPa": "kPa", "m": NOTHING, "gamma": NOTHING, "tau_s": "s"}
-MEANING = {
-    "c_kPa": "long-term shear modulus",
-    "m": "strain-stiffening exponent",
-    "gamma": "relaxation amplitude",
-    "tau_s": "relaxation time",
-}
 PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}  # where fat is no tissue of its own
 
 
@@ -33,6 +25,12 @@ def verdict(store: Results, tissue: str, name: str) -> str:
     key = f"{tissue}.{name}"
     word = str((uncertainty.get("verdict") or {}).get(key, NOTHING))
     return f"{word}; at its bound" if (uncertainty.get("at_bound") or {}).get(key) else word
+
+
+def parameter_words(store: Results, name: str) -> str:
+    """A parameter's symbol and what it is."""
+    words = {parameter.key: parameter.words for parameter in store.law.parameters}
+    return ", ".join(part for part in (symbol(name), words.get(name, "")) if part)
 
 
 def tissue_name(store: Results, tissue: str) -> str:
@@ -57,7 +55,9 @@ def parameter_table(store: Results) -> Table:
         caption="Table 1. Constitutive parameters before and after each stage of the identification. "
         "The interval and the verdict belong to the last stage.",
         head=tuple(head),
-        rows=tuple(_parameter_row(store, tissue, name) for tissue in store.tissues for name in PARAMETERS),
+        rows=tuple(
+            _parameter_row(store, tissue, name) for tissue in store.tissues for name in store.law.keys
+        ),
     )
 
 
@@ -66,8 +66,8 @@ def _parameter_row(store: Results, tissue: str, name: str) -> Row:
     values = [stages[0].get("start", {}), *(stage.get("parameters", {}) for stage in stages)]
     cells = [
         heading(tissue_name(store, tissue)),
-        Cell(f"{SYMBOLS[name]}, {MEANING[name]}"),
-        Cell(UNITS[name]),
+        Cell(parameter_words(store, name)),
+        Cell(unit_of(name)),
     ]
     cells += [numeric(number(tissues.get(tissue, {}).get(name))) for tissues in values]
     cells += [numeric(_limits(interval(store, tissue, name))), Cell(verdict(store, tissue, name))]
@@ -170,7 +170,7 @@ def _shade(value: Any) -> float | None:
 
 def _short(name: str) -> str:
     tissue, _, parameter = name.partition(".")
-    return f"{tissue} {SYMBOLS.get(parameter, parameter)}" if parameter else name
+    return f"{tissue} {symbol(parameter)}" if parameter else name
 
 
 def place_table(store: Results) -> Table:
@@ -312,14 +312,14 @@ def simulated_table(store: Results) -> Table:
     return Table("simulated", "Indentations simulated one by one.", head, rows)
 
 
-def iteration_table(stage: Json) -> Table:
+def iteration_table(store: Results, stage: Json) -> Table:
     """Every accepted iterate of one identification stage."""
     iterations = stage.get("iterations") or []
     known = tuple(stage.get("parameters", ()))
     tissues = known if stage.get("name") != "one material" else known[:1]
-    columns = [(tissue, name) for tissue in tissues for name in PARAMETERS]
+    columns = [(tissue, name) for tissue in tissues for name in store.law.keys]
     heads = [
-        f"{tissue + ' ' if len(tissues) > 1 else ''}{SYMBOLS[name]}{_unit(name)}" for tissue, name in columns
+        f"{tissue + ' ' if len(tissues) > 1 else ''}{symbol(name)}{_unit(name)}" for tissue, name in columns
     ]
     rows = tuple(
         Row(
@@ -343,7 +343,7 @@ def iteration_table(stage: Json) -> Table:
 
 
 def _unit(name: str) -> str:
-    return f" ({UNITS[name]})" if UNITS[name] != NOTHING else ""
+    return f" ({unit_of(name)})" if unit_of(name) != NOTHING else ""
 
 
 def timing_table(store: Results) -> Table:

@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict
 from ..pipeline import STAGE_NAMES
 from ..pipeline.shared.simulations import newest_simulations
 from ..pipeline.stages.traces import read_curves
-from ..study import PARAMETERS
 from .folder import StudyFolder
 from .processes import running, start_run, starting, stop_run
 from .study_routes import Folder, stages_of_folder
@@ -49,7 +48,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "starting": starting(folder) if run is None else None,
         "last": _last(logs[-1], run is not None) if logs else None,
         "iterates": _iterates(folder, logs, state["state"], done),
-        "parameters": list(PARAMETERS),
+        "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
         "sites": [{"site": site.name, "fitted": site.fitted} for site in study.sites if site.trace],
         "answer": done and {**done, "state": state["state"]},

@@ -5,11 +5,11 @@ Relative paths are relative to the study file and must stay inside its folder's 
 """
 
 from .loading import load_study
-from .tables import PARAMETERS, IndenterTable, MaterialTable, Site, SolverTable, Vector
+from .material import MaterialTable
+from .tables import IndenterTable, Site, SolverTable, Vector
 from .whole import Study
 
 __all__ = [
-    "PARAMETERS",
     "IndenterTable",
     "MaterialTable",
     "Site",

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from ..anatomy.sites.markups import read_markups
 from ..errors import StudyError
+from ..extensions import load_extensions
 from .vain import refuse_vain
 from .whole import Study
 
@@ -37,6 +38,7 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
         raise StudyError(f"not valid TOML: {error}", file=file) from None
     content = {key: value for key, value in content.items() if key not in ("file", "notes")}
     notes = _place_by_markups(content, file)
+    _load_extensions(content, file)
     try:
         study = Study(**content, file=file, notes=notes)
     except ValidationError as error:
@@ -79,6 +81,14 @@ def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
             site[table.get("gives", "position")] = points[name].tolist()
     unused = sorted(set(points) - {str(site.get("name")) for site in sites if isinstance(site, dict)})
     return (f"control points without a site: {', '.join(unused)}",) if unused else ()
+
+
+def _load_extensions(content: dict[str, Any], file: Path) -> None:
+    """Run the study's own Python files; what is malformed is left for the check of the types to refuse."""
+    table = content.get("study")
+    named = table.get("extensions", []) if isinstance(table, dict) else []
+    if isinstance(named, list) and all(isinstance(one, str) for one in named):
+        load_extensions(file.parent / one for one in named)
 
 
 def _study_error(error: ValidationError, file: Path) -> StudyError:

@@ -5,14 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 BoneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ().+_-]{0,39}$")]
-PARAMETERS = ("c_kPa", "m", "gamma", "tau_s")
-ParameterName = Literal["c_kPa", "m", "gamma", "tau_s"]
-KAPPA_RATIO = (10.0, 1e4)
 TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
@@ -22,20 +19,12 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class TissueParameters(TomlTable):
-    """Parameters of one tissue: long-term shear modulus, exponent, relaxation amplitude and time."""
-
-    c_kPa: Positive
-    m: Positive
-    gamma: Annotated[float, Field(ge=0)]
-    tau_s: Positive
-
-
 class StudyTable(TomlTable):
-    """What the study is called."""
+    """What the study is called; ``extensions`` are Python files that register laws and shapes of its own."""
 
     name: str
     description: str = ""
+    extensions: tuple[Path, ...] = ()
 
 
 class ImageTable(TomlTable):
@@ -234,60 +223,6 @@ class Site(TomlTable):
                 raise ValueError(f"{key} is a time of a record, and the site has no trace")
         if None not in (self.touch_down_s, self.peak_s) and self.touch_down_s >= self.peak_s:  # type: ignore[operator]
             raise ValueError("touch_down_s must come before peak_s")
-        return self
-
-
-class TissueRange(TomlTable):
-    """Where one tissue's start or bounds differ from those of all; what is not named here stays."""
-
-    start: dict[ParameterName, Positive] = {}
-    lower: dict[ParameterName, Positive] = {}
-    upper: dict[ParameterName, Positive] = {}
-
-
-class MaterialTable(TomlTable):
-    """Start and bounds of the identification; the defaults are the paper's (section 2.3, table 1).
-
-    ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
-    """
-
-    kappa_ratio: float = 100.0
-    start: TissueParameters = TissueParameters(c_kPa=4.7, m=3.0, gamma=1.2, tau_s=2.0)
-    lower: TissueParameters = TissueParameters(c_kPa=0.047, m=2.0, gamma=0.01, tau_s=0.01)
-    upper: TissueParameters = TissueParameters(c_kPa=47.0, m=20.0, gamma=10.0, tau_s=10.0)
-    tissues: dict[str, TissueRange] = {}
-
-    def of(self, tissue: str, which: Literal["start", "lower", "upper"]) -> dict[str, float]:
-        """Start, lower or upper bound of the four parameters of a tissue."""
-        general = getattr(self, which).model_dump()
-        return general | getattr(self.tissues.get(tissue, TissueRange()), which)
-
-    @field_validator("kappa_ratio")
-    @classmethod
-    def _nearly_incompressible(cls, ratio: float) -> float:
-        low, high = KAPPA_RATIO
-        if ratio < low:
-            raise ValueError(
-                f"give {low:g} or more: with less, Poisson's ratio is under 0.45, and soft tissue hardly "
-                "changes its volume"
-            )
-        if ratio > high:
-            raise ValueError(
-                f"give at most {high:g}: with that, the volume changes by some 0.01 % of the strain, and "
-                "with more, the equations lose digits"
-            )
-        return ratio
-
-    @model_validator(mode="after")
-    def _ordered(self) -> MaterialTable:
-        for tissue in ("", *self.tissues):
-            lower, start, upper = (self.of(tissue, which) for which in ("lower", "start", "upper"))
-            place = f"tissues.{tissue}." if tissue else ""
-            for name in PARAMETERS:
-                if not lower[name] <= start[name] <= upper[name]:
-                    raise ValueError(f"{place}start.{name} lies outside its bounds")
-                if not lower[name] < upper[name]:
-                    raise ValueError(f"{place}lower.{name} is not below upper.{name}")
         return self
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from ..errors import StudyError
+from ..laws import LAWS, Parameters, TissueLaw, flat_names, to_parameters, to_vector
 from .acquisition import AcquireTable
+from .material import MaterialTable
 from .meshing import MeshTable
 from .tables import (
-    PARAMETERS,
     CalibrationTable,
     ExecutionTable,
     FebioTable,
@@ -18,7 +22,6 @@ from .tables import (
     ImageTable,
     IndenterTable,
     MarkupsTable,
-    MaterialTable,
     SegmentationTable,
     Site,
     SolverTable,
@@ -71,6 +74,29 @@ class Study(TomlTable):
         return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
 
     @property
+    def law(self) -> TissueLaw:
+        """The law of all tissues."""
+        return LAWS[self.material.law]
+
+    @property
+    def extensions(self) -> tuple[Path, ...]:
+        """The files of `StudyTable.extensions`, as paths of this machine."""
+        return tuple(self.path(file) for file in self.study.extensions)
+
+    @property
+    def parameters(self) -> tuple[tuple[str, str], ...]:
+        """(tissue, parameter) in the order of every flat vector."""
+        return flat_names(self.tissues, self.material.law)
+
+    def by_tissue(self, vector: Iterable[float]) -> Parameters:
+        """A flat vector as ``{tissue: {name: value}}``."""
+        return to_parameters(vector, self.tissues, self.material.law)
+
+    def vector(self, parameters: Parameters) -> NDArray[np.float64]:
+        """The flat vector of ``{tissue: {name: value}}``."""
+        return to_vector(parameters, self.tissues, self.material.law)
+
+    @property
     def within_mm(self) -> float | None:
         """How far from a site its mesh counts where parameters are searched; None: as far as it goes."""
         return self.calibration.search_radius_mm or None
@@ -87,6 +113,7 @@ class Study(TomlTable):
             "segmentation.labels": self.segmentation.labels,
             "segmentation.contours": self.segmentation.contours,
             "indenter.file": self.indenter.file,
+            **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
             **{f"sites.{site.name}.trace": site.trace for site in self.sites},
         }
         if self.image is not None:
@@ -137,7 +164,7 @@ class Study(TomlTable):
             raise ValueError(
                 f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
             )
-        for name in PARAMETERS:
+        for name in material.keys:
             lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
             upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
             if not lower < upper:
@@ -149,7 +176,7 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _parameters_of_tissues(self) -> Study:
-        known = [f"{tissue}.{name}" for tissue in self.tissues for name in PARAMETERS]
+        known = [f"{tissue}.{name}" for tissue, name in self.parameters]
         for name in self.calibration.named:
             if name not in known:
                 raise ValueError(f"calibration: no parameter is named {name!r}; they are {', '.join(known)}")

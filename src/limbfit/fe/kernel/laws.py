@@ -11,20 +11,23 @@ from numpy.typing import NDArray
 from ..materials import Material
 
 Array = NDArray[np.float64]
+Tables = tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
 class Laws:
-    """Materials of all regions as padded arrays; see `MaterialTable`; ``moduli (r,)`` are instantaneous, MPa.
+    """Materials of all regions as padded arrays; see `LawTable`; ``moduli (r,)`` are instantaneous, MPa.
 
-    ``parameter_index (r, p)`` says which global parameter each region's p-th one is (-1: none).
+    ``elastic (r, 2)``: addresses of each region's elastic law in this process.  ``parameter_index (r, p)``
+    says which global parameter each region's p-th one is (-1: none).
     """
 
-    terms: Array
+    numbers: Array
     kappa: Array
     law: NDArray[np.int64]
+    elastic: NDArray[np.int64]
     prony: Array
-    d_terms: Array
+    d_numbers: Array
     d_kappa: Array
     d_prony: Array
     parameter_index: NDArray[np.int64]
@@ -32,8 +35,9 @@ class Laws:
     modulus_gradient: Array
 
     @property
-    def tables(self) -> tuple[Array, Array, NDArray[np.int64]]:
-        return self.terms, self.kappa, self.law
+    def tables(self) -> Tables:
+        """``numbers (r, k), kappa (r,), law (r,), elastic (r, 2)``, as the kernels take them."""
+        return self.numbers, self.kappa, self.law, self.elastic
 
     @property
     def modulus(self) -> float:
@@ -48,17 +52,18 @@ class Laws:
     @classmethod
     def build(cls, materials: Sequence[Material]) -> Laws:
         tables, slopes = [m.table() for m in materials], [m.derivatives() for m in materials]
-        K = max(len(t.terms) for t in tables)
+        K = max(len(t.numbers) for t in tables)
         L = max(len(t.prony) for t in tables)
         P = max(len(d) for d in slopes)
         R = len(materials)
-        terms, prony = np.tile([0.0, 1.0], (R, K, 1)), np.tile([0.0, 1.0], (R, L, 1))
-        d_terms, d_prony, d_kappa = np.zeros((R, P, K, 2)), np.zeros((R, P, L, 2)), np.zeros((R, P))
+        # What is left over is an Ogden term, or a relaxation, of no size.
+        numbers, prony = np.tile([0.0, 1.0], (R, K))[:, :K], np.tile([0.0, 1.0], (R, L, 1))
+        d_numbers, d_prony, d_kappa = np.zeros((R, P, K)), np.zeros((R, P, L, 2)), np.zeros((R, P))
         index, at = np.full((R, P), -1), 0
         for r, (table, slope) in enumerate(zip(tables, slopes)):
-            terms[r, : len(table.terms)], prony[r, : len(table.prony)] = table.terms, table.prony
+            numbers[r, : len(table.numbers)], prony[r, : len(table.prony)] = table.numbers, table.prony
             for p, d in enumerate(slope):
-                d_terms[r, p, : len(d.terms)], d_prony[r, p, : len(d.prony)] = d.terms, d.prony
+                d_numbers[r, p, : len(d.numbers)], d_prony[r, p, : len(d.prony)] = d.numbers, d.prony
                 d_kappa[r, p] = d.kappa
                 index[r, p] = at
                 at += 1
@@ -66,4 +71,8 @@ class Laws:
         gradient = np.concatenate([m.instantaneous_modulus_gradient for m in materials]) / R
         kappa = np.array([t.kappa for t in tables])
         law = np.array([t.volumetric for t in tables])
-        return cls(terms, kappa, law, prony, d_terms, d_kappa, d_prony, index, moduli, gradient)
+        elastic = np.array([t.elastic.addresses for t in tables], dtype=np.int64)
+        return cls(
+            np.ascontiguousarray(numbers), kappa, law, elastic, prony, d_numbers, d_kappa, d_prony, index,
+            moduli, gradient,
+        )  # fmt: skip

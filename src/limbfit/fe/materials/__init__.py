@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from .elastic import ElasticLaw, lane_function, mean_exponential
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenQLV
-from .material import LawTable, Material
+from .material import LawTable, Material, Uncoupled
 from .viscoelastic import ORDER_IN_TIME, prony_factors
 from .volumetric import VOLUMETRIC_LAWS
 
 __all__ = [
     "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
+    "ElasticLaw",
     "LawTable",
     "Material",
     "MooneyRivlin",
     "NeoHookean",
     "Ogden",
     "OgdenQLV",
+    "Uncoupled",
+    "lane_function",
+    "mean_exponential",
     "prony_factors",
 ]

@@ -13,6 +13,7 @@ Source: FEBio user manual, uncoupled materials.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,39 @@ from .material import Array, PronyTerms, Uncoupled, finite, not_negative, pairs,
 MAX_OGDEN_TERMS = 6  # as FEBio
 
 
+class OgdenSum(Uncoupled):
+    """A law that says which Ogden terms it is made of."""
+
+    @abstractmethod
+    def ogden_terms(self) -> Array:
+        """Moduli c_k (MPa) and exponents m_k (k, 2)."""
+
+    @abstractmethod
+    def ogden_term_derivatives(self) -> Array:
+        """Derivative (p, k, 2) of `ogden_terms` with respect to each elastic parameter."""
+
+    def numbers(self) -> Array:
+        """c_1, m_1, c_2, ..."""
+        return self.ogden_terms().ravel()
+
+    def number_derivatives(self) -> Array:
+        """Derivative (p, 2 k) of `numbers`."""
+        slopes = self.ogden_term_derivatives()
+        return slopes.reshape(len(slopes), -1)
+
+    @property
+    def shear_modulus(self) -> float:
+        """``sum c_k / 2``, MPa."""
+        return float(self.ogden_terms()[:, 0].sum() / 2.0)
+
+    @property
+    def shear_modulus_gradient(self) -> Array:
+        """Its derivative (p,)."""
+        return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
+
+
 @dataclass(frozen=True)
-class OgdenQLV(Uncoupled):
+class OgdenQLV(OgdenSum):
     """The paper's tissue: symmetric second-order Ogden with one relaxation term.
 
     ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``.
@@ -68,7 +100,7 @@ class OgdenQLV(Uncoupled):
 
 
 @dataclass(frozen=True)
-class Ogden(Uncoupled):
+class Ogden(OgdenSum):
     """Ogden's law: ``W = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3) + U(J)``.
 
     Parameters
@@ -119,7 +151,7 @@ class Ogden(Uncoupled):
 
 
 @dataclass(frozen=True)
-class NeoHookean(Uncoupled):
+class NeoHookean(OgdenSum):
     """The uncoupled neo-Hookean law: ``W = mu/2 (I1 - 3) + U(J)``.
 
     Parameters
@@ -154,7 +186,7 @@ class NeoHookean(Uncoupled):
 
 
 @dataclass(frozen=True)
-class MooneyRivlin(Uncoupled):
+class MooneyRivlin(OgdenSum):
     """The Mooney-Rivlin law: ``W = c1 (I1 - 3) + c2 (I2 - 3) + U(J)``.
 
     Parameters

@@ -1,9 +1,9 @@
 """What the solver asks of a material, and what the laws of this room share.
 
-Every law here is *uncoupled*: ``W = W_dev(lt_1, lt_2, lt_3) + U(J)`` with ``lt_i = J^(-1/3) lambda_i``, a
-deviatoric part that is a sum of Ogden terms,
-``W_dev = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``, and a relaxation function
-``G(t) = 1 + sum_l g_l exp(-t/tau_l)`` on the deviatoric stress (FEBio's "uncoupled viscoelastic", g0 = 1).
+Every law here is *uncoupled*: ``W = W_dev(lt_1, lt_2, lt_3) + U(J)`` with ``lt_i = J^(-1/3) lambda_i``, and a
+relaxation function ``G(t) = 1 + sum_l g_l exp(-t/tau_l)`` on the deviatoric stress (FEBio's "uncoupled
+viscoelastic", g0 = 1).  The deviatoric part is an `ElasticLaw` with numbers of its own, for most a sum of
+Ogden terms, ``W_dev = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
+from .elastic import ElasticLaw
+from .ogden import OGDEN
 from .volumetric import VOLUMETRIC_LAWS
 
 Array = NDArray[np.float64]
@@ -28,14 +30,36 @@ PronyTerms = Sequence[tuple[float, float]]
 class LawTable:
     """What the kernels know of a material, or a derivative of it.
 
-    ``terms (k, 2)``: Ogden moduli c_k (MPa) and exponents m_k; ``kappa``: bulk modulus (MPa);
+    ``numbers (k,)``: what the ``elastic`` law is given; ``kappa``: bulk modulus (MPa);
     ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law.
     """
 
-    terms: Array
+    numbers: Array
     kappa: float
     prony: Array
     volumetric: int = 0
+    elastic: ElasticLaw = OGDEN
+
+    @property
+    def has_terms(self) -> bool:
+        """Whether the law is a sum of Ogden terms."""
+        return self.elastic is OGDEN
+
+    @property
+    def terms(self) -> Array:
+        """Ogden moduli c_k (MPa) and exponents m_k (k, 2).
+
+        Raises
+        ------
+        ProblemError
+            Where the law is none of Ogden terms.
+        """
+        if not self.has_terms:
+            raise ProblemError(
+                "the tissue's law is no sum of Ogden terms, and other programs know none else",
+                remedy="use one of Ogden terms there",
+            )
+        return self.numbers.reshape(-1, 2)
 
 
 class Material(Protocol):
@@ -68,12 +92,14 @@ class Material(Protocol):
 
 
 class Uncoupled(ABC):
-    """The tables of a law that says which Ogden terms it is made of.
+    """The tables of a law that says which numbers its `ElasticLaw` has, and its shear modulus.
 
     ``kappa_ratio`` is the bulk modulus over the long-term shear modulus of small strains: a law given by its
     bulk modulus ``k`` has ``kappa_ratio = k / shear_modulus``.  The bulk modulus moves with the shear
     modulus, so that an identified material keeps its compressibility.
     """
+
+    elastic: ClassVar[ElasticLaw] = OGDEN
 
     @property
     @abstractmethod
@@ -96,22 +122,27 @@ class Uncoupled(ABC):
         """The parameters before those of relaxation."""
 
     @abstractmethod
-    def ogden_terms(self) -> Array:
-        """Moduli c_k (MPa) and exponents m_k (k, 2)."""
+    def numbers(self) -> Array:
+        """What `elastic` is given (k,), moduli in MPa."""
 
     @abstractmethod
-    def ogden_term_derivatives(self) -> Array:
-        """Derivative (p, k, 2) of `ogden_terms` with respect to each elastic parameter."""
+    def number_derivatives(self) -> Array:
+        """Derivative (p, k) of `numbers` with respect to each elastic parameter."""
+
+    @property
+    @abstractmethod
+    def shear_modulus(self) -> float:
+        """Long-term shear modulus of small strains, MPa."""
+
+    @property
+    @abstractmethod
+    def shear_modulus_gradient(self) -> Array:
+        """Its derivative (p,) with respect to each elastic parameter."""
 
     @property
     def parameters(self) -> tuple[float, ...]:
         """Elastic parameters, then g_1, tau_1, g_2, ..."""
         return *self.elastic_parameters, *(value for term in self.prony for value in term)
-
-    @property
-    def shear_modulus(self) -> float:
-        """Long-term shear modulus of small strains, ``sum c_k / 2``, MPa."""
-        return float(self.ogden_terms()[:, 0].sum() / 2.0)
 
     @property
     def instantaneous_modulus(self) -> float:
@@ -121,31 +152,27 @@ class Uncoupled(ABC):
     @property
     def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
         """Derivative of `instantaneous_modulus` with respect to each parameter."""
-        elastic = [float(d) * self._relaxation for d in self._shear_modulus_gradient]
+        elastic = [float(d) * self._relaxation for d in self.shear_modulus_gradient]
         return *elastic, *[self.shear_modulus, 0.0] * len(self.prony)
 
     @property
     def _relaxation(self) -> float:
         return 1.0 + sum(g for g, _ in self.prony)
 
-    @property
-    def _shear_modulus_gradient(self) -> Array:
-        return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
-
     def table(self) -> LawTable:
         """The material as the kernels read it."""
         prony = np.array(self.prony, dtype=float).reshape(-1, 2)
-        law = VOLUMETRIC_LAWS[self.volumetric]
-        return LawTable(self.ogden_terms(), self.kappa_ratio * self.shear_modulus, prony, law)
+        law, kappa = VOLUMETRIC_LAWS[self.volumetric], self.kappa_ratio * self.shear_modulus
+        return LawTable(self.numbers(), kappa, prony, law, self.elastic)
 
     def derivatives(self) -> tuple[LawTable, ...]:
         """Derivative of the table with respect to each parameter."""
-        still, slopes = np.zeros((len(self.prony), 2)), self._shear_modulus_gradient
+        still, slopes = np.zeros((len(self.prony), 2)), self.shear_modulus_gradient
         elastic = [
-            LawTable(terms, float(self.kappa_ratio * slope), still)
-            for terms, slope in zip(self.ogden_term_derivatives(), slopes)
+            LawTable(numbers, float(self.kappa_ratio * slope), still)
+            for numbers, slope in zip(self.number_derivatives(), slopes, strict=True)
         ]
-        rest, units = np.zeros_like(self.ogden_terms()), np.eye(2 * len(self.prony))
+        rest, units = np.zeros_like(self.numbers()), np.eye(2 * len(self.prony))
         return *elastic, *(LawTable(rest, 0.0, unit.reshape(-1, 2)) for unit in units)
 
     def _check_shared(self) -> None:

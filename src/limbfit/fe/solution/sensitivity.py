@@ -15,17 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..history import Memory
-from ..kernel.kinematics import (
-    deformation_gradient,
-    from_principal,
-    logarithmic_stretches,
-    mean_dilatation,
-    principal,
-)
 from ..kernel.laws import Laws
+from ..kernel.response import elastic_response, elastic_stress, moduli, pressures, stress_rates
+from ..lanes import LANES, workspace
 from ..materials import prony_factors
-from ..materials.ogden import ogden, ogden_derivative
-from ..materials.volumetric import volumetric
 from ..system import Evaluation, Increment, System
 from .direction import solve_at
 from .factor import Factor
@@ -75,12 +68,12 @@ class MemoryDerivative:
         self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
     ) -> Explicit:
         """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
-        bends = laws.d_terms.any(axis=(2, 3))  # parameters of the elastic law
-        derivatives = laws.d_terms, bends, laws.d_kappa, laws.parameter_index
+        bends = laws.d_numbers.any(axis=2)  # parameters of the elastic law
+        derivatives = laws.d_numbers, bends, laws.d_kappa / laws.kappa[:, None], laws.parameter_index
         coefficients = _step_coefficients(laws, dt, memory.duration)
         past = memory.elastic if memory.before is None else memory.before
         elastic, stress = np.zeros_like(self.elastic), np.empty_like(memory.elastic)
-        moduli = np.empty((*stress.shape, 9))
+        slopes = np.empty((*stress.shape, 9))
         d_past = self.elastic if self.before is None else self.before
         d_elastic, d_past, d_prony = (
             a.reshape(*a.shape[:-2], -1) for a in (self.elastic, d_past, self.prony)
@@ -88,16 +81,19 @@ class MemoryDerivative:
 
         def part(cells: slice) -> Array:
             forces = np.zeros((*u.shape, laws.count))
+            points, law, numbers, _, _, element, _, rates = workspace(
+                0, stress.shape[1], laws.numbers.shape[1]
+            )
             explicit_derivatives(
-                system.cells[cells], system.gradients[cells], system.weights[cells],
-                system.element.mean_dilatation, system.regions[cells], laws.tables, derivatives,
+                system.elements(cells), system.element.mean_dilatation, laws.tables, derivatives,
                 increment.scale, coefficients, memory.elastic[cells], past[cells], memory.prony[:, cells],
                 d_elastic[cells], d_past[cells], d_prony[:, cells], u,
-                forces, elastic[cells], stress[cells], moduli[cells],
+                forces, elastic[cells], stress[cells], slopes[cells],
+                (points, law, numbers, element, rates),
             )  # fmt: skip
             return forces
 
-        return Explicit(np.asarray(sum(system.over_cells(part))), elastic, stress, moduli)
+        return Explicit(np.asarray(sum(system.over_cells(part))), elastic, stress, slopes)
 
     def advanced(
         self, system: System, laws: Laws, before: Memory, step: Explicit, du: Array, dt: float
@@ -160,51 +156,27 @@ _KERNEL: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy",
 _SHEAR = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # place of each entry of a symmetric tensor in its six numbers
 
 
-@njit(cache=True, fastmath={"contract"})
-def elastic_moduli(beta, slope, quotient, c2, N, F, scratch, out):  # type: ignore[no-untyped-def]
-    """Derivative (6, 9) of the elastic stress Se with respect to ``F``, column by column.
-
-    ``dSe/dC`` is that of principal stresses ``beta_i/c2_i`` with axes ``N``; ``scratch (3, 6, 6)``.
-    """
-    v, w, C = scratch[0], scratch[1], scratch[2]
-    total = (slope[0] + slope[1] + slope[2]) / 9.0
-    for t in range(6):
-        x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
-        for i in range(3):
-            j, h = (i + 1) % 3, (i + 2) % 3
-            v[i, t] = N[x, i] * N[y, i] / c2[i]
-            v[3 + i, t] = N[x, j] * N[y, h] + N[x, h] * N[y, j]
-    for i in range(3):
-        j, h = (i + 1) % 3, (i + 2) % 3
-        x = 0.5 * ((c2[j] + c2[h]) * quotient[i] - beta[j] - beta[h]) / (c2[j] * c2[h])
-        y = slope[i] - 2.0 * beta[i]
-        for t in range(6):
-            rest = (total - slope[i] / 3.0) * (v[0, t] + v[1, t] + v[2, t])
-            rest -= (slope[0] * v[0, t] + slope[1] * v[1, t] + slope[2] * v[2, t]) / 3.0
-            w[i, t] = y * v[i, t] + rest
-            w[3 + i, t] = x * v[3 + i, t]
-    for s in range(6):
-        for t in range(s + 1):
-            C[s, t] = v[0, s] * w[0, t] + v[1, s] * w[1, t] + v[2, s] * w[2, t]
-            C[s, t] += v[3, s] * w[3, t] + v[4, s] * w[4, t] + v[5, s] * w[5, t]
-            C[t, s] = C[s, t]
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _by_gradient(p, l, out):  # type: ignore[no-untyped-def]
+    """Derivative (6, 9) of Se with respect to ``F``, column by column, in a lane of a POINT with moduli."""
     for t in range(6):
         for j in range(3):
-            x, y, z = C[t, _SHEAR[j][0]], C[t, _SHEAR[j][1]], C[t, _SHEAR[j][2]]
+            x, y, z = p.D[t, _SHEAR[j][0], l], p.D[t, _SHEAR[j][1], l], p.D[t, _SHEAR[j][2], l]
             for i in range(3):
-                out[t, 3 * j + i] = x * F[i, 0] + y * F[i, 1] + z * F[i, 2]
+                out[t, 3 * j + i] = x * p.F[i, 0, l] + y * p.F[i, 1, l] + z * p.F[i, 2, l]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _add_forces(S, F, grad, weight, FS, fe):  # type: ignore[no-untyped-def]
-    """Add the weighted nodal forces of stresses ``S (6, p)`` at a point to ``fe (k, row)``; FS is scratch."""
+def _add_forces(S, p, l, grad, weight, FS, fe):  # type: ignore[no-untyped-def]
+    """Add the weighted nodal forces of stresses ``S (6, P)`` in a lane of a POINT to ``fe (k, row)``; FS is
+    scratch."""
     P, row = S.shape[1], fe.shape[1]
     for i in range(3):
-        x, y, z = weight * F[i, 0], weight * F[i, 1], weight * F[i, 2]
-        for p in range(P):
-            FS[0, i * P + p] = x * S[0, p] + y * S[3, p] + z * S[5, p]
-            FS[1, i * P + p] = x * S[3, p] + y * S[1, p] + z * S[4, p]
-            FS[2, i * P + p] = x * S[5, p] + y * S[4, p] + z * S[2, p]
+        x, y, z = weight * p.F[i, 0, l], weight * p.F[i, 1, l], weight * p.F[i, 2, l]
+        for c in range(P):
+            FS[0, i * P + c] = x * S[0, c] + y * S[3, c] + z * S[5, c]
+            FS[1, i * P + c] = x * S[3, c] + y * S[1, c] + z * S[4, c]
+            FS[2, i * P + c] = x * S[5, c] + y * S[4, c] + z * S[2, c]
     for a in range(fe.shape[0]):
         x, y, z = grad[0, a], grad[1, a], grad[2, a]
         for c in range(row):
@@ -213,78 +185,72 @@ def _add_forces(S, F, grad, weight, FS, fe):  # type: ignore[no-untyped-def]
 
 @njit(**_KERNEL)
 def explicit_derivatives(  # type: ignore[no-untyped-def]
-    cells, grads, weights, mean, regions, tables, d_tables, scale, coefficients, Se, past, H, dSe, d_past, dH,
-    u, forces, elastic, stress, moduli
+    elements, mean, tables, d_tables, scale, coefficients, Se, past, H, dSe, d_past, dH, u,
+    forces, elastic, stress, slopes, records
 ):  # fmt: skip
     """The kernel of `MemoryDerivative.explicit`; adds to ``forces`` and to ``elastic``.
 
     The forces are those of ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``; ``past`` is Se one step
-    earlier, ``d_past`` its derivative.  Rows of the work arrays hold
-    three components of all parameters and are padded to whole vectors.
+    earlier, ``d_past`` its derivative.  The elastic law is asked for `LANES` elements at once.  Rows of the
+    work arrays hold three components of all parameters and are padded to whole vectors.
     """
-    terms, _, law = tables
-    d_terms, bends, d_kappa, index = d_tables
+    cells, grads, weights, regions = elements
+    points, law, numbers, element, rates = records
+    d_numbers, bends, d_kappa, index = d_tables
     on_prony, on_elastic, on_before, d_on_prony, d_scale, d_back = coefficients
     m, k = cells.shape
-    P = forces.shape[2]
+    n, P = len(numbers), forces.shape[2]
     row = 16 * ((3 * P + 15) // 16)
-    ue, matrix, vector, scratch = np.empty((3, k)), np.empty((3, 3, 3)), np.empty((6, 3)), np.empty((3, 6, 6))
-    F, A, N = matrix[0], matrix[1], matrix[2]
-    c2, e, beta, slope, quotient, value = vector[0], vector[1], vector[2], vector[3], vector[4], vector[5]
     S, part, inverse = np.empty((6, P)), np.empty(6), np.empty(6)
     flat = S.reshape(6 * P)
     fe, FS = np.empty((k, row)), np.zeros((3, row))
-    for el in range(m):
-        for a in range(k):
-            for i in range(3):
-                ue[i, a] = u[cells[el, a], i]
-        region = regions[el]
-        fe[:] = 0.0
-        ratio = mean_dilatation(grads[el], weights[el], ue, F) if mean else 1.0
-        for q in range(grads.shape[1]):
-            J = deformation_gradient(grads[el, q], ue, F)
-            if not mean:
-                ratio = J
-            principal(F, A, c2, N)
-            logarithmic_stretches(c2, e)
-            ogden(terms[region], c2, e, beta, slope, quotient)
-            elastic_moduli(beta, slope, quotient, c2, N, F, scratch, moduli[el, q])
-            for i in range(3):
-                value[i] = 1.0 / c2[i]
-                beta[i] /= c2[i]
-            from_principal(value, N, inverse)
-            from_principal(beta, N, stress[el, q])
-            for c in range(6 * P):
-                flat[c] = on_elastic[region] * dSe[el, q, c] + on_before[region] * d_past[el, q, c]
-            for l in range(H.shape[0]):
-                for c in range(6 * P):
-                    flat[c] += on_prony[region, l] * dH[l, el, q, c]
-            for j in range(index.shape[1]):
-                p = index[region, j]
-                if p < 0:
-                    continue
-                part[:] = 0.0
-                if bends[region, j]:
-                    ogden_derivative(terms[region], d_terms[region, j], e, value)
-                    for i in range(3):
-                        value[i] /= c2[i]
-                    from_principal(value, N, part)
-                d_JU = 0.0
-                if d_kappa[region, j] != 0.0:
-                    d_JU = volumetric(law[region], d_kappa[region, j], ratio)[1] * J / ratio
+    for start in range(0, m, LANES):
+        elastic_response(elements, start, tables, u, points, law[0], numbers)
+        pressures(weights, regions, tables, mean, start, points, element[0])
+        for q in range(len(points)):
+            elastic_stress(points[q])
+            stress_rates(points[q], law[0], numbers, rates[q * n : (q + 1) * n])
+            moduli(points[q], element[0])
+        for el in range(start, min(start + LANES, m)):
+            l, region = el - start, regions[el]
+            fe[:] = 0.0
+            for q in range(len(points)):
+                at = points[q]
+                _by_gradient(at, l, slopes[el, q])
                 for t in range(6):
-                    total = scale[region] * part[t] + d_JU * inverse[t]
-                    total += d_scale[region, j] * (stress[el, q, t] - Se[el, q, t])
-                    total += d_back[region, j] * (Se[el, q, t] - past[el, q, t])
-                    for l in range(H.shape[0]):
-                        total += d_on_prony[region, j, l] * H[l, el, q, t]
-                    elastic[el, q, t, p] += part[t]
-                    S[t, p] += total
-            _add_forces(S, F, grads[el, q], weights[el, q], FS, fe)
-        for a in range(k):
-            for i in range(3):
-                for p in range(P):
-                    forces[cells[el, a], i, p] += fe[a, i * P + p]
+                    x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
+                    stress[el, q, t] = at.tau[t, l]
+                    inverse[t] = 0.0
+                    for i in range(3):
+                        inverse[t] += at.inverse[i, x, l] * at.inverse[i, y, l]
+                for c in range(6 * P):
+                    flat[c] = on_elastic[region] * dSe[el, q, c] + on_before[region] * d_past[el, q, c]
+                for h in range(H.shape[0]):
+                    for c in range(6 * P):
+                        flat[c] += on_prony[region, h] * dH[h, el, q, c]
+                for j in range(index.shape[1]):
+                    p = index[region, j]
+                    if p < 0:
+                        continue
+                    part[:] = 0.0
+                    if bends[region, j]:
+                        for i in range(n):
+                            for t in range(6):
+                                part[t] += d_numbers[region, j, i] * rates[q * n + i].S[t, l]
+                    d_JU = d_kappa[region, j] * at.pressure[l]
+                    for t in range(6):
+                        total = scale[region] * part[t] + d_JU * inverse[t]
+                        total += d_scale[region, j] * (stress[el, q, t] - Se[el, q, t])
+                        total += d_back[region, j] * (Se[el, q, t] - past[el, q, t])
+                        for h in range(H.shape[0]):
+                            total += d_on_prony[region, j, h] * H[h, el, q, t]
+                        elastic[el, q, t, p] += part[t]
+                        S[t, p] += total
+                _add_forces(S, at, l, grads[el, q], weights[el, q], FS, fe)
+            for a in range(k):
+                for i in range(3):
+                    for p in range(P):
+                        forces[cells[el, a], i, p] += fe[a, i * P + p]
 
 
 @njit(**_KERNEL)

@@ -32,7 +32,6 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import error_percent
 from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
-from ...indentation import to_vector
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..shared.store import write_json
@@ -99,7 +98,7 @@ class _Bench:
         self.context, self.laboratory = context, laboratory
         study = context.study
         stored = context.stored("calibrate", "calibration.json")
-        self.best = to_vector(stored["stages"][-1]["parameters"], study.tissues)
+        self.best = study.vector(stored["stages"][-1]["parameters"])
         self.bounds = unknowns(study).from_start(self.best)
         self.measured = laboratory.measured
         covariance = np.array(stored["uncertainty"]["covariance_log"])

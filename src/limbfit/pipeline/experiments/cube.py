@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from ... import report
 from ...bench.blocks import HEX, boxes
 from ...errors import InputError, RunError
-from ...fe import History, Material, OgdenQLV, Problem, StepControl, Support, System, iterate
+from ...fe import History, Material, Problem, StepControl, Support, System, iterate
 from ...fe.kernel.laws import Laws
 from ...fe.observables import element_fields
-from ...indentation import KPA, materials
+from ...indentation import materials
+from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
 from ..shared.context import Context
 from ..shared.store import read_json, write_json
@@ -46,6 +47,7 @@ def compress_cube(
     *,
     parameters: dict[str, dict[str, float]] | None = None,
     kappa_ratio: float = 100.0,
+    law: str = OGDEN,
     compression_percent: float = COMPRESSION_PERCENT,
 ) -> dict[str, Any]:
     """Compress a cube of each given tissue, of the paper's and of the published ones.
@@ -53,9 +55,10 @@ def compress_cube(
     Parameters
     ----------
     output : folder for ``cube.json``, ``cube.csv`` and ``cube.svg``; None: nothing is written.
-    parameters : ``{tissue: {c_kPa, m, gamma, tau_s}}``, outermost first; the last one stands beside published
+    parameters : ``{tissue: {name: value}}``, outermost first; the last one stands beside published
         muscle, all others beside published skin. None: published tissues only.
-    kappa_ratio : bulk modulus over ``c`` of the given tissues.
+    kappa_ratio : bulk modulus over the shear modulus of the given tissues.
+    law : name of their law.
     compression_percent : of the side of the cube.
 
     Returns
@@ -78,7 +81,7 @@ def compress_cube(
         )
     times = _times()
     rows, stresses = [], {}
-    for specimen in _specimens(parameters or {}, kappa_ratio):
+    for specimen in _specimens(parameters or {}, kappa_ratio, law):
         stress, least, most = compress(specimen.material, times, compression_percent)
         stresses[specimen.name] = stress
         rows.append(specimen.row | _summary(times, stress) | {"J_min": least, "J_max": most})
@@ -105,47 +108,47 @@ def run_cube(context: Context, folder: Path, *, compression_percent: float) -> d
         folder,
         parameters=stages[-1]["parameters"],
         kappa_ratio=context.study.material.kappa_ratio,
+        law=context.study.material.law,
         compression_percent=compression_percent,
     )
     return {}
 
 
-def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float) -> list[Specimen]:
-    own = materials(parameters, kappa_ratio)
+def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law: str) -> list[Specimen]:
+    own = materials(parameters, kappa_ratio, law)
     found = []
     for i, (tissue, values) in enumerate(parameters.items()):
-        words = ", ".join(f"{key} = {values[key]:.4g}{unit}" for key, unit in _UNITS.items())
+        words = ", ".join(f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)
         kind = "muscle" if i == len(parameters) - 1 else "skin"
         row = {"values": words, "conversion": "none", "source": "this study"}
-        found.append(_specimen(f"{tissue} (this study)", kind, own[tissue], row))
+        found.append(_specimen(f"{tissue} (this study)", kind, own[tissue], LAWS[law].words, row))
     relaxation = {"skin": (3.57, 0.32), "muscle": (3.47, 0.34)}  # the paper's, where no study gives its own
     if parameters:
-        first, last = (list(parameters.values())[i] for i in (0, -1))
-        relaxation = {"skin": _relaxation(first), "muscle": _relaxation(last)}
+        first, last = (tuple(list(own.values())[i].table().prony[0]) for i in (0, -1))
+        relaxation = {"skin": first, "muscle": last}
     for known in PUBLISHED:
         row = {"values": known.values, "conversion": known.conversion, "source": known.source}
-        found.append(_specimen(known.name, known.kind, known.material(relaxation[known.kind]), row))
+        found.append(
+            _specimen(
+                known.name, known.kind, known.material(relaxation[known.kind]), "sum of Ogden terms", row
+            )
+        )
     return found
 
 
-_UNITS = {"c_kPa": " kPa", "m": "", "gamma": "", "tau_s": " s"}
-
-
-def _relaxation(values: dict[str, float]) -> tuple[float, float]:
-    return values["gamma"], values["tau_s"]
-
-
-def _specimen(name: str, kind: str, material: Material, row: dict[str, Any]) -> Specimen:
+def _specimen(name: str, kind: str, material: Material, law: str, row: dict[str, Any]) -> Specimen:
     table = material.table()
+    relaxation = 1.0 + float(table.prony[:, 0].sum())
+    terms = table.terms.tolist() if table.has_terms else []
     facts = {
         "tissue": name,
         "kind": kind,
-        "shear_modulus_kPa": float(table.terms[:, 0].sum() / 2.0 / KPA),
+        "shear_modulus_kPa": material.instantaneous_modulus / relaxation / KPA,
         "instantaneous_modulus_kPa": material.instantaneous_modulus / KPA,
         "bulk_modulus_kPa": table.kappa / KPA,
         "prony": table.prony.tolist(),
-        "law": "second-order Ogden" if isinstance(material, OgdenQLV) else "sum of Ogden terms",
-        "terms": [[c / KPA, m] for c, m in table.terms.tolist()],
+        "law": law,
+        "terms": [[c / KPA, m] for c, m in terms],
     }
     return Specimen(name, kind, material, facts | row)
 

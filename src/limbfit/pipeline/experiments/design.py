@@ -16,7 +16,7 @@ from ...errors import InputError, RunError, StudyError
 from ...identify.checks.design import Candidate, Design, NoiseModel, candidate, choose, efficiency, evaluate
 from ...identify.checks.design import prior_information as bounds_information
 from ...identify.fit.objective import SiteResponse
-from ...indentation import Parameters, SimulationJob, SiteModel, to_vector
+from ...indentation import Parameters, SimulationJob, SiteModel
 from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
@@ -43,7 +43,7 @@ def run_design(
     study = context.study
     if not 0 < sites <= len(study.sites):
         raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
-    vector = to_vector(parameters, study.tissues)
+    vector = study.vector(parameters)
     models, left_out = _candidate_models(context, depths_mm)
     cache = experiment_cache(context, folder)
     jobs = [_job(model, study.tissues, vector) for model in models]

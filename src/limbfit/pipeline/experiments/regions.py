@@ -14,7 +14,6 @@ from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.regions import Region, RegionFit, fit_regions, mean_percent
 from ...identify.fit.state import Calibration
-from ...indentation import flat_names, to_parameters, to_vector
 from ...study import Site
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache, experiment_cache
@@ -36,7 +35,7 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     study = context.study
     members = _members(context, sites)
     stages = context.stored("calibrate", "calibration.json")["stages"]
-    whole = to_vector(stages[-1]["parameters"], study.tissues)
+    whole = study.vector(stages[-1]["parameters"])
     cache = experiment_cache(context, folder)
     benches = {name: Laboratory(context, cache, fitted, "regions") for name, (fitted, _) in members.items()}
     made = {name: _region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
@@ -126,13 +125,13 @@ def _row(
     fitted, mine = chosen
     known = laboratory.uncertainty(found, groupings(study)[-1], folder / "coarser")
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
-    for (tissue, key), limits in zip(flat_names(study.tissues), known.intervals_95.tolist(), strict=True):
+    for (tissue, key), limits in zip(study.parameters, known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits
     return {
         "region": name,
         "sites": [site.name for site in mine],
         "fitted_sites": [site.name for site in fitted],
-        "parameters": to_parameters(found.parameters, study.tissues),
+        "parameters": study.by_tissue(found.parameters),
         "intervals_95": intervals,
         "verdict": dict(zip(known.names, known.verdicts, strict=True)),
         "evaluations": found.evaluations,

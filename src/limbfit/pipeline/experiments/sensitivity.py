@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...indentation import Parameters, flat_names, to_vector
+from ...indentation import Parameters
 from ...study import IndenterTable
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
@@ -38,15 +38,17 @@ KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
 
 
 def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
-    """Force against ``c`` of each tissue, all tissues with the same ``m`` (the geometric mean of theirs).
+    """Force against the moduli of each tissue, all with the same ``m`` (the geometric mean of theirs).
 
     Beside it the exact derivatives at all recorded sites, with the identified ``m``.
     """
-    identified = identified_parameters(context)
-    m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
-    equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
+    identified, law = identified_parameters(context), context.study.law
+    m, equal = None, identified
+    if "m" in law.keys:
+        m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
+        equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
     chosen = choose_sites(context, sites)
-    variants = [variant for one in chosen for variant in _stiffer(one, equal)]
+    variants = [variant for one in chosen for variant in _stiffer(one, equal, law.moduli)]
     content = _run(context, folder, "sensitivity-c", chosen, variants)
     content |= {"parameters": identified, "equal_m": m, "factors": list(FACTORS)}
     content["local"] = _derivatives(context, folder, identified)
@@ -60,13 +62,13 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> di
     return {}
 
 
-def _stiffer(chosen: ChosenSite, equal: Parameters) -> list[Variant]:
+def _stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
     base = Variant(chosen, chosen.model, equal, "as identified", {"tissue": None, "factor": 1.0}, base=True)
     changed = [
         Variant(
             chosen,
             chosen.model,
-            equal | {tissue: values | {"c_kPa": factor * values["c_kPa"]}},
+            equal | {tissue: values | {key: factor * values[key] for key in moduli}},
             f"{tissue} c x {factor:g}",
             {"tissue": tissue, "factor": factor},
         )
@@ -77,13 +79,13 @@ def _stiffer(chosen: ChosenSite, equal: Parameters) -> list[Variant]:
 
 
 def _derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
-    """At every recorded site: change of the largest force in percent for one percent more ``c`` of a tissue.
+    """At every recorded site: change of the largest force in percent for one percent more of a modulus.
 
-    They are of where parameters are searched, as those of the prediction.
+    It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
     own = [site_record(context, site) for site in study.sites if site.trace is not None]
-    records, best = as_searched(context, own), to_vector(identified, study.tissues)
+    records, best = as_searched(context, own), study.vector(identified)
     cache = experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []
     for record, found in zip(
@@ -101,8 +103,8 @@ def _derivatives(context: Context, folder: Path, identified: Parameters) -> list
                 "completed": found.completed,
                 "peak_percent_per_percent": {
                     tissue: float(value) if found.completed else None
-                    for (tissue, name), value in zip(flat_names(study.tissues), relative, strict=True)
-                    if name == "c_kPa"
+                    for (tissue, name), value in zip(study.parameters, relative, strict=True)
+                    if name == study.law.moduli[0]
                 },
             }
         )

@@ -18,7 +18,6 @@ from ...identify.uncertainty.evidence import Evidence, candidate, compare
 from ...identify.uncertainty.explore import Explored, ExploreSettings, explore
 from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.sources import Gain
-from ...indentation import to_vector
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
@@ -73,7 +72,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     """Posterior, profiles, evidence, further sources and prediction intervals (see docs/uncertainty.md)."""
     study = context.study
     calibration = context.stored("calibrate", "calibration.json")
-    best = to_vector(calibration["stages"][-1]["parameters"], study.tissues)
+    best = study.vector(calibration["stages"][-1]["parameters"])
     earlier = _earlier_points(context, calibration)
     sites = FittedSites(context, folder, best, earlier)
     known = linearised(study, sites.records, best, sites.at_best)
@@ -105,11 +104,11 @@ def _earlier_points(
     context: Context, calibration: dict[str, Any]
 ) -> dict[tuple[float, ...], Sequence[Array]]:
     """Parameters of the calibration's iterates that came near the records, and where it started them from."""
-    tissues = context.study.tissues
+    study = context.study
     iterates = [iterate for stage in calibration["stages"] for iterate in stage["iterations"]]
     least = min(iterate["error_percent"] for iterate in iterates)
     return {
-        tuple(to_vector(one["parameters"], tissues).tolist()): [to_vector(s, tissues) for s in one["starts"]]
+        tuple(study.vector(one["parameters"]).tolist()): [study.vector(s) for s in one["starts"]]
         for one in iterates
         if one["error_percent"] <= _NEAR * least + 3.0
     }
@@ -122,7 +121,7 @@ def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evi
     single = Likelihood(explored.emulator, likelihood.measured, model, unknowns(study), space)
     titles = stage_titles(study.tissues)
     calibration = context.stored("calibrate", "calibration.json")
-    start = to_vector(calibration["stages"][0]["parameters"], study.tissues)
+    start = study.vector(calibration["stages"][0]["parameters"])
     one, _ = candidate(titles[0], single, space.reduce(np.log(start)))
     several, _ = candidate(titles[1], likelihood, explored.best.z)
     rows = [row for row in context.stored("predict", "predict.json")["sites"] if not row["fitted"]]
@@ -136,7 +135,7 @@ def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
     study = context.study
     records = [site_record(context, site) for site in study.sites if site.trace is not None]
     searched = as_searched(context, records)
-    answer = Answer.of(context.stored("calibrate", "calibration.json")["stages"][-1], study.tissues)
+    answer = Answer.of(context.stored("calibrate", "calibration.json")["stages"][-1], study)
     jobs = answer_jobs(records, searched, answer)
     ends = [as_response(end) for end in sites.cache.run(jobs, context.executor)]
     n = len(records)

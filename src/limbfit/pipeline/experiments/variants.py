@@ -55,7 +55,7 @@ class Variant:
 
     def job(self) -> SimulationJob:
         tissues = tuple(self.parameters)
-        values = tuple(map(float, to_vector(self.parameters, tissues)))
+        values = tuple(map(float, to_vector(self.parameters, tissues, self.model.law)))
         return SimulationJob(self.model, tissues, values, tuple(map(float, self.times)), False)
 
     @property

@@ -33,7 +33,7 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
     share of the volume whose J is more than 1 % from one.
     """
     model = job.model
-    parameters = to_parameters(np.array(job.parameters), job.tissues)
+    parameters = to_parameters(job.parameters, job.tissues, job.model.law)
     problem = build_problem(model, read_vtu(model.mesh), parameters)
     result = solve(problem, steps=steps_of(model), store="peak")
     return Simulation(

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from ...extensions import extensions_digest
 from ...study import Study
 from .provenance import input_files
 from .sources import code_digest
@@ -38,6 +39,11 @@ class Keys:
         # A record that is yet to be made has none.
         return {path: file_digest(place) if place.exists() else "" for path, place in places.items()}
 
+    @cached_property
+    def extensions(self) -> str:
+        """Of the study's own Python files, which may change what any stage does."""
+        return extensions_digest(self.study.extensions)
+
     def of(
         self,
         stages: Iterable[Stage],
@@ -65,6 +71,7 @@ class Keys:
                 [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
                 None if read is None else {str(path): self.digests[path] for path in read},
                 code_digest(stage.run),
+                *([self.extensions] if self.extensions else []),
                 [found.get(below) or known.get(below) for below in stage.needs],
                 *extra,
             )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...execution import Executor
+from ...extensions import extensions_digest
 from ...fe import Doubt
 from ...indentation import Simulation, SimulationJob, SiteModel, simulate
 from ...study import Site, Study
@@ -116,7 +117,7 @@ def _load(file: Path) -> Simulation:
 
 def job_digest(job: SimulationJob) -> str:
     """What decides a simulation, code included, wherever its mesh file happens to lie."""
-    model = {key: value for key, value in vars(job.model).items() if key != "mesh"}
+    model = {key: value for key, value in vars(job.model).items() if key not in ("mesh", "extensions")}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
     return digest(
@@ -159,6 +160,9 @@ def site_model(
         steps=study.solver,
         element=study.mesh.element,
         within_mm=study.within_mm if searched else None,
+        law=study.material.law,
+        extensions=study.extensions,
+        extensions_digest=extensions_digest(study.extensions),
     )
 
 

@@ -14,7 +14,8 @@ from ...identify.fit.multistart import Multistart, describe, multistart
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.state import Calibration
 from ...identify.uncertainty.uncertainty import Uncertainty
-from ...indentation import Parameters, flat_names, to_parameters
+from ...indentation import Parameters
+from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
 from ..shared.store import write_json
@@ -53,8 +54,8 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
     content = _calibration_record(context, found, known, laboratory)
     content |= {
-        "corrections": [_round_record(one, found.sites, study.tissues) for one in rounds],
-        "multistart": _multistart_record(tried, study.tissues) if table.starts > 1 else None,
+        "corrections": [_round_record(one, found.sites, study) for one in rounds],
+        "multistart": _multistart_record(tried, study) if table.starts > 1 else None,
         "warnings": laboratory.warnings,
         "contact": contact_record(laboratory.latest, laboratory.penalties, answers, found.responses),
         "doubts": doubts_record(
@@ -69,19 +70,20 @@ def _calibration_record(
     context: Context, found: Calibration, known: Uncertainty, laboratory: Laboratory
 ) -> dict[str, Any]:
     """What ``calibration.json`` holds."""
-    study, tissues, cache = context.study, context.study.tissues, laboratory.cache
+    study, cache = context.study, laboratory.cache
     bounds = unknowns(study)
     example = cache.example()
     return {
         "stages": [
-            _stage_record(found, i, bounds.start, tissues, laboratory) for i in range(len(found.stages))
+            _stage_record(found, i, bounds.start, study, laboratory) for i in range(len(found.stages))
         ],
         "bounds": {
-            "lower": to_parameters(bounds.lower, tissues),
-            "upper": to_parameters(bounds.upper, tissues),
+            "lower": study.by_tissue(bounds.lower),
+            "upper": study.by_tissue(bounds.upper),
         },
+        "law": study.law.record(),
         "objective": study.calibration.objective,
-        "uncertainty": _uncertainty_record(known, tissues),
+        "uncertainty": _uncertainty_record(known, study),
         "forward_runs": len(cache),
         "forward_runs_with_sensitivities": cache.with_sensitivities(),
         "linear_solver": example.facts["linear_solver"] if example else None,
@@ -90,7 +92,7 @@ def _calibration_record(
 
 
 def _stage_record(
-    found: Calibration, number: int, start: Array, tissues: Sequence[str], laboratory: Laboratory
+    found: Calibration, number: int, start: Array, study: Study, laboratory: Laboratory
 ) -> dict[str, Any]:
     """One stage: from ``start`` (the first) or the end of the stage before to its own end."""
     stage = found.stages[number]
@@ -98,12 +100,12 @@ def _stage_record(
     iterates = [iterate for iterate in found.history if iterate.stage == number]
 
     def starts(parameters: Sequence[float]) -> list[Parameters]:
-        return [to_parameters(one, tissues) for one in laboratory.starts(np.array(parameters))]
+        return [study.by_tissue(one) for one in laboratory.starts(np.array(parameters))]
 
     return {
-        "name": stage_titles(tissues)[number],
-        "start": to_parameters(before, tissues),
-        "parameters": to_parameters(np.array(stage.parameters), tissues),
+        "name": stage_titles(study.tissues)[number],
+        "start": study.by_tissue(before),
+        "parameters": study.by_tissue(np.array(stage.parameters)),
         "cost": stage.cost,
         "evaluations": stage.evaluations,
         "converged": stage.converged,
@@ -111,7 +113,7 @@ def _stage_record(
         "iterations": [
             {
                 "iteration": i,
-                "parameters": to_parameters(np.array(iterate.parameters), tissues),
+                "parameters": study.by_tissue(np.array(iterate.parameters)),
                 "starts": starts(iterate.parameters),
                 "cost": iterate.cost,
                 "error_percent": float(np.mean(iterate.errors_percent)),
@@ -122,11 +124,11 @@ def _stage_record(
     }
 
 
-def _round_record(one: Round, sites: Sequence[str], tissues: Sequence[str]) -> dict[str, Any]:
+def _round_record(one: Round, sites: Sequence[str], study: Study) -> dict[str, Any]:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
     return {
-        "stage": stage_titles(tissues)[one.stage] if one.stage >= 0 else "start",
-        "parameters": to_parameters(np.array(one.parameters), tissues),
+        "stage": stage_titles(study.tissues)[one.stage] if one.stage >= 0 else "start",
+        "parameters": study.by_tissue(np.array(one.parameters)),
         "scale_by_site": dict(zip(sites, one.scales, strict=True)),
         "difference_percent_by_site": dict(zip(sites, one.difference_percent, strict=True)),
         "change_percent_by_site": dict(zip(sites, one.expected_percent, strict=True)),
@@ -134,18 +136,16 @@ def _round_record(one: Round, sites: Sequence[str], tissues: Sequence[str]) -> d
     }
 
 
-def _multistart_record(tried: Multistart, tissues: Sequence[str]) -> dict[str, Any]:
+def _multistart_record(tried: Multistart, study: Study) -> dict[str, Any]:
     """What came of every start."""
-    names = [f"{tissue}.{name}" for tissue, name in flat_names(tissues)]
+    names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     return {
         "summary": describe(tried, names),
         "reached": tried.reached,
         "starts": [
             {
-                "start": to_parameters(np.array(one.start), tissues),
-                "parameters": None
-                if one.parameters is None
-                else to_parameters(np.array(one.parameters), tissues),
+                "start": study.by_tissue(np.array(one.start)),
+                "parameters": None if one.parameters is None else study.by_tissue(np.array(one.parameters)),
                 **{
                     key: getattr(one, key)
                     for key in ("cost", "evaluations", "converged", "reason", "same", "apart")
@@ -156,10 +156,10 @@ def _multistart_record(tried: Multistart, tissues: Sequence[str]) -> dict[str, A
     }
 
 
-def _uncertainty_record(known: Uncertainty, tissues: Sequence[str]) -> dict[str, Any]:
+def _uncertainty_record(known: Uncertainty, study: Study) -> dict[str, Any]:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
-    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in tissues}
-    for (tissue, name), interval in zip(flat_names(tissues), known.intervals_95.tolist(), strict=True):
+    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
+    for (tissue, name), interval in zip(study.parameters, known.intervals_95.tolist(), strict=True):
         intervals[tissue][name] = interval
     return {
         "method": known.method,
@@ -170,6 +170,6 @@ def _uncertainty_record(known: Uncertainty, tissues: Sequence[str]) -> dict[str,
         "verdict": dict(zip(known.names, known.verdicts, strict=True)),
         "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
         "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],
-        "most_probable": to_parameters(known.centre, tissues),
+        "most_probable": study.by_tissue(known.centre),
         "residuals": known.residual_model.to_dict(),
     }

@@ -19,7 +19,7 @@ from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, s
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
 from ...identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
-from ...indentation import Simulation, SimulationJob, flat_names, to_parameters, to_vector
+from ...indentation import Simulation, SimulationJob
 from ...study import Site, Study
 from ...study.meshing import MeshTable
 from ..shared.context import Context
@@ -225,7 +225,7 @@ class Laboratory:
                     strict=True,
                 )
             ),
-            "parameters": to_parameters(np.array(last.parameters), self.context.study.tissues),
+            "parameters": self.context.study.by_tissue(last.parameters),
         }
 
     def _run(
@@ -258,7 +258,7 @@ class Laboratory:
         def tell(state: SearchState) -> None:
             name = titles[state.history[-1].stage]
             facts = {"of": name, **self._facts(state)}
-            words = f"{name}: {_describe(state, study.tissues)}"
+            words = f"{name}: {_describe(state, study)}"
             self.context.tell(self.title, 0, 0, words, fit=True, facts=facts)
 
         if not self.is_apart:
@@ -317,22 +317,20 @@ def groupings(study: Study) -> tuple[Grouping, ...]:
 
 
 def unknowns(study: Study) -> Unknowns:
-    """The four parameters of each tissue with the study's start and bounds."""
-    material, tissues = study.material, study.tissues
+    """The parameters of each tissue with the study's start and bounds."""
 
     def flat(which: Literal["start", "lower", "upper"]) -> Array:
-        return to_vector({tissue: material.of(tissue, which) for tissue in tissues}, tissues)
+        return study.vector({tissue: study.material.of(tissue, which) for tissue in study.tissues})
 
-    names = tuple(f"{tissue}.{name}" for tissue, name in flat_names(tissues))
+    names = tuple(f"{tissue}.{name}" for tissue, name in study.parameters)
     priors = tuple(Prior(name, p.median, p.factor) for name, p in study.calibration.prior.items())
     return Unknowns(names, flat("start"), flat("lower"), flat("upper"), priors)
 
 
-def _describe(state: SearchState, tissues: Sequence[str]) -> str:
+def _describe(state: SearchState, study: Study) -> str:
     last = state.history[-1]
-    values = to_parameters(np.array(last.parameters), tissues)
     words = " | ".join(
-        f"{tissue} c {v['c_kPa']:.3g} kPa, m {v['m']:.3g}, gamma {v['gamma']:.3g}, tau {v['tau_s']:.3g} s"
-        for tissue, v in values.items()
+        f"{tissue} " + ", ".join(f"{p.name} {v[p.key]:.3g} {p.unit}".rstrip() for p in study.law.parameters)
+        for tissue, v in study.by_tissue(last.parameters).items()
     )
     return f"error {np.mean(last.errors_percent):.2f} % | {words}"

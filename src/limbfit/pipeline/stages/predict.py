@@ -18,8 +18,8 @@ from ...indentation import (
     Simulation,
     SimulationJob,
     job_fields,
-    to_vector,
 )
+from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
 from ..shared.store import write_json
@@ -38,7 +38,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
     study = context.study
     calibration = context.stored("calibrate", "calibration.json")
-    answers = [Answer.of(stage, study.tissues) for stage in calibration["stages"]]
+    answers = [Answer.of(stage, study) for stage in calibration["stages"]]
     one, best = answers[0].parameters, answers[-1].parameters
     known = Known.of(calibration["uncertainty"])
     records = [site_record(context, site) for site in study.sites if site.trace is not None]
@@ -82,10 +82,10 @@ class Answer:
     starts: tuple[Array, ...]
 
     @classmethod
-    def of(cls, stage: dict[str, Any], tissues: Sequence[str]) -> Answer:
+    def of(cls, stage: dict[str, Any], study: Study) -> Answer:
         """The answer of a stage as ``calibration.json`` holds it."""
         starts = stage["iterations"][-1]["starts"]
-        return cls(to_vector(stage["parameters"], tissues), tuple(to_vector(one, tissues) for one in starts))
+        return cls(study.vector(stage["parameters"]), tuple(study.vector(one) for one in starts))
 
 
 def answer_jobs(

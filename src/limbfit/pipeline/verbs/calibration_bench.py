@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from ...bench.forward import FEBIO_SECONDS
-from ...indentation import flat_names
 from ...study import Study, load_study
 from ..shared.context import Listener
 from ..shared.simulations import SimulationCache
@@ -69,7 +68,7 @@ def _facts(study: Study) -> dict[str, Any]:
     seconds = {stage: (store.stamp(stage) or {})["seconds"] for stage in ("calibrate", "predict")}
     runs = {stage: SimulationCache(store[stage] / "runs") for stage in seconds}
     names = {file.name for cache in runs.values() for file in cache.folder.glob("*.npz")}
-    parameters, sites = len(flat_names(study.tissues)), len(study.fitted)
+    parameters, sites = len(study.parameters), len(study.fitted)
     febio = FEBIO_SECONDS[FEBIO_CASE] * FEBIO_ITERATIONS * sites * (parameters + 1)
     total = seconds["calibrate"] + seconds["predict"]
     mesh = store.read("mesh", "mesh.json")

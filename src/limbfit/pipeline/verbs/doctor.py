@@ -23,7 +23,7 @@ from ...execution import THREAD_VARIABLES, ProcessExecutor, usable_cores
 from ...fe import OgdenQLV
 from ...fe.solution.linear import SOLVERS, linear_solver
 from ...febio.program import find_febio
-from ...indentation import KPA
+from ...laws import KPA
 from ..experiments.cube import RAMP_S, compress
 from ..shared.provenance import machine, versions
 

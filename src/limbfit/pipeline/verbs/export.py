@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
 from ...febio import Range, differences, in_indenter_frame, write_feb, write_inp, write_optimisation
-from ...indentation import KPA, Parameters
+from ...indentation import Parameters
 from ...study import Site, Study
 from ..shared.context import Listener
 from ..stages.traces import site_record
 from .simulate import Indentation, feb_settings, prepare_site, site_problem
 
 FORMATS = ("feb", "febio-optimize", "inp", "calculix")
-_FE_NAME = {"c_kPa": "c", "m": "m", "gamma": "gamma", "tau_s": "tau"}
 
 
 def export_study(
@@ -118,10 +117,6 @@ def _ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, Range]:
             if not lower[key] <= value <= upper[key]:
                 what = f"{tissue}.{key} = {value:g} lies outside its bounds, {lower[key]:g} to {upper[key]:g}"
                 raise InputError(what, file=study.file, place="material")
-        ends = _solver_units(lower), _solver_units(upper)
-        ranges[tissue] = Range(_solver_units(start), *ends, study.material.kappa_ratio)
+        start, lower, upper = map(study.law.in_solver_units, (start, lower, upper))
+        ranges[tissue] = Range(start, lower, upper, study.material.kappa_ratio)
     return ranges
-
-
-def _solver_units(values: Mapping[str, float]) -> dict[str, float]:
-    return {_FE_NAME[key]: value * (KPA if key == "c_kPa" else 1.0) for key, value in values.items()}

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..formats import fixed, number
+from ..formats import fixed, number, symbol, unit_of
 from ..page import Figure
-from ..store import PARAMETERS, Curves, Json, Results
-from ..tables import SYMBOLS, UNITS, interval
+from ..store import Curves, Json, Results
+from ..tables import interval
 from .ink import (
     FITTED,
     HELD_OUT,
@@ -139,11 +139,12 @@ def convergence_figure(store: Results) -> Figure | None:
     stages = [stage for stage in store.stages if stage.get("iterations")]
     if not stages:
         return None
-    drawing, axes = panels(1 + len(PARAMETERS), 1 + len(PARAMETERS), 2.3)
+    count = 1 + len(store.law.keys)
+    drawing, axes = panels(count, count, 2.3)
     with matplotlib.rc_context(STYLE):
         offset = 0
         for stage in stages:
-            offset += _draw_stage(axes, stage, offset)
+            offset += _draw_stage(axes, store, stage, offset)
         _finish_convergence(axes, store, stages)
         handles = [*axes[0].get_legend_handles_labels()[0], *axes[1].get_legend_handles_labels()[0]]
         rows = math.ceil(len(handles) / MOST_IN_A_ROW)
@@ -160,7 +161,7 @@ def convergence_figure(store: Results) -> Figure | None:
     return Figure("convergence", svg(drawing, "convergence", alt), caption)
 
 
-def _draw_stage(axes: list[Axes], stage: Json, offset: int) -> int:
+def _draw_stage(axes: list[Axes], store: Results, stage: Json, offset: int) -> int:
     """Draw one stage from iteration ``offset`` on; the number of its iterates."""
     steps = stage["iterations"]
     x = offset + np.arange(len(steps))
@@ -170,7 +171,7 @@ def _draw_stage(axes: list[Axes], stage: Json, offset: int) -> int:
         axes[0].plot(x, errors, color=MUTED, lw=0.8)
     mean = [step.get("error_percent", math.nan) for step in steps]
     axes[0].plot(x, mean, color=INK, marker="o", ms=3, label="mean error" if offset == 0 else None)
-    for ax, name in zip(axes[1:], PARAMETERS, strict=True):
+    for ax, name in zip(axes[1:], store.law.keys, strict=True):
         for i, tissue in enumerate(stage["parameters"]):
             values = [step["parameters"].get(tissue, {}).get(name, math.nan) for step in steps]
             ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **tissue_style(i))
@@ -185,9 +186,9 @@ def _finish_convergence(axes: list[Axes], store: Results, stages: list[Json]) ->
     axes[0].set_yscale("log")
     axes[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes[0].yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
-    for ax, name in zip(axes[1:], PARAMETERS, strict=True):
-        unit = UNITS[name]
-        ax.set_title(f"{SYMBOLS[name]} ({unit})" if len(unit) > 1 or unit == "s" else f"{SYMBOLS[name]} (–)")
+    for ax, name in zip(axes[1:], store.law.keys, strict=True):
+        unit = unit_of(name)
+        ax.set_title(f"{symbol(name)} ({unit})" if len(unit) > 1 or unit == "s" else f"{symbol(name)} (–)")
         truth = store.truth.get("parameters", {})
         for i, (tissue, values) in enumerate(truth.items()):
             if name in values:
@@ -228,14 +229,14 @@ def interval_figure(store: Results) -> Figure | None:
     if not store.stages:
         return None
     last = store.stages[-1].get("parameters", {})
-    names = [(t, n) for t in store.tissues for n in PARAMETERS if last.get(t, {}).get(n)]
+    names = [(t, n) for t in store.tissues for n in store.law.keys if last.get(t, {}).get(n)]
     if not names:
         return None
     drawing, (ax,) = panels(1, 1, 0.7 + 0.3 * len(names))
     with matplotlib.rc_context(STYLE):
         for at, (tissue, name) in enumerate(names):
             _draw_ratio(ax, store, at, tissue, name)
-        labels = [f"{t} {SYMBOLS[n]} = {number(last[t][n])} {_unit(n)}".strip() for t, n in names]
+        labels = [f"{t} {symbol(n)} = {number(last[t][n])} {_unit(n)}".strip() for t, n in names]
         ax.set_yticks(range(len(names)), labels)
         ax.invert_yaxis()
         ax.set_xscale("log")
@@ -254,7 +255,7 @@ def interval_figure(store: Results) -> Figure | None:
 
 
 def _unit(name: str) -> str:
-    return UNITS[name] if UNITS[name] != "–" else ""
+    return unit_of(name) if unit_of(name) != "–" else ""
 
 
 def _draw_ratio(ax: Axes, store: Results, at: int, tissue: str, name: str) -> None:

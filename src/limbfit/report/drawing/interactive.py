@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ...mesh import read_vtu
 from ...web.arrays import pack
 from ...web.shapes import interface, read_shell, shell_of, volume_of
+from ..formats import symbol, unit_of
 from ..page import Interactive
-from ..store import PARAMETERS, Curves, Json, Results
-from ..tables import SYMBOLS, UNITS
+from ..store import Curves, Json, Results
 from .pictures import BONE, FITTED, HELD_OUT, SKIN_SURFACE, cut_views, drawable, far_side, limb_frame, linear
 
 MOST_FACES, MOST_SAMPLES = 12_000, 300
@@ -205,12 +205,12 @@ def convergence_curves(store: Results) -> Interactive | None:
     if not steps:
         return None
     panels: list[Json] = [_errors([step for _, step in steps])]
-    for name in PARAMETERS:
+    for name in store.law.keys:
         series = [
             {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for _, step in steps]}
             for tissue in store.tissues
         ]
-        panels.append({"title": SYMBOLS[name], "unit": UNITS[name], "log": False, "series": series})
+        panels.append({"title": symbol(name), "unit": unit_of(name), "log": False, "series": series})
     caption = "The same, to read values from; iterates are counted through all stages."
     return Interactive(
         "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": panels}

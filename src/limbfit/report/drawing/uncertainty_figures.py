@@ -9,10 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
-from ..formats import fixed
+from ..formats import fixed, symbol
 from ..page import Figure
 from ..store import Json, Results
-from ..tables import SYMBOLS
 from .ink import (
     INK,
     MEASURED,
@@ -93,7 +92,7 @@ def _draw_pair(
 def _name_axes(ax: Axes, names: list[str], i: int, j: int) -> None:
     def short(name: str) -> str:
         tissue, _, kind = name.rpartition(".")
-        return f"{tissue} {SYMBOLS.get(kind, kind)}"
+        return f"{tissue} {symbol(kind)}"
 
     ax.tick_params(labelsize=5, length=2)
     for axis, wanted in ((ax.xaxis, i == len(names) - 1), (ax.yaxis, j == 0 and i > 0)):

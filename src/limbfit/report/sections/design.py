@@ -6,10 +6,9 @@ import matplotlib
 import numpy as np
 
 from ..drawing.ink import INK, MUTED, ONE_MATERIAL, SIMULATED, STYLE, THIRD, legend_above, panels, svg
-from ..formats import fixed, heading, number, numeric
+from ..formats import fixed, heading, number, numeric, symbol
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Results
-from ..tables import SYMBOLS
 
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))
 _WIDEST = 100.0  # factor that is drawn
@@ -65,7 +64,7 @@ def _factor(value: float) -> str:
 
 def _label(name: str) -> str:
     tissue, _, parameter = name.rpartition(".")
-    return f"{tissue} {SYMBOLS.get(parameter, parameter)}"
+    return f"{tissue} {symbol(parameter)}"
 
 
 def _figure(content: Json) -> Figure:

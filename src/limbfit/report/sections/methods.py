@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from ..formats import fixed, number
+from ...laws import OGDEN
+from ..formats import fixed, number, symbol, unit_of
 from ..page import Prose, Section
-from ..store import PARAMETERS, Json, Results
-from ..tables import NOTHING, SYMBOLS, UNITS, flatten, mean_and_deviation
+from ..store import Json, Results
+from ..tables import NOTHING, flatten, mean_and_deviation
 
 Part = tuple[str, str]  # a heading and its paragraph
 
@@ -186,13 +187,12 @@ def _pairs(table: Json) -> str:
 
 def _law(store: Results) -> str:
     kappa = number(_settings(store, "material").get("kappa_ratio"))
+    if store.law.name != OGDEN:
+        bulk = f"The bulk modulus is the long-term shear modulus times {kappa}."
+        return f"Each tissue has the law “{store.law.words}”: {store.law.energy}. {bulk}"
     return (
         "As in Sengeh, Moerman, Petron and Herr (2016, J. Mech. Behav. Biomed. Mater. 59, 379), each "
-        "tissue has "
-        "the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
-        "G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress; γ has no unit. The bulk modulus κ is c "
-        "times "
-        f"{kappa}."
+        f"tissue has {store.law.energy}; γ has no unit. The bulk modulus κ is c times {kappa}."
     )
 
 
@@ -308,7 +308,7 @@ def _constraints(table: Json) -> str:
 def _values(tissues: Json) -> str:
     """Parameters in words; once for all tissues where they are alike."""
     texts = {
-        tissue: ", ".join(f"{SYMBOLS[n]} = {number(values.get(n))}{_unit(n)}" for n in PARAMETERS)
+        tissue: ", ".join(f"{symbol(n)} = {number(values.get(n))}{_unit(n)}" for n in values)
         for tissue, values in tissues.items()
     }
     if len(set(texts.values())) == 1:
@@ -320,8 +320,8 @@ def _bounds(bounds: Json) -> str:
     lower, upper = bounds.get("lower") or {}, bounds.get("upper") or {}
     texts = {
         tissue: ", ".join(
-            f"{SYMBOLS[n]} {number(values.get(n))} to {number(upper.get(tissue, {}).get(n))}{_unit(n)}"
-            for n in PARAMETERS
+            f"{symbol(n)} {number(values.get(n))} to {number(upper.get(tissue, {}).get(n))}{_unit(n)}"
+            for n in values
         )
         for tissue, values in lower.items()
     }
@@ -331,7 +331,7 @@ def _bounds(bounds: Json) -> str:
 
 
 def _unit(name: str) -> str:
-    return f" {UNITS[name]}" if UNITS[name] != NOTHING else ""
+    return f" {unit_of(name)}" if unit_of(name) != NOTHING else ""
 
 
 def _mesh_error(sites: Json) -> str:

@@ -6,10 +6,10 @@ import matplotlib
 from matplotlib.axes import Axes
 
 from ..drawing.ink import HELD_OUT, INK, SIMULATED, STYLE, panels, svg, tissue_style
-from ..formats import fixed, heading, number, numeric
+from ..formats import fixed, heading, number, numeric, symbol, unit_of
 from ..page import Bullets, Cell, Figure, Prose, Row, Section, Table
-from ..store import PARAMETERS, Json, Results
-from ..tables import MEANING, SYMBOLS, UNITS, tissue_name
+from ..store import Json, Results
+from ..tables import parameter_words, tissue_name
 
 WIDEST = 1e3  # of an interval over its value, in the figure
 
@@ -33,7 +33,7 @@ def regions_section(store: Results, content: Json) -> Section:
     )
     omitted = tuple(f"Left out: {text}." for text in content["left_out"])
     notes = (Bullets(omitted),) if omitted else ()
-    blocks = (words, *notes, _parameter_table(store, content), _error_table(content), _figure(content))
+    blocks = (words, *notes, _parameter_table(store, content), _error_table(content), _figure(store, content))
     return Section("regions", "Regions", blocks)
 
 
@@ -55,15 +55,15 @@ def _parameter_table(store: Results, content: Json) -> Table:
         Row(
             (
                 heading(tissue_name(store, tissue)),
-                Cell(f"{SYMBOLS[name]}, {MEANING[name]}"),
-                Cell(UNITS[name]),
+                Cell(parameter_words(store, name)),
+                Cell(unit_of(name)),
                 numeric(number(content["whole"]["start"][tissue][name])),
                 numeric(number(content["whole"]["parameters"][tissue][name])),
                 *(numeric(_with_limits(row, tissue, name)) for row in regions),
             )
         )
         for tissue in content["whole"]["parameters"]
-        for name in PARAMETERS
+        for name in store.law.keys
     )
     caption = (
         "Table 3. Parameters of each region beside those of the whole limb, with 95 % intervals in brackets. "
@@ -118,11 +118,11 @@ def _error_table(content: Json) -> Table:
     )
 
 
-def _figure(content: Json) -> Figure:
+def _figure(store: Results, content: Json) -> Figure:
     """Errors by region as bars; each parameter by region with its interval, against the whole limb's."""
-    regions = content["regions"]
+    regions, count = content["regions"], 1 + len(store.law.keys)
     names = [row["region"] for row in regions]
-    drawing, axes = panels(1 + len(PARAMETERS), 1 + len(PARAMETERS), 0.9 + 0.34 * len(regions))
+    drawing, axes = panels(count, count, 0.9 + 0.34 * len(regions))
     with matplotlib.rc_context(STYLE):
         for at, row in enumerate(regions):
             for shift, key, color, label in (
@@ -133,7 +133,7 @@ def _figure(content: Json) -> Figure:
                 axes[0].barh(at + shift, row[key] or 0.0, 0.34, color=color, alpha=0.75, label=named)
         axes[0].set_title("Error (%)")
         axes[0].set_yticks(range(len(names)), names)
-        for ax, name in zip(axes[1:], PARAMETERS, strict=True):
+        for ax, name in zip(axes[1:], store.law.keys, strict=True):
             _draw_parameter(ax, content, name)
         for ax in axes:
             ax.set_ylim(len(regions) - 0.5, -0.5)
@@ -166,6 +166,6 @@ def _draw_parameter(ax: Axes, content: Json, name: str) -> None:
     ax.set_xscale("log")
     ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.xaxis.set_minor_formatter(lambda value, _: "")
-    unit = UNITS[name]
-    ax.set_title(f"{SYMBOLS[name]} ({unit})" if unit != "–" else SYMBOLS[name])
+    unit = unit_of(name)
+    ax.set_title(f"{symbol(name)} ({unit})" if unit != "–" else symbol(name))
     ax.set_yticks([])

@@ -203,7 +203,7 @@ def convergence(store: Results) -> Section:
     )
     figure: Figure | None = figures.convergence_figure(store)
     details: tuple[Table, ...] = tuple(
-        tables.iteration_table(stage) for stage in stages if stage.get("iterations")
+        tables.iteration_table(store, stage) for stage in stages if stage.get("iterations")
     )
     blocks = _blocks(
         Bullets(texts) if texts else None,

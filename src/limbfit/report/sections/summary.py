@@ -6,9 +6,9 @@ import statistics
 from collections.abc import Sequence
 
 from .. import tables
-from ..formats import fixed, number
+from ..formats import fixed, number, symbol
 from ..page import Block, Bullets, KeyNumber, Prose
-from ..store import PARAMETERS, Results
+from ..store import Results
 
 _RANKS = {"determined": 0, "weakly": 1, "not": 2}
 
@@ -23,7 +23,8 @@ def key_numbers(store: Results) -> tuple[KeyNumber, ...]:
     for tissue in store.tissues:
         last = store.stages[-1].get("parameters", {}).get(tissue) if store.stages else None
         if last:
-            found.append(KeyNumber(number(last.get("c_kPa")), "kPa", _with_interval(store, tissue)))
+            modulus = number(last.get(store.law.moduli[0]))
+            found.append(KeyNumber(modulus, "kPa", _with_interval(store, tissue)))
     seconds = [stage.get("seconds", 0.0) for stage in (store.run.get("stages") or {}).values()]
     if seconds:
         found.append(KeyNumber(*_short_time(sum(seconds)), "computing time, all stages"))
@@ -35,8 +36,9 @@ def _short_time(seconds: float) -> tuple[str, str]:
 
 
 def _with_interval(store: Results, tissue: str) -> str:
-    limits = tables.interval(store, tissue, "c_kPa")
-    text = f"{tissue}, long-term shear modulus c"
+    first = next(p for p in store.law.parameters if p.key == store.law.moduli[0])
+    limits = tables.interval(store, tissue, first.key)
+    text = f"{tissue}, {first.words} {symbol(first.key)}"
     return f"{text} ({number(limits[0])} to {number(limits[1])} kPa)" if limits else text
 
 
@@ -122,7 +124,7 @@ def _verdict(store: Results) -> tuple[str, ...]:
 
 def _symbols(store: Results) -> dict[str, str]:
     """Each parameter's name as people read it: ``muscle.tau_s`` is muscle τ."""
-    return {f"{t}.{n}": f"{t} {tables.SYMBOLS[n]}" for t in store.tissues for n in PARAMETERS}
+    return {f"{t}.{n}": f"{t} {symbol(n)}" for t in store.tissues for n in store.law.keys}
 
 
 def _combinations(store: Results) -> tuple[Block, ...]:
@@ -132,8 +134,8 @@ def _combinations(store: Results) -> tuple[Block, ...]:
         return ()
     told = []
     for sentence in map(str, sentences):
-        for name, symbol in _symbols(store).items():
-            sentence = sentence.replace(name, symbol)
+        for name, read in _symbols(store).items():
+            sentence = sentence.replace(name, read)
         told.append(sentence)
     lead = (
         "Products of powers of the parameters, the best determined by the data first. They and the intervals "

@@ -8,10 +8,9 @@ from matplotlib.axes import Axes
 
 from ..drawing.ink import MUTED, SIMULATED, STYLE, legend_above, panels, svg
 from ..drawing.uncertainty_figures import pairs_figure, prediction_figure, true_values
-from ..formats import fixed, heading, number, numeric
+from ..formats import fixed, heading, number, numeric, symbol
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Row, Section, Table
 from ..store import Json, Results
-from ..tables import SYMBOLS
 
 _MOST_PANELS_IN_A_ROW = 4
 
@@ -38,7 +37,7 @@ def uncertainty_section(store: Results, content: Json) -> Section:
 def label(name: str) -> str:
     """``skin.c_kPa`` as ``skin c``."""
     tissue, _, kind = name.rpartition(".")
-    return f"{tissue} {SYMBOLS.get(kind, kind)}".strip()
+    return f"{tissue} {symbol(kind)}".strip()
 
 
 def _method(content: Json) -> Prose:

@@ -3,7 +3,8 @@ import { el, replace, table } from "/static/dom.js";
 import { Chart } from "/web/chart.js";
 import { shortNumber } from "/web/colours.js";
 
-const UNITS = { c_kPa: ["c", "kPa"], m: ["m", ""], gamma: ["gamma", ""], tau_s: ["tau", "s"] };
+// A parameter's name and unit from its key.
+const parted = (key) => { const found = /^(.*)_(kPa|s)$/.exec(key); return found ? [found[1], found[2]] : [key, ""]; };
 const LOOKS = [["--second", "solid"], ["--simulated", "dashed"], ["--third", "dashdot"], ["--measured", "dotted"]];
 const ENDS = { running: "goes on", ended: "ended well" };
 const STATES = { done: "done", stale: "stale", begun: "begun", missing: "not done" };
@@ -181,7 +182,7 @@ class IdentificationView {
     const { parameters, tissues } = this.found;
     if (this.parameterHost.childElementCount !== parameters.length) replace(this.parameterHost, parameters.map(() => el("div", {})));
     parameters.forEach((name, k) => {
-      const [symbol, unit] = UNITS[name];
+      const [symbol, unit] = parted(name);
       const series = tissues.map((tissue, i) => ({ label: tissue, colour: LOOKS[i % 4][0], dash: LOOKS[i % 4][1], width: 2, points: true, x, y: rows.map((row) => row.parameters[tissue]?.[name] ?? null) }));
       this.plot(`parameter ${name}`, this.parameterHost.children[k], { label: `${symbol} over the iterates.`, x: { title: "Iterate", unit: "" }, y: { title: symbol, unit }, series }, 190);
     });
@@ -241,7 +242,7 @@ class IdentificationView {
       const [low, high] = answer.intervals_95[tissue][name];
       const key = `${tissue}.${name}`;
       const verdict = answer.verdict[key];
-      const [symbol, unit] = UNITS[name];
+      const [symbol, unit] = parted(name);
       return [`${tissue} ${symbol}${unit ? ` (${unit})` : ""}`, shortNumber(answer.parameters[tissue][name]), `${shortNumber(low)} to ${shortNumber(high)}`,
         el("span", { class: /^not/.test(verdict) ? "bad" : /weak/.test(verdict) ? "doubt" : "good" }, verdict), answer.at_bound[key] ? "at its bound" : ""];
     }));
@@ -257,7 +258,7 @@ class IdentificationView {
   correlation({ names, matrix }) {
     const short = (name) => {
       const [tissue, parameter] = name.split(".");
-      return `${tissue} ${UNITS[parameter]?.[0] ?? parameter}`;
+      return `${tissue} ${parted(parameter ?? "")[0]}`;
     };
     const cell = (value) => {
       const made = el("span", { class: "heat" }, value.toFixed(2).replace("-", "−"));

@@ -5,7 +5,8 @@ import { shortNumber } from "/web/colours.js";
 import { labelled, NAVIGATION } from "/static/views/parts.js";
 import { Player } from "/static/views/player.js";
 
-const PARAMETERS = [["c_kPa", "c", "kPa"], ["m", "m", "–"], ["gamma", "γ", "–"], ["tau_s", "τ", "s"]];
+const GREEK = { gamma: "γ", tau: "τ" };
+const parted = (key) => { const [, name, unit] = /^(.*?)(?:_(kPa|s))?$/.exec(key); return [GREEK[name] ?? name, unit ?? "–"]; };
 const AXES = { time_s: { title: "Time", unit: "s" }, displacement_mm: { title: "Displacement", unit: "mm" } };
 const WATCH_MS = 1500;
 
@@ -230,7 +231,8 @@ class ResultsView {
     const last = stages.at(-1);
     if (!last) return null;
     const theirs = this.beside?.stages.at(-1)?.parameters ?? {};
-    const rows = Object.entries(last.parameters).flatMap(([tissue, values]) => PARAMETERS.map(([key, symbol, unit]) => {
+    const rows = Object.entries(last.parameters).flatMap(([tissue, values]) => Object.keys(values).map((key) => {
+      const [symbol, unit] = parted(key);
       const limits = intervals[tissue]?.[key];
       return [`${tissue} ${symbol} (${unit})`, shortNumber(stages[0].parameters[tissue]?.[key]), shortNumber(values[key]), limits ? `${shortNumber(limits[0])} to ${shortNumber(limits[1])}` : "–",
         verdict[`${tissue}.${key}`] ?? "–", ...(this.beside ? [shortNumber(theirs[tissue]?.[key])] : [])];

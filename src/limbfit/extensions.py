@@ -1,0 +1,111 @@
+"""What a study adds to limbfit with Python files of its own: they register, by name, what is theirs.
+
+A file is run once in every process that needs it, workers among them, and again when it has changed.  Its
+digest counts wherever it can change an answer.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+from hashlib import sha256
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from .errors import InputError
+
+T = TypeVar("T")
+_loaded: dict[str, Path] = {}  # files that have been run, by their digest
+_running: list[Path] = []  # the file that is being run
+
+
+class Registry(Generic[T]):
+    """Things of one kind by name: those of limbfit, which stay, and those that are added."""
+
+    def __init__(self, kind: str, own: Mapping[str, T]) -> None:
+        self._kind, self._own = kind, dict(own)
+        self._added: dict[str, tuple[T, Path | None]] = {}
+
+    def add(self, name: str, what: T) -> None:
+        """Register ``what``; a file may register its own names again, and a session anything.
+
+        Raises
+        ------
+        InputError
+            Where the name is taken.
+        """
+        source = _running[-1] if _running else None
+        known = self._added[name][1] if name in self._added else None
+        if name in self._own or (known is not None and source is not None and known != source):
+            raise InputError(f"there already is a {self._kind} {name!r}", remedy="give yours another name")
+        self._added[name] = what, source
+
+    def __getitem__(self, name: str) -> T:
+        """What is registered by a name.
+
+        Raises
+        ------
+        InputError
+            Where nothing is.
+        """
+        if name in self._own:
+            return self._own[name]
+        if name in self._added:
+            return self._added[name][0]
+        raise InputError(
+            f"no {self._kind} is named {name!r}",
+            remedy=f"use {', '.join(self.names)}, or name the file that registers it in study.extensions",
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names, limbfit's own first."""
+        return *self._own, *self._added
+
+
+def load_extensions(files: Iterable[Path]) -> None:
+    """Run files that register something, unless that was done.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be run, with what it raised.
+    """
+    for file in files:
+        digest = _digest(file)
+        if digest not in _loaded:
+            _run(file.resolve(), f"limbfit_extension_{digest[:16]}")
+            _loaded[digest] = file
+
+
+def extensions_digest(files: Iterable[Path]) -> str:
+    """SHA-256 of what extension files hold; empty where there are none."""
+    each = [_digest(file) for file in files]
+    return sha256("".join(each).encode()).hexdigest() if each else ""
+
+
+def _digest(file: Path) -> str:
+    try:
+        return sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=file) from error
+
+
+def _run(file: Path, name: str) -> None:
+    spec = spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise InputError("is no Python file", file=file, remedy="give a file that ends in .py")
+    module = module_from_spec(spec)
+    sys.modules[name] = module  # what it defines can then be sent to other processes that have run it
+    _running.append(file)
+    try:
+        spec.loader.exec_module(module)
+    except InputError:
+        del sys.modules[name]
+        raise
+    except Exception as error:
+        del sys.modules[name]
+        raise InputError(f"{type(error).__name__}: {error}", file=file, place="extension") from error
+    finally:
+        _running.pop()

@@ -1,0 +1,96 @@
+"""The table ``[material]``: the law of the tissues, start and bounds of its parameters."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from ..errors import InputError
+from ..laws import LAWS, OGDEN
+from .tables import Positive, TomlTable
+
+KAPPA_RATIO = (10.0, 1e4)
+End = Literal["lower", "start", "upper"]
+_ENDS: tuple[End, ...] = ("lower", "start", "upper")
+
+
+class TissueRange(TomlTable):
+    """Where one tissue's start or bounds differ from those of all; what is not named here stays."""
+
+    start: dict[str, Positive] = Field(default={})
+    lower: dict[str, Positive] = Field(default={})
+    upper: dict[str, Positive] = Field(default={})
+
+
+class MaterialTable(TomlTable):
+    """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
+
+    ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
+    """
+
+    law: str = OGDEN
+    kappa_ratio: float = 100.0
+    start: dict[str, Positive] = Field(default={})
+    lower: dict[str, Positive] = Field(default={})
+    upper: dict[str, Positive] = Field(default={})
+    tissues: dict[str, TissueRange] = Field(default={})
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The parameters of the law."""
+        return LAWS[self.law].keys
+
+    def of(self, tissue: str, which: End) -> dict[str, float]:
+        """Start, lower or upper bound of the parameters of a tissue."""
+        return getattr(self, which) | getattr(self.tissues.get(tissue, TissueRange()), which)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _filled(cls, content: Any) -> Any:
+        """What the law says where the study says nothing; what is malformed is left to be refused."""
+        name = content.get("law", OGDEN) if isinstance(content, dict) else None
+        if not isinstance(name, str):
+            return content
+        try:
+            law = LAWS[name]
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        known = {which: {p.key: getattr(p, which) for p in law.parameters} for which in _ENDS}
+        given = {which: content.get(which, {}) for which in _ENDS}
+        filled = {which: known[which] | values for which, values in given.items() if isinstance(values, dict)}
+        return content | filled
+
+    @field_validator("kappa_ratio")
+    @classmethod
+    def _nearly_incompressible(cls, ratio: float) -> float:
+        low, high = KAPPA_RATIO
+        if ratio < low:
+            raise ValueError(
+                f"give {low:g} or more: with less, Poisson's ratio is under 0.45, and soft tissue hardly "
+                "changes its volume"
+            )
+        if ratio > high:
+            raise ValueError(
+                f"give at most {high:g}: with that, the volume changes by some 0.01 % of the strain, and "
+                "with more, the equations lose digits"
+            )
+        return ratio
+
+    @model_validator(mode="after")
+    def _ordered(self) -> MaterialTable:
+        for tissue in ("", *self.tissues):
+            lower, start, upper = (self.of(tissue, which) for which in _ENDS)
+            place = f"tissues.{tissue}." if tissue else ""
+            for which, values in zip(_ENDS, (lower, start, upper), strict=True):
+                for name in values.keys() - self.keys:
+                    known = ", ".join(self.keys)
+                    raise ValueError(
+                        f"material.{place}{which}.{name} is no parameter of the law; they are {known}"
+                    )
+            for name in self.keys:
+                if not lower[name] <= start[name] <= upper[name]:
+                    raise ValueError(f"{place}start.{name} lies outside its bounds")
+                if not lower[name] < upper[name]:
+                    raise ValueError(f"{place}lower.{name} is not below upper.{name}")
+        return self

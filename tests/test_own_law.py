@@ -1,0 +1,260 @@
+"""A law registered from outside the package: at a point, in the solver, and identified from a study."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from layered import store_blocks
+from limbfit import History, OgdenQLV, Problem, load_study
+from limbfit.errors import InputError
+from limbfit.execution import Limits, make_executor
+from limbfit.extensions import load_extensions
+from limbfit.fe import StepControl, System, solve
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.system import Increment
+from limbfit.laws import LAWS, Parameter, TissueLaw, register_law
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.verbs.run import keys
+
+sys.path.insert(0, str(Path(__file__).parent / "fe"))
+from blocks import block, punch
+from samples import point
+
+GUIDE = Path(__file__).parents[1] / "docs" / "extending.md"
+TRUTH = {"a_kPa": 9.0, "b": 1.6, "gamma": 2.0, "tau_s": 0.5}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory) -> Path:
+    """The law's file as the guide shows it."""
+    (code,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+    file = tmp_path_factory.mktemp("extension") / "fung.py"
+    file.write_text(code, encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def law(file) -> TissueLaw:
+    load_extensions([file])
+    return LAWS["fung"]
+
+
+@pytest.fixture(scope="module")
+def tissue(law):
+    return law.material(**law.in_solver_units(TRUTH))
+
+
+def energy(tissue, stretches):
+    lt = stretches * stretches.prod(axis=-1)[..., None] ** (-1 / 3)
+    return tissue.a / (2 * tissue.b) * (np.exp(tissue.b * ((lt**2).sum(axis=-1) - 3)) - 1)
+
+
+def stress(tissue, stretches):
+    """Deviatoric principal Kirchhoff stresses by complex steps."""
+    steps = np.exp(1e-30j * np.eye(3))
+    return np.array([energy(tissue, stretches * step).imag for step in steps]) / 1e-30
+
+
+@pytest.mark.parametrize(
+    "stretches", [[1.0, 1.0, 1.0], [0.7, 1.2, 1.2], [1.1, 1.1 + 1e-9, 0.8], [0.6, 1.1, 1.5]]
+)
+def test_the_kernels_give_its_energy_stress_and_parameters_derivatives(tissue, stretches):
+    x = np.array(stretches)
+    p, rates = point(tissue, np.diag(x))
+    assert p["energy"][0] == pytest.approx(energy(tissue, x), rel=1e-12, abs=1e-15)
+    np.testing.assert_allclose(p["beta"][:, 0], stress(tissue, x), rtol=1e-11, atol=1e-14 * tissue.a)
+    for k, name in enumerate(("a", "b")):
+        h = 1e-5 * getattr(tissue, name)
+        ends = [replace(tissue, **{name: getattr(tissue, name) + s * h}) for s in (1, -1)]
+        change = (stress(ends[0], x) - stress(ends[1], x)) / (2 * h)
+        np.testing.assert_allclose(rates["kept"][k, :, 0], change, atol=1e-8 * max(1.0, np.abs(change).max()))
+
+
+def test_its_modulus_of_small_strains_is_that_of_the_kernels(tissue):
+    """``d beta_1/d(e_1 - e_2) = 2 mu`` at rest, and what the material says of itself."""
+    p, _ = point(tissue, np.eye(3))
+    assert (p["slope"][0, 0] - p["slope"][3, 0]) / 2 == pytest.approx(tissue.shear_modulus, rel=1e-14)
+    assert p["quotient"][0, 0] == pytest.approx(tissue.shear_modulus, rel=1e-14)
+    shear = np.eye(3)
+    shear[0, 1] = 1e-5
+    sheared, _ = point(tissue, shear)
+    tau = (sheared["n"][..., 0] * sheared["beta"][:, 0]) @ sheared["n"][..., 0].T
+    assert tau[0, 1] / 1e-5 == pytest.approx(tissue.shear_modulus, rel=1e-8)
+
+
+def mixed(tissue) -> tuple[System, Laws]:
+    """Elements of both laws side by side in the kernels."""
+    lines = np.linspace(0.0, 1.0, 3)
+    mesh = block("tet10", lines, lines, lines, layer=0.5, jitter=0.05)
+    tissues = {"skin": tissue, "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}
+    ramp = History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    faces = mesh.face_sets["top"][:0]
+    system = System(Problem(mesh, tissues, mesh.node_sets["bottom"], faces, None, ramp))
+    return system, Laws.build(list(tissues.values()))
+
+
+def test_forces_and_tangent_are_derivatives_beside_another_law(tissue):
+    system, laws = mixed(tissue)
+    assert len(set(system.regions[:16].tolist())) == 2
+    rng = np.random.default_rng(4)
+    u = system.points @ (0.1 * rng.normal(size=(3, 3))) + 0.01 * rng.normal(size=system.points.shape)
+    rest = Increment(0.0, 0.0, np.array([1.5, 2.5]), np.zeros((*system.weights.shape, 6)), 1.0)
+    d, h = rng.normal(size=u.shape) * ~system.supported, 1e-6
+    here = system.evaluate(u, laws, rest)
+    ahead, back = (system.evaluate(u + s * h * d, laws, rest) for s in (1, -1))
+    K = np.zeros((system.unknowns, system.unknowns))
+    K[np.repeat(np.arange(system.unknowns), np.diff(system.indptr)), system.indices] = here.tangent
+    K += np.triu(K, 1).T
+    size = np.abs(K).max()
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), abs=1e-7 * size)
+    change = ((ahead.residual - back.residual) / (2 * h)).ravel()[system.free]
+    np.testing.assert_allclose(K @ d.ravel()[system.free], change, atol=1e-7 * size)
+
+
+def test_every_parameter_of_a_simulation_has_its_sensitivity(tissue):
+    problem = punch("tet4", 2, 1, materials={"skin": tissue, "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)})
+    control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-11)
+    centre = solve(problem, control, sensitivities=True, store="all")
+    for j, name in enumerate(tissue.parameter_names):
+        h, forces = 1e-4 * getattr(tissue, name), []
+        for sign in (1, -1):
+            skin = replace(tissue, **{name: getattr(tissue, name) + sign * h})
+            changed = problem.with_materials({**problem.materials, "skin": skin})
+            forces.append(solve(changed, control, warm_start=centre).force)
+        difference = (forces[0] - forces[1]) / (2 * h)
+        error = np.abs(difference - centre.force_sensitivity[:, j]).max()
+        assert error <= 1e-4 * np.abs(difference).max(), name
+
+
+def test_impossible_laws_are_refused():
+    with pytest.raises(InputError, match="already is a tissue law 'ogden'"):
+        register_law(LAWS["ogden"])
+    soft = Parameter("a", start=1.0, lower=2.0, upper=3.0, unit="kPa")
+    with pytest.raises(InputError, match="parameter a needs"):
+        register_law(TissueLaw("soft", "", "", (soft,), None))
+    with pytest.raises(InputError, match="has no modulus"):
+        register_law(TissueLaw("soft", "", "", (replace(soft, unit=""),), None))
+    with pytest.raises(InputError, match="no tissue law is named 'unheard-of'; use ogden"):
+        LAWS["unheard-of"]
+
+
+GIVEN = """\
+[study]
+name = "own law"
+extensions = ["fung.py"]
+
+[surfaces]
+skin = "skin.stl"
+
+[material]
+law = "fung"
+start = { b = 2.0 }
+
+[calibration]
+fixed = ["skin.tau_s"]
+
+[[sites]]
+name = "1"
+fitted = true
+trace = "1.csv"
+position = [0.0, -50.0, 10.0]
+"""
+
+
+def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
+    assert law.moduli == ("a_kPa",)
+    for name in ("skin.stl", "1.csv"):
+        (tmp_path / name).write_text(name)
+    shutil.copy(file, tmp_path / "fung.py")
+    (tmp_path / "study.toml").write_text(GIVEN)
+    study = load_study(tmp_path)
+    assert study.parameters[:4] == tuple(("skin", key) for key in TRUTH)
+    assert study.material.start == {"a_kPa": 4.0, "b": 2.0, "gamma": 1.2, "tau_s": 1.0}
+    assert study.material.upper["b"] == 10.0
+    before = keys(study)
+    (tmp_path / "fung.py").write_text((tmp_path / "fung.py").read_text() + "# another thought\n")
+    with pytest.raises(InputError, match="already is a tissue law 'fung'"):
+        load_study(tmp_path)  # one that is known here from another file
+    assert keys(study) != before
+    wrong = GIVEN.replace("b = 2.0", "c_kPa = 2.0")
+    shutil.copy(file, tmp_path / "fung.py")
+    (tmp_path / "study.toml").write_text(wrong)
+    with pytest.raises(InputError, match="c_kPa is no parameter of the law; they are a_kPa, b, gamma, tau_s"):
+        load_study(tmp_path)
+
+
+def test_what_an_extension_raises_names_it(tmp_path):
+    (tmp_path / "broken.py").write_text("import unheard_of_module\n")
+    with pytest.raises(InputError, match=r"broken\.py: extension: ModuleNotFoundError"):
+        load_extensions([tmp_path / "broken.py"])
+    with pytest.raises(InputError, match="cannot be read"):
+        load_extensions([tmp_path / "missing.py"])
+
+
+BLOCKS = {"a": ((3.0, 5.0), 2.2, True), "b": ((3.0, 21.0), 6.0, True)}  # thicknesses, depth
+TEXT = """
+[study]
+name = "blocks"
+extensions = ["fung.py"]
+[surfaces]
+skin = "skin.stl"
+[indenter]
+edge_radius_mm = 2.0
+[solver]
+load_steps = 4
+unload_steps = 3
+penalty_per_mm = 100.0
+[mesh]
+element = "tet10"
+[mesh.coarse]
+edge_near_mm = 6.0
+[calibration]
+
+tied = [
+    ["skin.a_kPa", "muscle.a_kPa"], ["skin.b", "muscle.b"], ["skin.gamma", "muscle.gamma"],
+    ["skin.tau_s", "muscle.tau_s"],
+]
+[material]
+law = "fung"
+"""
+SITE = """
+[[sites]]
+name = "{name}"
+fitted = true
+trace = "{name}.csv"
+position = [0.0, 0.0, 0.0]
+"""
+
+
+@pytest.mark.slow
+def test_a_study_identifies_it(tmp_path, file, law):
+    """Of records with known truth and noise, simulated by worker processes that load the study's file."""
+    shutil.copy(file, tmp_path / "fung.py")
+    for name in ("skin.stl", "a.csv", "b.csv"):
+        (tmp_path / name).touch()
+    (tmp_path / "study.toml").write_text(TEXT + "".join(SITE.format(name=name) for name in BLOCKS))
+    study = load_study(tmp_path)
+    truth = dict.fromkeys(study.tissues, TRUTH)
+    store = store_blocks(study, BLOCKS, truth, 4, coarse=4)
+    store["calibrate"].mkdir()
+    with make_executor(2, Limits(0.0, 0.0)) as executor:
+        run_calibrate(Context(study, store, executor, lambda event: None), store["calibrate"])
+    found = store.read("calibrate", "calibration.json")
+    last, known = found["stages"][-1], found["uncertainty"]["intervals_95"]
+    assert last["converged"], last["reason"]
+    assert last["iterations"][-1]["error_percent"] < 1.0
+    for tissue, values in truth.items():
+        assert last["parameters"][tissue] == pytest.approx(values, rel=0.02)
+        for key, value in values.items():
+            low, high = known[tissue][key]
+            assert low < value < high, (tissue, key)
+    assert found["law"]["name"] == "fung"
+    assert found["law"]["parameters"][1]["words"] == "stiffening"
