@@ -51,7 +51,7 @@ def nodal_forces(system: System, laws: Laws, state: State) -> Array:
     memory, as for `element_fields`.
     """
     increment = Increment(
-        state.time, state.displacement, np.ones(len(laws.terms)), _relaxing(system, laws, state),
+        state.time, state.displacement, np.ones(len(laws.prony)), _relaxing(system, laws, state),
         state.penalty * laws.modulus,
     )  # fmt: skip
     return system.evaluate(state.u, laws, increment, tangent=False).residual
