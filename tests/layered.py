@@ -73,11 +73,17 @@ def store_blocks(
     ``blocks``: thickness of each tissue, depth, whether fitted.  ``coarse``: divisions of a second mesh.
     """
     store, tissues = Store(study.results), study.tissues
-    for stage in ("surfaces", "sites", "traces", "mesh"):
+    for stage in ("sites", "traces", "mesh"):
         store[stage].mkdir(parents=True)
     bone = {"bone": box((-20.0, 20.0), (-34.0, -32.0))}
     plane = np.array([0.0, 0.0, -36.0]), np.array([0.0, 0.0, -1.0])
-    save_anatomy(store["surfaces"], Anatomy(box((-24.0, 24.0), (-36.0, 0.0)), bone, *plane))
+    anatomy = Anatomy(box((-24.0, 24.0), (-36.0, 0.0)), bone, *plane)
+
+    def save(folder: Path) -> dict[str, object]:
+        save_anatomy(folder, anatomy)
+        return {}
+
+    store.make("surfaces", "blocks", save)
     places = []
     for i, (name, (thickness, depth, fitted)) in enumerate(blocks.items()):
         mesh = layered_block(thickness, tissues, divisions=divisions)

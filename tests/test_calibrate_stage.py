@@ -170,7 +170,8 @@ def test_an_interrupted_calibration_goes_on_where_it_was(blocks, tmp_path):
 def test_several_starts_constraints_and_weights_of_a_study(blocks, tmp_path):
     _, store, _ = blocks
     more = (
-        "[calibration]\nstarts = 3\nseed = 2\nfixed = ['skin.m']\ntied = [['skin.tau_s', 'muscle.tau_s']]\n"
+        "[calibration]\nsearch_radius_mm = 0\nstarts = 3\nseed = 2\n"
+        "fixed = ['skin.m']\ntied = [['skin.tau_s', 'muscle.tau_s']]\n"
         "[calibration.prior.'skin.c_kPa']\nmedian = 9.0\nfactor = 1.3\n"
     )
     study = write_study(tmp_path, more)
