@@ -128,9 +128,11 @@ def test_starts_just_touching(name):
 
 
 def test_force_under_a_box_of_triangles_is_that_under_the_square():
-    control = StepControl(load_steps=3, unload_steps=3, tolerance=1e-7)
-    square = solve(punch("tet10", 4, 1, indenter=Indenter("square", 20.0, 1.0)), control)
-    triangles = solve(punch("tet10", 4, 1, indenter=Indenter("stl", edge_radius=1.0, surface=box())), control)
+    """Beside the middle: there, points below the edge make two equilibria, and rounding chooses."""
+    control, at = StepControl(load_steps=3, unload_steps=3, tolerance=1e-7), (0.3, -0.4, 0.0)
+    box_of_triangles = Indenter("stl", edge_radius=1.0, centre=at, surface=box())
+    square = solve(punch("tet10", 4, 1, indenter=Indenter("square", 20.0, 1.0, centre=at)), control)
+    triangles = solve(punch("tet10", 4, 1, indenter=box_of_triangles), control)
     assert square.completed
     np.testing.assert_allclose(triangles.force, square.force, rtol=1e-6, atol=1e-9)
 

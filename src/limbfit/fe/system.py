@@ -16,7 +16,15 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
-from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
+from .contact.contact import (
+    ContactSurface,
+    Distances,
+    Touch,
+    add_springs,
+    check_clear,
+    contact,
+    touching_offset,
+)
 from .contact.indenter import Indenter
 from .contact.sticky import Anchors
 from .kernel.assembly import Elements, assemble
@@ -185,15 +193,11 @@ class System:
             data += more[2]
         if not np.isfinite(energy) or self.surface is None or self.indenter is None:
             return Evaluation(energy, residual, data if tangent else None)
-        numbers, pushed, advance, gaps, normals, blocks = self._contact(u, increment)
-        found, force, deepest, area = numbers
+        (found, force, deepest, area), pushed, advance, touch = self._contact(u, increment)
         if tangent:
+            blocks = touch.blocks.reshape(*self.surface.areas.shape, 3, 3)
             add_springs(self.surface.N, blocks, self.face_positions, data)
         norm = float(np.linalg.norm(pushed))
-        anchors = increment.anchors or self.free_to_slip
-        stick = anchors.blocks(self.surface, self.indenter, increment.penalty).reshape(-1, 3, 3)
-        weights = increment.penalty * self.surface.areas.ravel()
-        touch = Touch(gaps.ravel(), normals.reshape(-1, 3), weights, blocks.reshape(-1, 3, 3), stick)
         return Evaluation(
             energy + found, residual + pushed, data if tangent else None, force, deepest, area, advance, norm,
             touch,
@@ -205,22 +209,27 @@ class System:
 
     def _contact(
         self, u: Array, increment: Increment
-    ) -> tuple[tuple[float, float, float, float], Array, Array, Array, Array, Array]:
-        """What `contact` returns, and the arrays that it fills: residual, advance, gaps, normals, blocks."""
+    ) -> tuple[tuple[float, float, float, float], Array, Array, Touch]:
+        """What `contact` returns, the residual and the advance that it fills, and its springs."""
         assert self.surface is not None
         assert self.indenter is not None
-        surface, frame = self.surface, self.indenter.frame
+        surface, indenter = self.surface, self.indenter.moved(increment.displacement)
         anchors = increment.anchors or self.free_to_slip
-        centre = np.asarray(self.indenter.centre) + increment.displacement * frame[2]
+        near = Distances.of(surface, indenter, u, None if increment.anchors is None else anchors.held)
         shape = surface.areas.shape
-        residual, advance, gaps = np.zeros_like(u), np.zeros_like(u), np.empty(shape)
-        normals, blocks = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
+        residual, advance, gaps = np.zeros_like(u), np.zeros_like(u), np.full(shape, np.inf)
+        normals, blocks, stick = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3)), np.zeros((*shape, 3, 3))
         found = contact(
-            surface.faces, surface.N, surface.areas, self.points, u, centre, frame, self.indenter.kernel,
+            surface.faces, surface.N, surface.areas,
+            (near.points, near.places, near.gaps, near.slopes, near.bends), indenter.frame,
             increment.penalty, increment.flat_from, (anchors.held, anchors.places, anchors.normals),
-            residual, advance, gaps, normals, blocks,
+            residual, advance, gaps, normals, blocks, stick,
         )  # fmt: skip
-        return found, residual, advance, gaps, normals, blocks
+        weights = increment.penalty * surface.areas.ravel()
+        touch = Touch(
+            gaps.ravel(), normals.reshape(-1, 3), weights, blocks.reshape(-1, 3, 3), stick.reshape(-1, 3, 3)
+        )
+        return found, residual, advance, touch
 
     def with_springs(self, data: Array, blocks: Array) -> Array:
         """``data`` plus a stiffness (c, 3, 3) at every contact point."""

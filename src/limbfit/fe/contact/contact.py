@@ -1,7 +1,8 @@
 """Frictionless rigid contact by a penalty energy over the reference skin.
 
 ``E = eps/2 int <-phi(x)>^2 dA_0`` with the indenter's signed distance ``phi``: one potential, hence a
-symmetric tangent, and a reaction that is its derivative with respect to the indenter's advance.
+symmetric tangent, and a reaction that is its derivative with respect to the indenter's advance.  The body
+gives distances, gradients and hessians (`Distances`); the energy's kernel knows nothing else of it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ..kernel.elements import Element, face_quadrature
-from .indenter import Indenter, signed_distance
+from .indenter import Indenter
 
 Array = NDArray[np.float64]
 START_MM = 0.02  # inside the tissue is a start that is deeper; other quadratures touch a little sooner
@@ -47,9 +48,20 @@ class ContactSurface:
 
     def local(self, indenter: Indenter, u: Array | None = None) -> Array:
         """The quadrature points (f, q, 3) in the indenter's frame, mm."""
-        x = self.points if u is None else self.points + u
-        at = np.einsum("qk,fki->fqi", self.N, x[self.faces])
+        at = np.empty((*self.areas.shape, 3))
+        place_points(self.faces, self.N, self.points if u is None else self.points + u, at)
         return (at - np.asarray(indenter.centre)) @ indenter.frame.T
+
+
+@njit(cache=True)
+def place_points(faces, N, x, out):  # type: ignore[no-untyped-def]
+    """Fill ``out (f, q, 3)`` with the contact points of nodes that are at ``x (n, 3)``."""
+    out[:] = 0.0
+    for f in range(faces.shape[0]):
+        for q in range(N.shape[0]):
+            for a in range(faces.shape[1]):
+                for i in range(3):
+                    out[f, q, i] += N[q, a] * x[faces[f, a], i]
 
 
 @dataclass(frozen=True)
@@ -116,75 +128,104 @@ def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
         )
 
 
+@dataclass(frozen=True)
+class Distances:
+    """Contact points near a rigid body.
+
+    ``points (k,)``: their numbers among all (f, q).  In the body's frame: ``places (k, 3)``, signed distances
+    ``gaps (k,)``, mm, their gradients ``slopes (k, 3)`` and hessians ``bends (k, 3, 3)``, 1/mm.
+    """
+
+    points: NDArray[np.int64]
+    places: Array
+    gaps: Array
+    slopes: Array
+    bends: Array
+
+    @classmethod
+    def of(
+        cls, surface: ContactSurface, indenter: Indenter, u: Array, also: NDArray[np.bool_] | None = None
+    ) -> Distances:
+        """From the indenter where it is at the displacement ``u (n, 3)``; ``also (f, q)`` points far away."""
+        local = surface.local(indenter, u).reshape(-1, 3)
+        wanted = indenter.near(local)
+        if also is not None:
+            wanted |= also.ravel()
+        points = np.flatnonzero(wanted)
+        return cls(points, local[points], *indenter.local_distance(local[points]))
+
+
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, X, u, centre, frame, kernel, penalty, flat_from, anchors, residual, advance, gaps,
-    normals, blocks,
-):  # fmt: skip
+    faces, N, areas, near, frame, penalty, flat_from, anchors, residual, advance, gaps, normals, blocks, stick
+):
     """Add the contact energy's gradient to ``residual``; its hessian is that of the springs ``blocks``.
 
+    ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
     ``flat_from``: penetration from which a point's tangent leaves the indenter's curvature out (mm).
     ``anchors``: which points stick (f, q), where (f, q, 3) and in which plane, as the normal (f, q, 3) to it,
     in the indenter's frame.  ``advance (n, 3)`` receives the mixed derivative with respect to displacement
     and indenter advance (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals
-    (f, q, 3)`` and ``blocks (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point.
+    (f, q, 3)`` and ``blocks (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point,
+    ``stick (f, q, 3, 3)`` the part of the tangent that is the anchors'.
     Returns energy, reaction along the axis (N), largest penetration (mm), reference area in touch (mm^2).
     """
+    points, local, phis, slopes, bends = near
     held, places, planes = anchors
-    half, k = kernel[1], faces.shape[1]
-    x, local, g, t = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    bend, h = np.empty((3, 3)), np.empty((3, 3))
+    k = faces.shape[1]
+    t, h, hold = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     energy = force = deepest = area = 0.0
-    reach = 1.8 * half
-    for f in range(faces.shape[0]):
-        for q in range(N.shape[0]):
-            x[:] = -centre
-            for a in range(k):
-                for i in range(3):
-                    x[i] += N[q, a] * (X[faces[f, a], i] + u[faces[f, a], i])
+    for p in range(len(points)):
+        f, q = divmod(points[p], N.shape[0])
+        phi, g, w = phis[p], slopes[p], penalty * areas[f, q]
+        gaps[f, q] = phi
+        t[:], h[:] = 0.0, 0.0
+        for i in range(3):
+            normals[f, q, i] = frame[0, i] * g[0] + frame[1, i] * g[1] + frame[2, i] * g[2]
+        if phi < 0.0:
+            energy += 0.5 * w * phi * phi
+            deepest = max(deepest, -phi)
+            area += areas[f, q]
             for i in range(3):
-                local[i] = frame[i, 0] * x[0] + frame[i, 1] * x[1] + frame[i, 2] * x[2]
-            phi, w = np.inf, penalty * areas[f, q]
-            t[:], h[:] = 0.0, 0.0
-            if local[2] <= half and abs(local[0]) <= reach and abs(local[1]) <= reach:
-                phi = signed_distance(kernel, local, g, bend)
-                for i in range(3):
-                    normals[f, q, i] = frame[0, i] * g[0] + frame[1, i] * g[1] + frame[2, i] * g[2]
-            gaps[f, q] = phi
-            if phi < 0.0:
-                energy += 0.5 * w * phi * phi
-                deepest = max(deepest, -phi)
-                area += areas[f, q]
-                for i in range(3):
-                    t[i] = w * phi * g[i]
-                    for j in range(3):
-                        h[i, j] = w * (g[i] * g[j] + (phi * bend[i, j] if phi > -flat_from else 0.0))
-            if held[f, q]:
-                energy += _stick(local, places[f, q], planes[f, q], w, t, h)
-            elif phi >= 0.0:
-                continue
-            force -= t[2]
-            for i in range(3):
-                push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
-                for a in range(k):
-                    residual[faces[f, a], i] += N[q, a] * push
-            H = blocks[f, q]
+                t[i] = w * phi * g[i]
+                for j in range(3):
+                    h[i, j] = w * (g[i] * g[j] + (phi * bends[p, i, j] if phi > -flat_from else 0.0))
+        if held[f, q]:
+            energy += _stick(local[p], places[f, q], planes[f, q], w, t, hold)
+            _rotated(frame, hold, stick[f, q])
             for i in range(3):
                 for j in range(3):
-                    H[i, j] = 0.0
-                    for p in range(3):
-                        for r in range(3):
-                            H[i, j] += frame[p, i] * h[p, r] * frame[r, j]
+                    h[i, j] += hold[i, j]
+        elif phi >= 0.0:
+            continue
+        force -= t[2]
+        for i in range(3):
+            push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
             for a in range(k):
-                for i in range(3):
-                    along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
-                    advance[faces[f, a], i] += N[q, a] * along
+                residual[faces[f, a], i] += N[q, a] * push
+        H = blocks[f, q]
+        _rotated(frame, h, H)
+        for a in range(k):
+            for i in range(3):
+                along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
+                advance[faces[f, a], i] += N[q, a] * along
     return energy, force, deepest, area
 
 
 @njit(cache=True)
+def _rotated(frame, h, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with the tensor ``h (3, 3)`` of the body's frame in space."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = 0.0
+            for p in range(3):
+                for r in range(3):
+                    out[i, j] += frame[p, i] * h[p, r] * frame[r, j]
+
+
+@njit(cache=True)
 def _stick(local, place, normal, w, t, h):  # type: ignore[no-untyped-def]
-    """Add force and tangent of an anchor at the point ``local (3,)``; returns its energy."""
+    """Add the force of an anchor at the point ``local (3,)`` and fill its tangent; returns its energy."""
     across = energy = 0.0
     for i in range(3):
         across += normal[i] * (local[i] - place[i])
@@ -193,7 +234,7 @@ def _stick(local, place, normal, w, t, h):  # type: ignore[no-untyped-def]
         energy += 0.5 * w * slip * slip
         t[i] += w * slip
         for j in range(3):
-            h[i, j] += w * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
+            h[i, j] = w * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
     return energy
 
 

@@ -121,6 +121,13 @@ class Indenter:
         local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
         return self.local_distance(local)[0]
 
+    def near(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points (n, 3) of its frame it may touch; the distance of others is not looked for."""
+        half = self.width / 2
+        reach = 1.8 * half
+        x, y, z = points.T
+        return np.asarray((z <= half) & (np.abs(x) <= reach) & (np.abs(y) <= reach))
+
     def local_distance(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

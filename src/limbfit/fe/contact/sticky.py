@@ -66,12 +66,6 @@ class Anchors:
         places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)
         return Anchors(closed, places, normals, d_places, d_normals)
 
-    def blocks(self, surface: ContactSurface, indenter: Indenter, penalty: float) -> Array:
-        """Tangents (f, q, 3, 3) of the anchors in space, N/mm."""
-        normals = self.normals @ indenter.frame
-        planes = np.eye(3) - normals[..., :, None] * normals[..., None, :]
-        return (penalty * surface.areas * self.held)[..., None, None] * planes
-
     def explicit(
         self, surface: ContactSurface, indenter: Indenter, u: Array, penalty: float
     ) -> tuple[Array, Array]:
