@@ -107,6 +107,16 @@ FAULTS = {
     "not a number": ("edge_near_mm = 3.0", "edge_near_mm = nan", r"mesh\.edge_near_mm: "),
     "text for number": ("edge_near_mm = 3.0", 'edge_near_mm = "fine"', r"mesh\.edge_near_mm: .*number"),
     "wrong choice": ("edge_near_mm = 3.0", 'element = "hex20"', r"mesh\.element: .*'tet10' or 'tet10p0'"),
+    "no friction": (
+        "[mesh]",
+        '[indenter]\nfriction = "rough"\n[mesh]',
+        r"indenter\.friction: 'rough' is not .*0 on$",
+    ),
+    "negative friction": (
+        "[mesh]",
+        "[indenter]\nfriction = -0.3\n[mesh]",
+        r"indenter\.friction: -0\.3 is not",
+    ),
     "short vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0]", r"sites\.0\.position"),
     "infinite vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0, inf]", r"sites\.0\.position\.2: .*finite"),
     "no name": ('name = "one limb"', "", r"study\.name: .*required"),

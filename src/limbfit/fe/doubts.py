@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..mesh import Mesh, node_jacobians
 
 Array = NDArray[np.float64]
-Kind = Literal["folded", "slipped", "sunk", "unbalanced", "inexact"]
+Kind = Literal["folded", "slipped", "sunk", "unbalanced", "unsettled", "inexact"]
 
 SLIP = 0.9  # force over the one before, in an advancing step, that is no relaxation
 
@@ -28,7 +28,7 @@ class Doubt:
     ----------
     kind : ``folded`` (elements inside out at a node), ``slipped`` (the force falls in loading), ``sunk`` (the
         indenter is deeper in the skin than allowed), ``unbalanced`` (equilibrium to less than the tolerance),
-        ``inexact`` (sensitivities).
+        ``unsettled`` (friction of another normal force than there is), ``inexact`` (sensitivities).
     text : one sentence, with its remedy.
     count : elements (``folded``), or steps.
     depth_mm : indentation where it is first seen; of folded elements, where they were counted.
@@ -108,6 +108,18 @@ def unbalanced(
         f"{tolerance:.2g}, first at {found[0][0]:.3g} mm: the force may be off by as much"
     )
     return _doubt("unbalanced", text, len(found), found[0][0], displacement)
+
+
+def unsettled(displacement: Array, found: Sequence[tuple[float, float]]) -> tuple[Doubt, ...]:
+    """Steps, as (mm, residual over reactions), whose friction did not settle with the normal force."""
+    if not found:
+        return ()
+    worst = max(residual for _, residual in found)
+    text = (
+        f"the friction of {len(found)} steps is that of a normal force up to {worst:.2g} of the reactions "
+        f"off, first at {found[0][0]:.3g} mm: use more steps"
+    )
+    return _doubt("unsettled", text, len(found), found[0][0], displacement)
 
 
 def inexact(displacement: Array, count: int) -> tuple[Doubt, ...]:

@@ -21,13 +21,22 @@ FACE_NODES = {"tet4": 3, "tet10": 6, "hex8": 4}
 
 @dataclass(frozen=True)
 class History:
-    """Piecewise linear advance of the indenter: ``times (n,)`` s from 0, ``displacement (n,)`` mm."""
+    """Piecewise linear advance of the indenter: ``times (n,)`` s from 0, ``displacement (n,)`` mm.
+
+    ``across (n, 2)``: its move across its axis, along x and y of its frame, mm; None: none.
+    """
 
     times: NDArray[np.float64]
     displacement: NDArray[np.float64]
+    across: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         times, values = np.asarray(self.times, dtype=float), np.asarray(self.displacement, dtype=float)
+        if self.across is not None:
+            across = np.asarray(self.across, dtype=float)
+            if across.shape != (len(times), 2) or not np.isfinite(across).all():
+                raise ProblemError("a move across the axis needs two finite numbers for each time")
+            object.__setattr__(self, "across", across)
         if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
             raise ProblemError("a displacement history needs two or more times and as many displacements")
         if not (np.isfinite(times).all() and np.isfinite(values).all()):
@@ -43,6 +52,17 @@ class History:
         """Displacement at time(s) ``t``, mm."""
         return np.asarray(np.interp(t, self.times, self.displacement))
 
+    def across_at(self, t: float) -> tuple[float, float]:
+        """Move across the axis at time ``t``, mm."""
+        if self.across is None:
+            return 0.0, 0.0
+        x, y = (float(np.interp(t, self.times, values)) for values in self.across.T)
+        return x, y
+
+    def travel(self, t: float) -> float:
+        """Advance and moves across together, mm: what changes while the indenter moves in any direction."""
+        return float(self.at(t)) + sum(self.across_at(t))
+
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """What the indenter does: loads, holds, unloads, in any number."""
@@ -50,8 +70,19 @@ class History:
 
     @property
     def kinks(self) -> NDArray[np.float64]:
-        """Times where phases begin or end, s, both ends among them."""
-        return boundaries(self.phases)
+        """Times where phases begin or end, or a move across the axis turns, s, both ends among them."""
+        found = boundaries(self.phases)
+        apart = np.abs(found[:, None] - self.turns).min(axis=0, initial=np.inf) > 1e-9 * self.times[-1]
+        return np.union1d(found, self.turns[apart])
+
+    @property
+    def turns(self) -> NDArray[np.float64]:
+        """Times where a move across the axis turns, s."""
+        if self.across is None:
+            return np.zeros(0)
+        speeds = np.diff(self.across, axis=0) / np.diff(self.times)[:, None]
+        turned = np.abs(np.diff(speeds, axis=0)).max(axis=1, initial=0.0) > 1e-9 * np.abs(speeds).max()
+        return self.times[1:-1][turned]
 
     @property
     def peak(self) -> float:
@@ -89,7 +120,8 @@ class Problem:
     supports : single components held or moved.
     element : name in the element table; by default the mesh's cell type.
     contact_rule : where contact is enforced: ``nodes`` of the faces or their ``gauss`` points.
-    friction : ``frictionless``, or ``sticky``: what touches does not slip along the indenter.
+    friction : ``frictionless``, ``sticky`` (what touches does not slip along the indenter) or Coulomb's
+        coefficient.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     """
 
@@ -103,7 +135,7 @@ class Problem:
     element: str = ""
     start: str = "touching"
     contact_rule: str = "gauss"
-    friction: str = "frictionless"
+    friction: str | float = "frictionless"
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
@@ -167,10 +199,20 @@ def _check_choices(problem: Problem) -> None:
     if problem.contact_rule not in ELEMENTS[name].face_rules:
         rules = ", ".join(ELEMENTS[name].face_rules)
         raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy=f"use one of {rules}")
-    if problem.friction not in ("frictionless", "sticky"):
-        raise ProblemError(f"unknown friction {problem.friction!r}", remedy="use 'frictionless' or 'sticky'")
+    _check_friction(problem.friction)
     if problem.start not in ("touching", "as-given"):
         raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
+
+
+def _check_friction(friction: str | float) -> None:
+    if isinstance(friction, str):
+        known = friction in ("frictionless", "sticky")
+    else:
+        known = not isinstance(friction, bool) and 0.0 <= friction < np.inf
+    if not known:
+        raise ProblemError(
+            f"unknown friction {friction!r}", remedy="use 'frictionless', 'sticky' or a coefficient from 0 on"
+        )
 
 
 def _check_cells(problem: Problem) -> None:

@@ -34,7 +34,7 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """What `iterate` yields: one accepted step."""
+    """What `iterate` yields: one accepted step; see `Result`, of which it is a row."""
 
     time: float
     displacement: float
@@ -43,6 +43,7 @@ class Step:
     contact_area: float
     newton_iterations: int
     force_sensitivity: Array | None
+    reaction: Array
     state: State
 
 
@@ -56,13 +57,15 @@ class Result:
     force_sensitivity : (n, p) derivative of the force with respect to each parameter (mm, N, s, MPa).
     parameter_names : (region, parameter) per column.
     penetration, contact_area : (n,) mm, mm^2 (reference).
+    reaction : (n, 3) force of the indenter along x, y and z of its frame, N; the last column is ``force``.
     states : kept steps.
     completed, reason : False and why where the end of the history was not reached.
     doubts : what is doubtful about it, by kind; ``warnings`` are their texts.
     statistics : steps, ``sunk_steps`` (deeper in the skin than allowed), ``unbalanced_steps`` (accepted at
-        more than the tolerance), ``penalty_per_mm`` (the largest), newton_iterations, factorisations,
-        multigrids (made, one for each matrix), solves, linear_solver, whether its factors had to be in
-        ``double_precision``, element, unknowns, seconds by part.
+        more than the tolerance), ``unsettled_steps`` (whose friction had not settled), ``penalty_per_mm``
+        (the largest), newton_iterations, factorisations, multigrids (made, one for each matrix), solves,
+        linear_solver, whether its factors had to be in ``double_precision``, element, unknowns, seconds by
+        part.
     """
 
     problem: Problem
@@ -73,6 +76,7 @@ class Result:
     parameter_names: tuple[tuple[str, str], ...]
     penetration: Array
     contact_area: Array
+    reaction: Array
     states: tuple[State, ...]
     completed: bool
     reason: str

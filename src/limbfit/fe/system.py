@@ -25,8 +25,8 @@ from .contact.contact import (
     contact,
     touching_offset,
 )
+from .contact.grip import Grip
 from .contact.indenter import Indenter
-from .contact.sticky import Anchors
 from .kernel.assembly import Elements, assemble
 from .kernel.elements import Element, reference_gradients
 from .kernel.laws import Laws
@@ -41,9 +41,9 @@ T = TypeVar("T")
 class Increment:
     """What is constant while one step is solved.
 
-    ``scale (r,)`` and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; ``anchors``
-    hold the points that stick, where contact is sticky; points deeper than ``flat_from`` (mm) have the
-    tangent of a flat indenter.
+    ``displacement`` is the indenter's advance, ``across (2,)`` its move across its axis, mm; ``scale (r,)``
+    and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grip`` holds points
+    along the indenter; points deeper than ``flat_from`` (mm) have the tangent of a flat indenter.
     """
 
     time: float
@@ -51,15 +51,17 @@ class Increment:
     scale: Array
     history: Array
     penalty: float
-    anchors: Anchors | None = None
+    grip: Grip | None = None
     flat_from: float = np.inf
+    across: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """The potential and its derivatives at one displacement field.
 
-    ``data``: entries of the tangent; None where it was not asked for.
+    ``data``: entries of the tangent; None where it was not asked for.  ``reaction (3,)``: force of the
+    indenter in its frame, N; the last is the ``force`` along the axis.
     """
 
     energy: float
@@ -71,6 +73,7 @@ class Evaluation:
     advance: Array | None = None
     contact_norm: float = 0.0
     touch: Touch | None = None
+    reaction: Array | None = None
 
     @property
     def tangent(self) -> Array:
@@ -103,7 +106,9 @@ class System:
         if problem.indenter is not None:
             faces = np.asarray(problem.contact_faces, dtype=np.int64)
             self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
-            self.free_to_slip = Anchors.none(self.surface)
+            nothing = np.zeros(self.surface.areas.shape)
+            vectors = np.zeros((*nothing.shape, 3))
+            self._slipping = nothing > 0.0, vectors, vectors, nothing
             self.spread = self._spread(self.surface)
             touching = self.surface.faces
             self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
@@ -193,43 +198,48 @@ class System:
             data += more[2]
         if not np.isfinite(energy) or self.surface is None or self.indenter is None:
             return Evaluation(energy, residual, data if tangent else None)
-        (found, force, deepest, area), pushed, advance, touch = self._contact(u, increment)
+        (found, deepest, area), reaction, pushed, advance, touch = self._contact(u, increment)
         if tangent:
             blocks = touch.blocks.reshape(*self.surface.areas.shape, 3, 3)
             add_springs(self.surface.N, blocks, self.face_positions, data)
         norm = float(np.linalg.norm(pushed))
         return Evaluation(
-            energy + found, residual + pushed, data if tangent else None, force, deepest, area, advance, norm,
-            touch,
+            energy + found, residual + pushed, data if tangent else None, float(reaction[2]), deepest, area,
+            advance, norm, touch, reaction,
         )  # fmt: skip
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
         """The contact part of the residual (n, 3), N."""
-        return np.zeros_like(u) if self.surface is None else self._contact(u, increment)[1]
+        return np.zeros_like(u) if self.surface is None else self._contact(u, increment)[2]
+
+    def tool(self, increment: Increment) -> tuple[ContactSurface, Indenter]:
+        """The contact surface, and the indenter where it is in a step."""
+        if self.surface is None or self.indenter is None:
+            raise ProblemError("the problem has no indenter")
+        return self.surface, self.indenter.moved(increment.displacement, increment.across)
 
     def _contact(
         self, u: Array, increment: Increment
-    ) -> tuple[tuple[float, float, float, float], Array, Array, Touch]:
-        """What `contact` returns, the residual and the advance that it fills, and its springs."""
-        assert self.surface is not None
-        assert self.indenter is not None
-        surface, indenter = self.surface, self.indenter.moved(increment.displacement)
-        anchors = increment.anchors or self.free_to_slip
-        near = Distances.of(surface, indenter, u, None if increment.anchors is None else anchors.held)
-        shape = surface.areas.shape
+    ) -> tuple[tuple[float, float, float], Array, Array, Array, Touch]:
+        """What `contact` returns, the reaction, residual and advance that it fills, and its springs."""
+        surface, indenter = self.tool(increment)
+        grip = increment.grip
+        near = Distances.of(surface, indenter, u, None if grip is None else grip.held)
+        holding = self._slipping if grip is None else (grip.held, grip.places, grip.normals, grip.bounds)
+        shape, reaction = surface.areas.shape, np.zeros(3)
         residual, advance, gaps = np.zeros_like(u), np.zeros_like(u), np.full(shape, np.inf)
         normals, blocks, stick = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3)), np.zeros((*shape, 3, 3))
         found = contact(
             surface.faces, surface.N, surface.areas,
             (near.points, near.places, near.gaps, near.slopes, near.bends), indenter.frame,
-            increment.penalty, increment.flat_from, (anchors.held, anchors.places, anchors.normals),
-            residual, advance, gaps, normals, blocks, stick,
+            increment.penalty, increment.flat_from, holding, reaction, residual, advance, gaps, normals,
+            blocks, stick,
         )  # fmt: skip
         weights = increment.penalty * surface.areas.ravel()
         touch = Touch(
             gaps.ravel(), normals.reshape(-1, 3), weights, blocks.reshape(-1, 3, 3), stick.reshape(-1, 3, 3)
         )
-        return found, residual, advance, touch
+        return found, reaction, residual, advance, touch
 
     def with_springs(self, data: Array, blocks: Array) -> Array:
         """``data`` plus a stiffness (c, 3, 3) at every contact point."""

@@ -137,7 +137,8 @@ def _end(process: subprocess.Popen) -> None:
 def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: float = 0.0) -> Result:
     """FEBio's force over time as a `Result`, complete or not.
 
-    FEBio's table says nothing of penetration and area: they are NaN; there are no states.
+    FEBio's table says nothing of penetration and area, and forces across the axis are not read: they are NaN;
+    there are no states.
 
     Raises
     ------
@@ -162,6 +163,7 @@ def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: 
         parameter_names=problem.parameter_names,
         penetration=unknown,
         contact_area=unknown,
+        reaction=np.column_stack([np.full((len(times), 2), np.nan), force]),
         states=(),
         completed=verdict.completed,
         reason=verdict.reason,

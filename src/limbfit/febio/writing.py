@@ -116,9 +116,12 @@ def check_exportable(problem: Problem, program: str) -> None:
         raise ProblemError(f"{program} has no element {name!r}", remedy=f"export with one of {known}")
     if problem.indenter is None or problem.supports:
         raise ProblemError(f"only indentations with fixed nodes are written for {program}")
+    if problem.history.across is not None:
+        raise ProblemError(f"a move across the indenter's axis is not written for {program}")
     if problem.friction != "frictionless":
         raise ProblemError(
-            f"limbfit's sticky contact is none of {program}'s", remedy='export with friction = "frictionless"'
+            f"friction is not written for {program}, nor is limbfit's sticky contact",
+            remedy='export with friction = "frictionless"',
         )
     taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, HELD}
     if taken or INDENTER in problem.mesh.region_names:

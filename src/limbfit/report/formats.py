@@ -66,6 +66,11 @@ def vector(values: Any) -> str:
     return ", ".join(fixed(value) for value in values) if values else NOTHING
 
 
+def friction(value: Any) -> str:
+    """How contact is, by the study's key: a word, or a coefficient."""
+    return value if isinstance(value, str) else f"with friction of coefficient {number(value)}"
+
+
 def numeric(text: str, share: float | None = None) -> Cell:
     """A cell that holds a number."""
     return Cell(text, number=True, share=share)

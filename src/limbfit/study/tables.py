@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from .friction import Friction
+
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 BoneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ().+_-]{0,39}$")]
@@ -166,7 +168,7 @@ class IndenterTable(TomlTable):
     file: Path | None = None
     width_mm: Positive = 20.0
     edge_radius_mm: Annotated[float, Field(ge=0)] = 0.0
-    friction: Literal["frictionless", "sticky"] = "frictionless"
+    friction: Friction = "frictionless"
 
     @model_validator(mode="after")
     def _edge_fits(self) -> IndenterTable:

@@ -52,6 +52,17 @@ class ContactSurface:
         place_points(self.faces, self.N, self.points if u is None else self.points + u, at)
         return (at - np.asarray(indenter.centre)) @ indenter.frame.T
 
+    def moved(self, indenter: Indenter, du: Array) -> Array:
+        """What displacements (n, 3, p) of the nodes do to the points in the indenter's frame (f, q, 3, p)."""
+        return np.einsum("ij,qk,fkjp->fqip", indenter.frame, self.N, du[self.faces], optimize=True)
+
+    def distributed(self, indenter: Indenter, forces: Array) -> Array:
+        """Forces (f, q, 3, p) at the points, in the indenter's frame, as those of the nodes (n, 3, p)."""
+        out = np.zeros((len(self.points), 3, forces.shape[-1]))
+        parts = np.einsum("ij,qk,fqip->fkjp", indenter.frame, self.N, forces, optimize=True)
+        np.add.at(out, self.faces, parts)
+        return out
+
 
 @njit(cache=True)
 def place_points(faces, N, x, out):  # type: ignore[no-untyped-def]
@@ -157,24 +168,25 @@ class Distances:
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, near, frame, penalty, flat_from, anchors, residual, advance, gaps, normals, blocks, stick
-):
+    faces, N, areas, near, frame, penalty, flat_from, grip, reaction, residual, advance, gaps, normals,
+    blocks, stick,
+):  # fmt: skip
     """Add the contact energy's gradient to ``residual``; its hessian is that of the springs ``blocks``.
 
     ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
     ``flat_from``: penetration from which a point's tangent leaves the indenter's curvature out (mm).
-    ``anchors``: which points stick (f, q), where (f, q, 3) and in which plane, as the normal (f, q, 3) to it,
-    in the indenter's frame.  ``advance (n, 3)`` receives the mixed derivative with respect to displacement
+    ``grip``: the held points, their anchors, normals and bounds (`Grip`).  ``reaction (3,)`` receives the
+    force of the body in its frame, N; ``advance (n, 3)`` the mixed derivative with respect to displacement
     and indenter advance (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals
     (f, q, 3)`` and ``blocks (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point,
-    ``stick (f, q, 3, 3)`` the part of the tangent that is the anchors'.
-    Returns energy, reaction along the axis (N), largest penetration (mm), reference area in touch (mm^2).
+    ``stick (f, q, 3, 3)`` the part of the tangent that holds it along the body.
+    Returns energy, largest penetration (mm), reference area in touch (mm^2).
     """
     points, local, phis, slopes, bends = near
-    held, places, planes = anchors
+    held, places, planes, bounds = grip
     k = faces.shape[1]
     t, h, hold = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    energy = force = deepest = area = 0.0
+    energy = deepest = area = 0.0
     for p in range(len(points)):
         f, q = divmod(points[p], N.shape[0])
         phi, g, w = phis[p], slopes[p], penalty * areas[f, q]
@@ -191,15 +203,15 @@ def contact(  # type: ignore[no-untyped-def]
                 for j in range(3):
                     h[i, j] = w * (g[i] * g[j] + (phi * bends[p, i, j] if phi > -flat_from else 0.0))
         if held[f, q]:
-            energy += _stick(local[p], places[f, q], planes[f, q], w, t, hold)
+            energy += _hold(local[p], places[f, q], planes[f, q], bounds[f, q], w, t, hold)
             _rotated(frame, hold, stick[f, q])
             for i in range(3):
                 for j in range(3):
                     h[i, j] += hold[i, j]
         elif phi >= 0.0:
             continue
-        force -= t[2]
         for i in range(3):
+            reaction[i] -= t[i]
             push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
             for a in range(k):
                 residual[faces[f, a], i] += N[q, a] * push
@@ -209,7 +221,7 @@ def contact(  # type: ignore[no-untyped-def]
             for i in range(3):
                 along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
                 advance[faces[f, a], i] += N[q, a] * along
-    return energy, force, deepest, area
+    return energy, deepest, area
 
 
 @njit(cache=True)
@@ -224,18 +236,25 @@ def _rotated(frame, h, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _stick(local, place, normal, w, t, h):  # type: ignore[no-untyped-def]
+def _hold(local, place, normal, bound, w, t, h):  # type: ignore[no-untyped-def]
     """Add the force of an anchor at the point ``local (3,)`` and fill its tangent; returns its energy."""
-    across = energy = 0.0
+    slip = np.empty(3)
+    across = length = 0.0
     for i in range(3):
         across += normal[i] * (local[i] - place[i])
     for i in range(3):
-        slip = local[i] - place[i] - across * normal[i]
-        energy += 0.5 * w * slip * slip
-        t[i] += w * slip
+        slip[i] = local[i] - place[i] - across * normal[i]
+        length += slip[i] * slip[i]
+    length = np.sqrt(length)
+    stuck = length < bound
+    share = 1.0 if stuck else (bound / length if length > 0.0 else 0.0)
+    for i in range(3):
+        t[i] += w * share * slip[i]
         for j in range(3):
-            h[i, j] = w * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
-    return energy
+            h[i, j] = w * share * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
+            if share > 0.0 and not stuck:
+                h[i, j] -= w * share * slip[i] / length * slip[j] / length
+    return w * (0.5 * length * length if stuck else bound * (length - 0.5 * bound))
 
 
 @njit(cache=True)

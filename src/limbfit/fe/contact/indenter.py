@@ -112,9 +112,11 @@ class Indenter:
         """From the foremost point to the far end of a surface; the width for shapes without one, mm."""
         return self.width if self.surface is None else -float(self.surface.points[:, 2].min())
 
-    def moved(self, distance: float) -> Indenter:
-        """The indenter, advanced along its axis by ``distance`` mm."""
-        return replace(self, centre=np.asarray(self.centre, dtype=float) + distance * self.frame[2])
+    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Indenter:
+        """The indenter, advanced along its axis by ``distance`` mm and ``across`` it, along x and y of its
+        frame."""
+        move = np.array([*across, distance]) @ self.frame
+        return replace(self, centre=np.asarray(self.centre, dtype=float) + move)
 
     def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (n,) of points (n, 3), mm; negative inside."""

@@ -11,28 +11,29 @@ from numpy.typing import NDArray
 from ..history import Memory
 from ..kernel.laws import Laws
 from ..problem import Problem
-from ..result import Result, State
+from ..result import Result
 from ..system import System
 
 Array = NDArray[np.float64]
 _SAME_S = 1e-9
 
 
-def extrapolation(states: Sequence[State], displacement: float) -> Array:
-    """Weights (k,) of the last states' fields that foresee the field at an advance of the indenter.
+def extrapolation(travels: Sequence[float], travel: float) -> Array:
+    """Weights (k,) of the last states' fields, at ``travels (k,)`` of the indenter, that foresee that at
+    ``travel`` mm.
 
-    Quadratic in the advance while it goes on steadily; linear where it has just turned or leaps.
+    Quadratic in the travel while it goes on steadily; linear where it has just turned or leaps.
     """
-    weights = np.zeros(len(states))
+    d = np.asarray(travels, dtype=float)
+    weights = np.zeros(len(d))
     weights[-1] = 1.0
-    d = np.array([state.displacement for state in states])
     moved = np.diff(d)
-    if len(states) < 2 or moved[-1] == 0.0:
+    if len(d) < 2 or moved[-1] == 0.0:
         return weights
-    slope = float(np.clip((displacement - d[-1]) / moved[-1], -2.0, 8.0))
+    slope = float(np.clip((travel - d[-1]) / moved[-1], -2.0, 8.0))
     step = slope * moved[-1]
     weights[-2:] += -slope, slope
-    if len(states) > 2 and 0.0 < slope <= 2.0 and moved[0] * moved[1] > 0.0:
+    if len(d) > 2 and 0.0 < slope <= 2.0 and moved[0] * moved[1] > 0.0:
         bend = step * (step + moved[1]) / (d[2] - d[0])
         weights += bend * np.array([1.0 / moved[0], -1.0 / moved[0] - 1.0 / moved[1], 1.0 / moved[1]])
     return weights

@@ -51,9 +51,12 @@ class NewtonControl:
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """Where Newton stopped: ``reason`` is empty at equilibrium, or near one of unbearable penetration;
-    ``damped``: it had to shorten a step much; ``residual``: over the reactions, more than the tolerance where
-    nothing lower was found."""
+    """Where Newton stopped.
+
+    ``reason`` is empty at equilibrium, or near one of unbearable penetration; ``damped``: it had to shorten a
+    step much; ``residual``: over the reactions, more than the tolerance where nothing lower was found;
+    ``first``: that of the guess; ``unsettled``: that which renewing the grip went on causing.
+    """
 
     u: Array
     at: Evaluation
@@ -61,6 +64,8 @@ class Equilibrium:
     reason: str = ""
     damped: bool = False
     residual: float = np.inf
+    first: float = np.inf
+    unsettled: float = 0.0
 
 
 def equilibrate(
@@ -76,14 +81,16 @@ def equilibrate(
     u, here = _lowest(evaluate, guesses, deep)
     if not np.isfinite(here.energy):
         return Equilibrium(u, here, 0, "an element is inverted at the start of the step")
-    last, damping, damped = np.inf, control.damping, False
+    last, damping, damped, first = np.inf, control.damping, False, np.inf
     for iteration in range(control.max_iterations):
         norm = residual_norm(system, here)
         scale = reaction_scale(system, here, floor)
+        share = norm / max(scale, TINY)
+        first = first if iteration else share
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
         unbearable = norm <= NEAR * scale and here.penetration > control.bearable
         if norm <= control.tolerance * scale or rounding or unbearable:
-            return Equilibrium(u, here, iteration, damped=damped, residual=norm / max(scale, TINY))
+            return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
         if not np.isfinite(norm):
             return Equilibrium(u, here, iteration, "the residual is not finite")
         if here.data is None:
@@ -99,7 +106,7 @@ def equilibrate(
         found = _line_search(evaluate, u, here, direction, control)
         if found is None:
             if norm <= LOOSE * control.tolerance * scale:
-                return Equilibrium(u, here, iteration, damped=damped, residual=norm / max(scale, TINY))
+                return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
             return Equilibrium(u, here, iteration, "the line search found no lower energy")
         u, here, step = found
         damping, damped = _damped(damping, step), damped or step < SHORT_STEP

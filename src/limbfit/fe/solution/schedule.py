@@ -31,7 +31,7 @@ PLACES, SHORT_OF_END, FORESIGHT = 4, 0.9, 1.1
 
 
 def graded(history: History, load_steps: int, unload_steps: int) -> Array:
-    """Times (k,) s of the steps, the end of every phase among them.
+    """Times (k,) s of the steps, the end of every phase and every turn across the axis among them.
 
     Phases of one kind in a row share the number of steps by their lengths, but have no fewer than half of it;
     a hold has as many as unloading.  One of those is left for the end of contact (see `foresee`).
@@ -50,7 +50,9 @@ def graded(history: History, load_steps: int, unload_steps: int) -> Array:
             power = FROM_REST if fresh else AFTER_TURN
             part = (np.arange(1, count + 1) / count) ** power
             times.append(phase.start_s + phase.duration_s * part)
-    return np.concatenate(times)
+    found = np.concatenate(times)
+    apart = np.abs(found[:, None] - history.turns).min(axis=0) > 1e-9 * found[-1]
+    return np.union1d(found, history.turns[apart])
 
 
 def foresee(

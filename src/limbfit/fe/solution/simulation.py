@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact.contact import ContactSurface
-from ..contact.indenter import Indenter
+from ..contact.friction import Coulomb
+from ..contact.grip import Grip
 from ..contact.sticky import Anchors
 from ..history import Memory, elastic_stresses
 from ..kernel.laws import Laws
@@ -20,18 +20,21 @@ from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
 from ..threads import single_threaded_numpy
 from .control import StepControl, schedule
+from .coupling import solve_coupled
 from .direction import renew
 from .factor import Factor
 from .guesses import Warm, extrapolation
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .pace import Pace
 from .schedule import foresee
-from .sensitivity import Explicit, MemoryDerivative, solve_with_adjoint
+from .sensitivity import Explicit, MemoryDerivative
 
 Array = NDArray[np.float64]
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
 TOO_DEEP, MOST_RAISES = 1.2, 5
+# How often the grip of a step is renewed; residual over reactions that is left then and is taken as it is.
+MOST_RENEWALS, UNSETTLED = 30, 1e-2
 # Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
 STEEP_PRESSURE = 15.0
 
@@ -62,9 +65,7 @@ class Simulation:
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
         self.damping = 0.0  # to begin a step with, after one that needed it
-        self.anchors: Anchors | None = None
-        if problem.friction == "sticky" and self.system.surface is not None:
-            self.anchors = Anchors.none(self.system.surface, self.laws.count if sensitivities else 0)
+        self.grip = _grip(self.system, problem.friction, self.laws.count if sensitivities else 0)
         self.warm = Warm.of(problem, warm_start)
         self.floor, self.pushing = 0.0, False
         width = problem.indenter.width if problem.indenter is not None else 1.0
@@ -75,6 +76,7 @@ class Simulation:
         self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness, still)]
         self.reason = ""
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
+        self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
         self.seconds["setup"] = time.perf_counter() - started
 
     def run(self) -> Iterator[Step]:
@@ -119,35 +121,45 @@ class Simulation:
         ``patience``: iterations that are allowed for one equilibrium.
         """
         before = self.states[-1]
-        displacement, dt = float(self.problem.history.at(t)), t - before.time
-        stiffness, u = self.stiffness, self._predict(t, displacement)
-        anchors = self.anchors
+        history, dt = self.problem.history, t - before.time
+        displacement, stiffness, u = float(history.at(t)), self.stiffness, self._predict(t)
         for raises in range(MOST_RAISES, -1, -1):
             may_rise = raises > 0 and not self.control.hold_penalty
             increment = self.memory.increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
             )
-            increment = replace(increment, anchors=anchors, flat_from=STEEP_PRESSURE / stiffness)
+            increment = replace(
+                increment, grip=self.grip, flat_from=STEEP_PRESSURE / stiffness, across=history.across_at(t)
+            )
             control = replace(
                 self.control.newton, damping=self.damping, max_iterations=patience,
                 bearable=TOO_DEEP * self.deepest if may_rise else np.inf,
             )  # fmt: skip
-            found = self._equilibrate(increment, u, control)
+            found, increment = self._settle(increment, u, control)
             if found.reason:
                 return found.reason
-            kept, deep = anchors, may_rise and found.at.penetration > self.deepest
-            if anchors is not None and not deep:
-                kept = anchors.let_go(*self._tool(increment), found.u)
-            if raises == 0 or (kept is anchors and not deep):
+            if not (may_rise and found.at.penetration > self.deepest):
                 break
-            stiffness, anchors, u = (3.0 if deep else 1.0) * stiffness, kept, found.u
+            stiffness, u = 3.0 * stiffness, found.u
         return self._accept(found, increment, dt, stiffness)
 
-    def _tool(self, increment: Increment) -> tuple[ContactSurface, Indenter]:
-        """The contact surface and the indenter where it is in a step."""
-        assert self.system.surface is not None
-        assert self.system.indenter is not None
-        return self.system.surface, self.system.indenter.moved(increment.displacement)
+    def _settle(
+        self, increment: Increment, u: Array, control: NewtonControl
+    ) -> tuple[Equilibrium, Increment]:
+        """An equilibrium, and the increment with the grip that holds there."""
+        found = self._equilibrate(increment, u, control)
+        for _ in range(MOST_RENEWALS):
+            if found.reason or increment.grip is None or found.at.penetration > control.bearable:
+                return found, increment
+            grip = increment.grip.renewed(*self.system.tool(increment), found.u)
+            if grip is increment.grip:
+                return found, increment
+            increment = replace(increment, grip=grip)
+            found = self._equilibrate(increment, found.u, control)
+            if not found.iterations:
+                return found, increment
+        reason = "" if found.first <= UNSETTLED else "friction does not settle"
+        return replace(found, reason=reason, unsettled=found.first), increment
 
     def _equilibrate(self, increment: Increment, guess: Array, control: NewtonControl) -> Equilibrium:
         """From the predicted displacement or the last one; from the last one where that fails."""
@@ -170,12 +182,17 @@ class Simulation:
                 break  # from elsewhere it would take as many
         return found
 
-    def _predict(self, t: float, displacement: float) -> Array:
+    def _predict(self, t: float) -> Array:
         warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
         if warm is not None:  # what it missed by in the step before, it will miss by in this one
             return warm if last is None else warm + (self.states[-1].u - last)
-        weights = extrapolation(self.states, displacement)
+        weights = self._foreseen(t)
         return np.asarray(sum(w * state.u for w, state in zip(weights, self.states)))
+
+    def _foreseen(self, t: float) -> Array:
+        """Weights of the last states in a guess of the one at time ``t``."""
+        travel = self.problem.history.travel
+        return extrapolation([travel(state.time) for state in self.states], travel(t))
 
     def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
         started = time.perf_counter()
@@ -199,8 +216,8 @@ class Simulation:
         after = self.memory.advanced(self.system, self.laws, stress, dt)
         if self._turns(increment.time, at.force):
             after, self.slope = after.turned(), None if self.slope is None else self.slope.turned()
-        if increment.anchors is not None:
-            self.anchors = increment.anchors.after(*self._tool(increment), u, du)
+        if increment.grip is not None:
+            self.grip = increment.grip.after(*self.system.tool(increment), u, du)
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
@@ -208,11 +225,13 @@ class Simulation:
         self.states = [*self.states[-2:], state]
         if found.residual > self.control.tolerance:
             self.unbalanced.append((increment.displacement, found.residual))
+        if found.unsettled > self.control.tolerance:
+            self.unsettled.append((increment.displacement, found.unsettled))
         self.counts["steps"] += 1
         self.seconds["accept"] += time.perf_counter() - started
         return Step(
             increment.time, increment.displacement, at.force, at.penetration, at.contact_area,
-            found.iterations, force_slope, state,
+            found.iterations, force_slope, np.zeros(3) if at.reaction is None else at.reaction, state,
         )  # fmt: skip
 
     def _turns(self, t: float, force: float) -> bool:
@@ -230,19 +249,32 @@ class Simulation:
         system, laws, at, u = self.system, self.laws, found.at, found.u
         d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
         change = explicit.forces + system.contact_force(u, increment)[..., None] * d_penalty
-        d_reaction = np.zeros(laws.count)
-        if increment.anchors is not None:
-            forces, d_reaction = increment.anchors.explicit(*self._tool(increment), u, increment.penalty)
-            change += forces
+        d_reaction, coupling = np.zeros(laws.count), None
+        if increment.grip is not None:
+            surface, tool = system.tool(increment)
+            stiff = (increment.penalty * surface.areas)[..., None, None]
+            pushed = stiff * increment.grip.explicit(surface, tool, u)
+            change += surface.distributed(tool, pushed)
+            d_reaction -= pushed[:, :, 2].sum(axis=(0, 1))
+            coupling = increment.grip.coupling(surface, tool, u)
+            if coupling is not None:
+                coupling = (tool.frame.T @ (stiff * coupling) @ tool.frame).reshape(-1, 3, 3)
         b = -change.reshape(-1, laws.count)[system.free]
-        weights = extrapolation(self.states, increment.displacement)
+        weights = self._foreseen(increment.time)
         guess = sum(w * s.sensitivity for w, s in zip(weights, self.states) if s.sensitivity is not None)
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
-        advance = np.zeros(u.size) if at.advance is None else at.advance.ravel()
         du = np.zeros((u.size, laws.count))
-        du[system.free], advanced = solve_with_adjoint(at, self.slopes, b, x, advance[system.free])
-        d_force = at.force * d_penalty + d_reaction - advanced
-        return du.reshape(*u.shape, laws.count), d_force
+        du[system.free], d_force = solve_coupled(system, at, self.slopes, b, x, coupling)
+        return du.reshape(*u.shape, laws.count), at.force * d_penalty + d_reaction + d_force
+
+
+def _grip(system: System, friction: str | float, parameters: int) -> Grip | None:
+    """What holds the points at first; None where nothing ever does."""
+    if system.surface is None or friction in ("frictionless", 0.0):
+        return None
+    if isinstance(friction, str):
+        return Anchors.none(system.surface, parameters)
+    return Coulomb.none(float(friction), system.surface, parameters)
 
 
 def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced
+from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced, unsettled
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import System
@@ -116,6 +116,7 @@ def _result(
         parameter_names=problem.parameter_names,
         penetration=penetration,
         contact_area=column("contact_area"),
+        reaction=np.array([np.zeros(3), *(row.reaction for row in rows)]),
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
@@ -137,6 +138,7 @@ def _doubts(
         *slipped(displacement, force),
         *sunk(displacement, penetration, run.deepest, run.stiffness),
         *unbalanced(displacement, run.unbalanced, run.control.tolerance),
+        *unsettled(displacement, run.unsettled),
         *inexact(displacement, run.slopes.counts["inexact"]),
     )
 
@@ -152,6 +154,7 @@ def _statistics(run: Simulation, seconds: float, sunk_steps: int) -> dict[str, A
         "cuts": run.counts["cuts"],
         "sunk_steps": sunk_steps,
         "unbalanced_steps": len(run.unbalanced),
+        "unsettled_steps": len(run.unsettled),
         "penalty_per_mm": run.stiffness,
         "newton_iterations": run.counts["newton_iterations"],
         "factorisations": sum(factor.counts["factorisations"] for factor in used),

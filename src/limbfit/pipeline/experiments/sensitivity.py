@@ -144,12 +144,12 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict
             one,
             replace(one.model, indenter=one.model.indenter.model_copy(update={"friction": friction})),
             identified,
-            friction,
+            friction if isinstance(friction, str) else f"coefficient {friction:g}",
             {"friction": friction},
             base=friction == own,
         )
         for one in chosen
-        for friction in ("frictionless", "sticky")
+        for friction in dict.fromkeys((own, "frictionless", "sticky"))
     ]
     content = _run(context, folder, "sensitivity-contact", chosen, variants)
     store_runs(folder, "sensitivity-contact", content | {"parameters": identified, "friction": own})

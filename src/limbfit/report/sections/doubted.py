@@ -13,6 +13,7 @@ _WORDS = {
     "slipped": "force falls in loading",
     "sunk": "indenter too deep in the skin",
     "unbalanced": "equilibrium beyond the tolerance",
+    "unsettled": "friction not settled",
     "inexact": "inexact sensitivities",
 }
 

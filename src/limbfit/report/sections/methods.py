@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from ...laws import OGDEN
-from ..formats import fixed, number, symbol, unit_of
+from ..formats import fixed, friction, number, symbol, unit_of
 from ..page import Prose, Section
 from ..store import Json, Results
 from ..tables import NOTHING, flatten, mean_and_deviation
@@ -212,9 +212,8 @@ def _contact(store: Results) -> str:
             "Nodes on bones and on the proximal cut are fixed. A rigid "
             f"{indenter.get('shape')} indenter of {indenter.get('width_mm')} mm (edge radius "
             f"{indenter.get('edge_radius_mm')} mm) starts where it just touches the skin and follows the "
-            "recorded "
-            f"displacement along its axis; contact is {indenter.get('friction')}, by a penalty at the skin's "
-            f"quadrature points with {stiff}.",
+            f"recorded displacement along its axis; contact is {friction(indenter.get('friction'))}, by a "
+            f"penalty at the skin's quadrature points with {stiff}.",
             f"The largest penetration was {fixed(max(deepest), 3)} mm." if deepest else "",
         )
     )

@@ -22,7 +22,7 @@ from ..drawing.ink import (
     svg,
     tissue_style,
 )
-from ..formats import fixed, heading, number, numeric
+from ..formats import fixed, friction, heading, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Results
 from ..tables import NOTHING
@@ -234,7 +234,7 @@ def contact_section(store: Results, content: Json) -> Section:
         "of "
         f"the largest force. {_peaks(content)}"
         if content["friction"] == "frictionless"
-        else f"Contact in this study's model is {content['friction']}. {_peaks(content)}"
+        else f"Contact in this study's model is {friction(content['friction'])}. {_peaks(content)}"
     )
     return _simple(store, "sensitivity-contact", "Sensitivity to friction", words, content, _EFFORT)
 

@@ -1,0 +1,121 @@
+"""Coulomb friction as an incremental potential whose normal force and tangent plane are lagged.
+
+The force of a point in touch is at most ``mu`` times its normal force.  In a step it is that of a `Grip` with
+the bound ``mu <-phi>`` mm, where penetration and normal are those of the last equilibrium: a convex potential
+(as in incremental potential contact, Li et al. 2020).  The step is solved again with new ones until they do
+not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks by the penalty
+of the contact, so the width in which sticking goes over into slipping is ``mu`` times the penetration.
+
+A point is anchored where it is at the end of the step in which it first touched; the anchor of one that slips
+follows it at the distance of the bound (return mapping, Wriggers 2006, chapter 5.2).  So what sticks does not
+creep, however many steps it is held for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contact import ContactSurface, Distances
+from .grip import Grip
+from .indenter import Indenter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Coulomb(Grip):
+    """A `Grip` whose bounds are ``mu`` times the penetration."""
+
+    mu: float
+
+    @classmethod
+    def none(cls, mu: float, surface: ContactSurface, parameters: int = 0) -> Coulomb:
+        shape = surface.areas.shape
+        nothing, vectors = np.zeros(shape), np.zeros((*shape, 3))
+        return cls(nothing > 0.0, vectors, vectors, nothing, np.zeros((*shape, 3, parameters)), mu)
+
+    def renewed(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Coulomb:
+        """Planes and bounds as they are at ``u (n, 3)``."""
+        near = Distances.of(surface, indenter, u, self.held)
+        normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
+        normals.reshape(-1, 3)[near.points] = near.slopes
+        bounds.ravel()[near.points] = self.mu * np.maximum(-near.gaps, 0.0)
+        return replace(self, normals=normals, bounds=bounds)
+
+    def after(self, surface: ContactSurface, indenter: Indenter, u: Array, du: Array | None) -> Coulomb:
+        """The anchors at the end of a step: those of new points where they are, those of slipping ones drawn
+        along; planes and bounds are those of ``u (n, 3)``."""
+        now = self.renewed(surface, indenter, u)
+        closed, local = now.bounds > 0.0, surface.local(indenter, u)
+        slip = _Slip.of(now, local)
+        new, drawn = (closed & ~self.held)[..., None], (closed & self.held & ~slip.stuck)[..., None]
+        places = np.where(new, local, np.where(drawn, local - slip.elastic, self.places))
+        d_places = self.d_places
+        if du is not None:
+            moved = surface.moved(indenter, du)
+            tangent = slip.tangent + now._coupling(surface, indenter, u, slip)
+            d_elastic = tangent @ moved - slip.tangent @ d_places
+            d_drawn = np.where(drawn[..., None], moved - d_elastic, d_places)
+            d_places = np.where(new[..., None], moved, d_drawn)
+        return replace(now, held=closed, places=places, d_places=d_places)
+
+    def explicit(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+        """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
+        return np.asarray(-_Slip.of(self, surface.local(indenter, u)).tangent @ self.d_places)
+
+    def coupling(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+        """Derivative (f, q, 3, 3) of the forces, over penalty and area, through planes and bounds, which are
+        those of ``u (n, 3)``."""
+        return self._coupling(surface, indenter, u, _Slip.of(self, surface.local(indenter, u)))
+
+    def _coupling(self, surface: ContactSurface, indenter: Indenter, u: Array, slip: _Slip) -> Array:
+        near = Distances.of(surface, indenter, u, self.held)
+        bends = np.zeros(slip.tangent.shape)
+        bends.reshape(-1, 3, 3)[near.points] = near.bends
+        n, move = self.normals, slip.move
+        across = np.einsum("fqi,fqi->fq", n, move)[..., None, None]
+        turned = -(across * bends + n[..., None] * np.einsum("fqi,fqij->fqj", move, bends)[:, :, None])
+        along = np.einsum("fqi,fqij->fqj", slip.unit, turned)[:, :, None]
+        yielding = -self.mu * slip.unit[..., None] * n[:, :, None]
+        yielding += slip.share * (turned - slip.unit[..., None] * along)
+        found = np.where(slip.stuck[..., None, None], turned, yielding)
+        return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)
+
+
+@dataclass(frozen=True)
+class _Slip:
+    """The slip of the held points (f, q) at one place.
+
+    Parameters
+    ----------
+    move : (f, q, 3) from the anchor, mm.
+    unit : (f, q, 3) direction of the slip in the tangent plane; zero where there is none.
+    stuck : (f, q) which points are within their bounds.
+    elastic : (f, q, 3) the part of the slip that pulls, mm: the force over penalty and area.
+    share : (f, q, 1, 1) of that part.
+    tangent : (f, q, 3, 3) derivative of ``elastic``, planes and bounds held.
+    """
+
+    move: Array
+    unit: Array
+    stuck: NDArray[np.bool_]
+    elastic: Array
+    share: Array
+    tangent: Array
+
+    @classmethod
+    def of(cls, grip: Coulomb, local: Array) -> _Slip:
+        n, move = grip.normals, local - grip.places
+        slip = move - np.einsum("fqi,fqi->fq", n, move)[..., None] * n
+        length = np.linalg.norm(slip, axis=-1)
+        stuck = length < grip.bounds
+        some = np.where(length > 0.0, length, 1.0)
+        unit = slip / some[..., None]
+        share = np.where(stuck, 1.0, grip.bounds / some)[..., None, None]
+        planes = np.eye(3) - n[..., :, None] * n[..., None, :]
+        outer = np.where(stuck[..., None, None], 0.0, unit[..., :, None] * unit[..., None, :])
+        tangent = np.where(grip.held[..., None, None], share * (planes - outer), 0.0)
+        return cls(move, unit, stuck, share[..., 0] * slip, share, tangent)

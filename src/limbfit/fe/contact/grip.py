@@ -1,0 +1,59 @@
+"""What holds contact points along the indenter: sticking, or Coulomb friction, in one form for the kernel.
+
+A held point has an anchor ``a`` in the indenter's frame.  With its move along the tangent plane,
+``s = P (x - a)``, ``P = 1 - n n^T``, its energy is ``eps dA_0 H(|s|)`` with ``H(s) = s^2 / 2`` up to the
+bound ``b`` and ``b s - b^2 / 2`` beyond it: it sticks by the contact's own penalty up to a slip of ``b`` mm,
+and beyond pulls with ``eps b`` whatever the slip.  In a step anchors, planes and bounds are constant, so this
+is a convex potential with a symmetric tangent.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contact import ContactSurface
+from .indenter import Indenter
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Grip(ABC):
+    """The held points among the contact points (f, q), in the indenter's frame.
+
+    Parameters
+    ----------
+    held : (f, q) which points have an anchor.
+    places, normals : (f, q, 3) anchor, mm, and unit normal of the tangent plane.
+    bounds : (f, q) slip at which a point gives way, mm; infinite where it never does.
+    d_places : (f, q, 3, p) derivative of the anchors with respect to the parameters.
+    """
+
+    held: Bools
+    places: Array
+    normals: Array
+    bounds: Array
+    d_places: Array
+
+    @abstractmethod
+    def renewed(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Grip:
+        """The grip that an equilibrium at ``u (n, 3)``, with the indenter where it is, asks for; itself where
+        it holds."""
+
+    @abstractmethod
+    def after(self, surface: ContactSurface, indenter: Indenter, u: Array, du: Array | None) -> Grip:
+        """The grip after a step that ended at ``u (n, 3)``; ``du (n, 3, p)`` its derivative, where wanted."""
+
+    @abstractmethod
+    def explicit(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+        """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
+
+    @abstractmethod
+    def coupling(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array | None:
+        """Derivative (f, q, 3, 3) of the forces, over penalty and area, through what a step holds constant
+        although it follows the displacement; None where nothing does."""

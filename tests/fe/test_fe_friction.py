@@ -1,0 +1,215 @@
+"""Coulomb friction: its law, its limits, derivatives, and what it does not do (creep)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import MUSCLE, SKIN, block, punch
+
+from limbfit.errors import ProblemError
+from limbfit.fe import History, Indenter, NeoHookean, OgdenQLV, Problem, StepControl, Support, System, solve
+from limbfit.fe.contact.friction import Coulomb
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.solution.linear import symmetric_product
+from limbfit.fe.system import Increment
+
+
+class Dragged:
+    """A punch that presses and is dragged: its system, and the potential of the step that follows."""
+
+    def __init__(self, rule: str, shape: str = "sphere", mu: float = 0.3) -> None:
+        tool = Indenter(shape, 20.0, 1.0, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
+        problem = punch("tet10", 4, 1, indenter=tool, contact_rule=rule, start="as-given", friction=mu)
+        self.system, self.laws = System(problem), Laws.build([SKIN, MUSCLE])
+        self.rest = np.zeros((*self.system.weights.shape, 6))
+        self.rng = np.random.default_rng(1)
+        self.u = self.field(0.01)
+        start = self.system.indenter.moved(3.2)
+        grip = Coulomb.none(mu, self.system.surface).after(self.system.surface, start, self.u, None)
+        self.u = self.u + self.field(0.05)
+        self.grip = self.renewed(grip, self.u)
+
+    def field(self, size: float) -> np.ndarray:
+        return size * self.rng.normal(size=self.system.points.shape) * ~self.system.supported
+
+    def increment(self, advance: float, grip: Coulomb) -> Increment:
+        return Increment(0.0, advance, np.zeros(2), self.rest, 0.5, grip, across=(0.03, 0.02))
+
+    def renewed(self, grip: Coulomb, u: np.ndarray) -> Coulomb:
+        return grip.renewed(*self.system.tool(self.increment(3.3, grip)), u)
+
+    def at(self, u: np.ndarray, advance: float = 3.3, grip: Coulomb | None = None):
+        return self.system.evaluate(u, self.laws, self.increment(advance, grip or self.grip))
+
+
+@pytest.mark.parametrize("rule", ["nodes", "gauss"])
+@pytest.mark.parametrize("shape", ["sphere", "square"])
+def test_forces_and_stiffness_of_friction_are_derivatives_of_its_energy(rule, shape):
+    one = Dragged(rule, shape)
+    system, u, h = one.system, one.u, 1e-6
+    d = one.field(1.0)
+    here, ahead, back = one.at(u), one.at(u + h * d), one.at(u - h * d)
+    free = one.at(u, grip=replace(one.grip, held=np.zeros_like(one.grip.held)))
+    assert np.abs(here.residual - free.residual).max() > 0.01 * np.abs(free.residual).max()
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
+    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
+    rise = (one.at(u, 3.3 + h).energy - one.at(u, 3.3 - h).energy) / (2 * h)
+    assert rise == pytest.approx(here.force, rel=1e-5)
+    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
+    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
+
+
+@pytest.mark.parametrize("mu", [0.05, 0.3, 30.0])
+def test_coupling_is_what_a_step_holds_constant(mu):
+    """Contact forces with planes and bounds renewed at every displacement: springs and coupling together."""
+    one = Dragged("gauss", mu=mu)
+    system, u, h = one.system, one.u, 1e-6
+    d = one.field(1.0)
+    ahead, back = (
+        system.contact_force(v, one.increment(3.3, one.renewed(one.grip, v))) for v in (u + h * d, u - h * d)
+    )
+    change = ((ahead - back) / (2 * h)).reshape(-1, 1)[system.free]
+    surface, tool = system.tool(one.increment(3.3, one.grip))
+    coupling = (0.5 * surface.areas)[..., None, None] * one.grip.coupling(surface, tool, u)
+    coupling = (tool.frame.T @ coupling @ tool.frame).reshape(-1, 3, 3)
+    moved = system.springs_of(d.reshape(-1, 1)[system.free])
+    lagged = system.at_springs(coupling @ moved)
+    assert np.abs(lagged).max() > (0.0 if mu > 1.0 else 0.02) * np.abs(change).max()  # little where all stick
+    found = system.at_springs(one.at(u).touch.blocks @ moved) + lagged
+    np.testing.assert_allclose(found, change, atol=1e-5 * np.abs(change).max())
+
+
+def dragged_block(mu: float | str, history: History) -> Problem:
+    """A block of 20 x 20 x 10 mm under a plate that is wider than it will ever be dragged."""
+    lines = np.linspace(0.0, 20.0, 5)
+    mesh = block("hex8", lines, lines, np.linspace(-10.0, 0.0, 4))
+    plate = Indenter("square", 60.0, centre=(10.0, 10.0, 0.0), axis=(0, 0, -1), edge=(1, 0, 0))
+    material = NeoHookean(0.01)
+    return Problem(
+        mesh, {"skin": material, "muscle": material}, mesh.node_sets["bottom"], mesh.face_sets["top"], plate,
+        history, friction=mu,
+    )  # fmt: skip
+
+
+PRESS_AND_DRAG = History(
+    np.array([0.0, 1.0, 3.0]), np.array([0.0, 1.0, 1.0]), np.array([[0.0, 0.0], [0.0, 0.0], [8.0, 0.0]])
+)
+DRAG_TIMES = tuple(np.concatenate([np.linspace(0.25, 1.0, 4), np.linspace(1.2, 3.0, 10)]))
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.3, 0.5])  # with 0.8 a block this soft rolls before it slips
+def test_at_full_slip_the_friction_is_mu_times_the_normal_force(mu):
+    result = solve(dragged_block(mu, PRESS_AND_DRAG), StepControl(times=DRAG_TIMES))
+    assert result.completed, result.reason
+    assert not result.doubts
+    across = np.linalg.norm(result.reaction[:, :2], axis=1)
+    assert across[-1] == pytest.approx(mu * result.force[-1], rel=1e-3)
+    assert (across <= mu * result.force * (1.0 + 1e-3)).all()
+    np.testing.assert_allclose(result.reaction[:, 2], result.force)
+
+
+def test_what_sticks_does_not_creep():
+    """Half of what it takes to slip, held for 40 steps: the force across stays as it is."""
+    history = History(
+        np.array([0.0, 1.0, 2.0, 100.0]), np.array([0.0, 1.0, 1.0, 1.0]),
+        np.array([[0.0, 0.0], [0.0, 0.0], [0.4, 0.0], [0.4, 0.0]]),
+    )  # fmt: skip
+    times = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, *np.linspace(4.0, 100.0, 40))
+    result = solve(dragged_block(0.8, history), StepControl(times=times))
+    assert result.completed, result.reason
+    held = result.times >= 2.0
+    force = result.reaction[held, 0]
+    assert force[0] < 0.6 * 0.8 * result.force[-1]
+    np.testing.assert_allclose(force, force[0], rtol=1e-3)
+
+
+def test_friction_lies_between_frictionless_and_sticky():
+    """Without friction and with a very large coefficient it is what those two are."""
+    tool = Indenter("sphere", 40.0, centre=(0.0, 0.0, 1.0))
+    problem = punch("tet10", 4, 1, indenter=tool, depth=4.0)
+    control = StepControl(load_steps=5, unload_steps=5)
+    free, none, some, much, stuck = (
+        solve(replace(problem, friction=friction), control).force
+        for friction in ("frictionless", 1e-6, 0.3, 1e3, "sticky")
+    )
+    np.testing.assert_allclose(none, free, atol=1e-4 * free.max())
+    np.testing.assert_allclose(much, stuck, atol=5e-3 * stuck.max())
+    assert free.max() < some.max() < stuck.max()
+    np.testing.assert_array_equal(solve(replace(problem, friction=0.0), control).force, free)
+
+
+@pytest.mark.parametrize("shape", ["square", "sphere"])
+@pytest.mark.parametrize("mu", [0.1, 0.5])
+def test_sensitivities_with_friction_equal_central_differences(shape, mu):
+    """Along one direction in the space of all eight parameters, pressing, dragging and letting go."""
+    tight = StepControl(load_steps=3, unload_steps=2, tolerance=1e-9)
+    tool = Indenter(shape, 30.0, 2.0 * (shape == "square"), axis=(0.05, 0.02, -1.0), centre=(0, 0, 3.0))
+    times = np.array([0.0, 4.0, 6.0, 10.0])
+    across = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.5], [1.0, 0.5]])
+    history = History(times, np.array([0.0, 4.0, 4.0, 0.0]), across)
+    problem = punch("tet10", 2, 1, indenter=tool, friction=mu, history=history)
+    centre = solve(problem, tight, sensitivities=True, store="all")
+    assert centre.completed
+    assert not centre.doubts
+    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
+
+    def force(sign: int) -> np.ndarray:
+        values = (problem.parameters + sign * change).reshape(2, 4)
+        changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
+        return solve(problem.with_materials(changed), tight, warm_start=centre).force
+
+    difference, slope = 0.5 * (force(1) - force(-1)), centre.force_sensitivity @ change
+    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("friction", ["rough", -0.1, float("nan"), float("inf"), True])
+def test_friction_that_is_none_is_refused(friction):
+    with pytest.raises(ProblemError, match="unknown friction"):
+        solve(punch("tet4", 2, 1, friction=friction))
+
+
+def test_a_move_across_needs_two_numbers_for_each_time():
+    with pytest.raises(ProblemError, match="across"):
+        History(np.array([0.0, 1.0]), np.array([0.0, 1.0]), np.zeros((2, 3)))
+
+
+def partial_slip(mu: float, radius: float, depth: float) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Drag (mm) and force across (N) of a ball on a half-space from sticking to slipping; its normal force
+    and its contact radius.  Half of it is solved, to 100 contact radii away."""
+    a = np.sqrt(radius * depth)
+    near, far = np.linspace(0.0, 1.32, 12), np.array([1.6, 2.1, 3.0, 4.5, 7.0, 12.0, 22.0, 45.0, 100.0])
+    lines = a * np.concatenate([near, far])
+    z = a * np.array([0.0, 0.1, 0.2, 0.32, 0.46, 0.65, 0.9, 1.3, 1.9, 2.9, 4.5, 7.0, 12.0, 22.0, 45.0, 100.0])
+    mesh = block("hex8", np.concatenate([-lines[:0:-1], lines]), lines, -z[::-1])
+    X = mesh.points
+    far_off = np.flatnonzero((np.abs(X[:, :2]) > lines[-1] - 1e-9).any(axis=1) | (X[:, 2] < 1e-9 - z[-1]))
+    middle = (Support(np.flatnonzero(np.abs(X[:, 1]) < 1e-9), 1),)
+    law, limit = NeoHookean(0.01), 1.5 * mu * depth
+    history = History(
+        np.array([0.0, 1.0, 2.0]), np.array([0.0, depth, depth]),
+        np.array([[0.0, 0.0], [0.0, 0.0], [1.2 * limit, 0.0]]),
+    )  # fmt: skip
+    tool = Indenter("sphere", 2.0 * radius, axis=(0, 0, -1), edge=(1, 0, 0))
+    problem = Problem(
+        mesh, {"skin": law, "muscle": law}, far_off, mesh.face_sets["top"], tool, history, supports=middle,
+        friction=mu, start="as-given", contact_rule="nodes",
+    )  # fmt: skip
+    result = solve(problem, StepControl(times=(0.5, 1.0, *np.linspace(1.1, 2.0, 10)), penalty=2000.0))
+    assert result.completed, result.reason
+    drag = np.array([history.across_at(t)[0] for t in result.times])[2:]
+    return drag, 2.0 * result.reaction[2:, 0], 2.0 * result.force[2], a
+
+
+@pytest.mark.slow
+def test_partial_slip_of_a_ball_is_that_of_cattaneo_and_mindlin():
+    """Johnson, Contact Mechanics, eq. 7.42, of a rigid ball on a half-space:
+    ``drag = 3 mu P (2 - nu) / (16 a G) (1 - (1 - Q / (mu P))^(2/3))``, full slip beyond."""
+    mu, G, nu = 0.3, 0.01, (3 * 100.0 - 2) / (2 * (3 * 100.0 + 1))
+    drag, Q, P, a = partial_slip(mu, 100.0, 0.04)
+    limit = 3 * mu * P * (2 - nu) / (16 * a * G)
+    expected = mu * P * (1.0 - np.maximum(1.0 - drag / limit, 0.0) ** 1.5)
+    assert drag[-1] > limit
+    np.testing.assert_allclose(Q, expected, atol=0.03 * mu * P)
