@@ -217,7 +217,6 @@ element = "tet10"
 [mesh.coarse]
 edge_near_mm = 6.0
 [calibration]
-
 tied = [
     ["skin.a_kPa", "muscle.a_kPa"], ["skin.b", "muscle.b"], ["skin.gamma", "muscle.gamma"],
     ["skin.tau_s", "muscle.tau_s"],

@@ -6,7 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbfit.bench.blocks import HEX, SIX_TETS, boxes, upright
-from limbfit.fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, Support
+from limbfit.fe import (
+    ELEMENTS,
+    History,
+    Indenter,
+    OgdenQLV,
+    Problem,
+    Result,
+    StepControl,
+    Support,
+    solve,
+)
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
 
 HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
@@ -112,3 +122,17 @@ def quarter_punch(element: str, refinement: int, depth: float = 6.0, speed: floa
         mesh, {"skin": SKIN, "muscle": MUSCLE}, mesh.node_sets["bottom"], mesh.face_sets["top"], tool,
         history, supports=symmetry(mesh), element=element,
     )  # fmt: skip
+
+
+def slope_and_difference(centre: Result, control: StepControl) -> tuple[np.ndarray, np.ndarray]:
+    """Change of a punch's force along one direction of all eight parameters: by its sensitivities, and by
+    central differences about ``centre``, which kept all states."""
+    problem = centre.problem
+    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
+
+    def force(sign: int) -> np.ndarray:
+        values = (problem.parameters + sign * change).reshape(2, 4)
+        changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
+        return solve(problem.with_materials(changed), control, warm_start=centre).force
+
+    return centre.force_sensitivity @ change, 0.5 * (force(1) - force(-1))

@@ -171,10 +171,8 @@ def _solve_from_rest(
     known = _prepare(model, tissues)
     kept = known.rested.get(sensitivities)
     if kept is None or kept[0] != parameters:
-        values, store = (
-            to_parameters(np.array(parameters), tissues, model.law),
-            "all" if sensitivities else "peak",
-        )
+        values = to_parameters(np.array(parameters), tissues, model.law)
+        store = "all" if sensitivities else "peak"
         found = _solve(model, values, sensitivities=sensitivities, store=store)
         kept = parameters, replace(found, states=tuple(map(_lightened, found.states)))
         known.rested[sensitivities] = kept

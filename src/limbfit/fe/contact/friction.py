@@ -39,7 +39,9 @@ class Coulomb(Grip):
 
     def renewed(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Coulomb:
         """Planes and bounds as they are at ``u (n, 3)``."""
-        near = Distances.of(surface, indenter, u, self.held)
+        return self._at(Distances.of(surface, indenter, u, self.held))
+
+    def _at(self, near: Distances) -> Coulomb:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
         normals.reshape(-1, 3)[near.points] = near.slopes
         bounds.ravel()[near.points] = self.mu * np.maximum(-near.gaps, 0.0)
@@ -48,7 +50,8 @@ class Coulomb(Grip):
     def after(self, surface: ContactSurface, indenter: Indenter, u: Array, du: Array | None) -> Coulomb:
         """The anchors at the end of a step: those of new points where they are, those of slipping ones drawn
         along; planes and bounds are those of ``u (n, 3)``."""
-        now = self.renewed(surface, indenter, u)
+        near = Distances.of(surface, indenter, u, self.held)
+        now = self._at(near)
         closed, local = now.bounds > 0.0, surface.local(indenter, u)
         slip = _Slip.of(now, local)
         new, drawn = (closed & ~self.held)[..., None], (closed & self.held & ~slip.stuck)[..., None]
@@ -56,7 +59,7 @@ class Coulomb(Grip):
         d_places = self.d_places
         if du is not None:
             moved = surface.moved(indenter, du)
-            tangent = slip.tangent + now._coupling(surface, indenter, u, slip)
+            tangent = slip.tangent + now._coupling(near, slip)
             d_elastic = tangent @ moved - slip.tangent @ d_places
             d_drawn = np.where(drawn[..., None], moved - d_elastic, d_places)
             d_places = np.where(new[..., None], moved, d_drawn)
@@ -69,10 +72,10 @@ class Coulomb(Grip):
     def coupling(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
         """Derivative (f, q, 3, 3) of the forces, over penalty and area, through planes and bounds, which are
         those of ``u (n, 3)``."""
-        return self._coupling(surface, indenter, u, _Slip.of(self, surface.local(indenter, u)))
-
-    def _coupling(self, surface: ContactSurface, indenter: Indenter, u: Array, slip: _Slip) -> Array:
         near = Distances.of(surface, indenter, u, self.held)
+        return self._coupling(near, _Slip.of(self, surface.local(indenter, u)))
+
+    def _coupling(self, near: Distances, slip: _Slip) -> Array:
         bends = np.zeros(slip.tangent.shape)
         bends.reshape(-1, 3, 3)[near.points] = near.bends
         n, move = self.normals, slip.move
