@@ -23,10 +23,13 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 from __future__ import annotations
 
 from .contact.indenter import Indenter
+from .contact.open_surface import OpenSurface
 from .contact.rigid_surface import RigidSurface
 from .doubts import Doubt
 from .kernel.elements import ELEMENTS
 from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from .motion import Motion, RigidBody
+from .pressure import Pressure
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .solution.control import StepControl
@@ -44,11 +47,15 @@ __all__ = [
     "Indenter",
     "Material",
     "MooneyRivlin",
+    "Motion",
     "NeoHookean",
     "Ogden",
     "OgdenQLV",
+    "OpenSurface",
+    "Pressure",
     "Problem",
     "Result",
+    "RigidBody",
     "RigidSurface",
     "State",
     "Step",
