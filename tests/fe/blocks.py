@@ -125,6 +125,23 @@ def quarter_punch(element: str, refinement: int, depth: float = 6.0, speed: floa
     )  # fmt: skip
 
 
+def sector(radii: NDArray, n: int, cell_type: str = "hex8") -> Mesh:
+    """A quarter of a tube about z, one element high; node sets of its planes, face sets of its walls."""
+    z = np.array([0.0, float(radii[-1] - radii[0]) / 4])
+    mesh = block(cell_type, radii, np.linspace(0.0, np.pi / 2, n + 1), z)
+    r, angle, height = mesh.points.T
+    points = np.column_stack([r * np.cos(angle), r * np.sin(angle), height])
+    faces = boundary(mesh.cells, cell_type)
+    at = r[faces].mean(axis=1)
+    sets = {"y0": np.flatnonzero(angle < 1e-9), "x0": np.flatnonzero(angle > np.pi / 2 - 1e-9)}
+    sets |= {"ends": np.flatnonzero((height < 1e-9) | (height > z[-1] - 1e-9))}
+    inside, outside = (faces[np.abs(at - value) < 1e-6] for value in (radii[0], radii[-1]))
+    return Mesh(
+        points, mesh.cells, cell_type, mesh.regions, mesh.region_names, sets,
+        {"inside": inside, "outside": outside},
+    )  # fmt: skip
+
+
 def drive(advance: float, x: float = 0.0, y: float = 0.0) -> Drives:
     """What drives an indenter that has gone ``advance`` mm, and ``x, y`` mm across."""
     return Drives(np.array([[x, y, advance, 0.0, 0.0, 0.0]]), np.zeros((1, 6), dtype=bool))

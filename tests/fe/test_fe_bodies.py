@@ -6,11 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, punch
+from blocks import MUSCLE, SKIN, block, punch, sector
 from scipy.spatial.transform import Rotation
 
 from limbfit.errors import ProblemError
-from limbfit.fe import History, Indenter, Motion, OgdenQLV, RigidBody, StepControl, System, solve
+from limbfit.fe import (
+    History,
+    Indenter,
+    Motion,
+    NeoHookean,
+    OgdenQLV,
+    OpenSurface,
+    Problem,
+    RigidBody,
+    StepControl,
+    Support,
+    System,
+    solve,
+)
 from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.pose import Pose
 from limbfit.fe.kernel.laws import Laws
@@ -227,3 +240,75 @@ def test_a_motion_is_told_what_is_wrong():
         Motion.of([0.0, 1.0], z=[1.0, 2.0, 3.0])
     with pytest.raises(ProblemError, match="displacement or one of force"):
         History(TIMES)
+
+
+def test_a_bar_under_a_held_force_creeps_as_the_closed_form():
+    """Small strain, one Prony term: 1/E creeps as a standard linear solid in shear over a constant bulk."""
+    mu, gamma, tau, seconds = 0.01, 2.0, 0.5, 0.05
+    law = OgdenQLV(mu, 2.0, gamma, tau)
+    lines = np.linspace(0.0, 10.0, 3)
+    mesh = block("hex8", lines, lines, lines - 10.0)
+    shear, bulk = law.shear_modulus, law.kappa_ratio * mu
+    force = 1e-3 * 3.0 * shear * 100.0
+    on = np.abs(mesh.points) < 1e-9
+    planes = (Support(np.flatnonzero(on[:, 0]), 0), Support(np.flatnonzero(on[:, 1]), 1))
+    planes += (Support(mesh.node_sets["bottom"], 2),)
+    times = np.array([0.0, seconds, 3.0])
+    plate = Indenter("square", 60.0, centre=(5.0, 5.0, 0.0), axis=(0, 0, -1), edge=(1, 0, 0))
+    problem = Problem(
+        mesh, {"skin": law, "muscle": law}, np.zeros(0, int), mesh.face_sets["top"], plate,
+        History(times, force=np.array([0.0, force, force])), supports=planes,
+    )  # fmt: skip
+    creeping = seconds + (times[-1] - seconds) * (np.arange(1, 41) / 40) ** 2
+    steps = (*np.linspace(0.0, seconds, 6)[1:], *creeping)
+    found = solve(problem, StepControl(times=steps, penalty=1e6, hold_penalty=True, tolerance=1e-8))
+    assert found.completed, found.reason
+
+    def compliance(t):
+        """Strain per stress after a step of stress, integrated over a ramp of ``seconds``."""
+        slow = tau * (1.0 + gamma)
+        ramped = slow / seconds * (np.exp(-(t - seconds) / slow) - np.exp(-t / slow))
+        return (1.0 - gamma / (1.0 + gamma) * ramped) / (3.0 * shear) + 1.0 / (9.0 * bulk)
+
+    held = found.times >= seconds - 1e-9
+    expected = 10.0 * force / 100.0 * compliance(found.times[held])
+    assert expected[-1] > 2.0 * expected[0]
+    np.testing.assert_allclose(found.displacement[held], expected, rtol=5e-3)
+
+
+def ring(radius: float, wide: float, n: int, length: float) -> OpenSurface:
+    """A quarter of a rigid ring seen from inside, ``length`` mm long, and a cone as long before it."""
+    angles = np.linspace(0.0, np.pi / 2, n + 1)
+    rows = [(-length, radius), (0.0, radius), (length, wide)]
+    points = np.array([(r * np.cos(a), r * np.sin(a), z) for z, r in rows for a in angles])
+    quads = [(i * (n + 1) + j, i * (n + 1) + j + 1) for i in range(2) for j in range(n)]
+    faces = [t for a, b in quads for t in ((a, a + n + 1, b), (b, a + n + 1, b + n + 1))]
+    return OpenSurface(points, np.array(faces))
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.2])
+def test_a_press_fit_is_lames_and_comes_off_by_its_friction(mu):
+    """A rigid ring pushed over a tube: the pressure of plane strain, small strain; and the pull mu p A."""
+    inner, outer, n, overlap = 10.0, 20.0, 24, 0.04
+    law = NeoHookean(0.01, kappa_ratio=20.0)
+    mesh = sector(np.linspace(inner, outer, 13), n)
+    height = float(mesh.points[:, 2].max())
+    sets = mesh.node_sets
+    planes = (Support(sets["y0"], 1), Support(sets["x0"], 0), Support(sets["ends"], 2))
+    shape = ring(outer - overlap, outer + overlap, n, 4.0 * height)
+    shape = shape.moved(-4.5 * height)
+    push = Motion.of([0.0, 1.0, 2.0], z=[0.0, 6.5 * height, 7.0 * height])
+    body = RigidBody(shape, mesh.face_sets["outside"], push, mu)
+    problem = Problem(
+        mesh, dict.fromkeys(mesh.region_names, law), np.zeros(0, int), np.zeros((0, 4), int), None, STILL,
+        supports=planes, bodies=(body,),
+    )  # fmt: skip
+    times = (*np.linspace(0.0, 1.0, 21)[1:], 1.25, 1.5, 2.0)
+    found = solve(problem, StepControl(times=times, penalty=2000.0, hold_penalty=True, penetration=1.0))
+    assert found.completed, found.reason
+    G, K, a, b = law.shear_modulus, law.kappa_ratio * law.shear_modulus, inner, outer
+    E, nu = 9 * K * G / (3 * K + G), (3 * K - 2 * G) / (2 * (3 * K + G))
+    pressure = overlap * E * (b**2 - a**2) / (b * (1 + nu) * ((1 - 2 * nu) * b**2 + a**2))
+    radial, axial = -found.reactions[-1, 0, 0], found.reactions[-1, 0, 2]
+    assert radial == pytest.approx(pressure * b * height, rel=0.01)
+    assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01, abs=1e-6 * radial)

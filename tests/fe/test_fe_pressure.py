@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, boundary, punch
+from blocks import MUSCLE, SKIN, block, boundary, punch, sector
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
@@ -79,23 +79,6 @@ def at_without(system: System, laws: Laws, u: np.ndarray) -> np.ndarray:
     """The residual at ``u`` without a pressure."""
     rest = np.zeros((*system.weights.shape, 6))
     return system.evaluate(u, laws, Increment(0.0, 0.0, np.zeros(2), rest, 0.5)).residual
-
-
-def sector(radii: np.ndarray, n: int, cell_type: str = "hex8") -> Mesh:
-    """A quarter of a tube about z, one element high; node sets of its planes, face sets of its walls."""
-    z = np.array([0.0, float(radii[-1] - radii[0]) / 4])
-    mesh = block(cell_type, radii, np.linspace(0.0, np.pi / 2, n + 1), z)
-    r, angle, height = mesh.points.T
-    points = np.column_stack([r * np.cos(angle), r * np.sin(angle), height])
-    faces = boundary(mesh.cells, cell_type)
-    at = r[faces].mean(axis=1)
-    sets = {"y0": np.flatnonzero(angle < 1e-9), "x0": np.flatnonzero(angle > np.pi / 2 - 1e-9)}
-    sets |= {"ends": np.flatnonzero((height < 1e-9) | (height > z[-1] - 1e-9))}
-    inside, outside = (faces[np.abs(at - value) < 1e-6] for value in (radii[0], radii[-1]))
-    return Mesh(
-        points, mesh.cells, cell_type, mesh.regions, mesh.region_names, sets,
-        {"inside": inside, "outside": outside},
-    )  # fmt: skip
 
 
 def held(mesh: Mesh) -> tuple[Support, ...]:

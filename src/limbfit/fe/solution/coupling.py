@@ -1,72 +1,148 @@
-"""Linear systems of an equilibrium that friction makes unsymmetric.
+"""What a step holds constant although it follows the displacement, taken in: friction, rims of pressures.
 
-The tangent ``K`` of a step holds normal force and plane of friction constant.  At equilibrium they follow
-the displacement, by blocks ``C`` at the contact points: the derivative ``x`` solves ``(K + C) x = b``, by
-iterating ``K x = b - C x`` with the factor that Newton has, as the equilibrium itself was found.
+The tangent ``K`` of a step holds the normal force and plane of friction constant, and the rim's part of a
+follower pressure.  At equilibrium they follow the displacement, by an unsymmetric ``C``.  Equilibrium with
+all of them as they are there is found by Newton's method with ``K + C``, and so are its derivatives, both by
+GMRES with the factor that Newton has as the preconditioner.  Renewing them alone, a fixed point, diverges
+where a body wedges itself in: there ``K^-1 C`` is larger than one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
-import scipy.sparse as sp
+import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from ..system import Evaluation, System
-from .direction import touching
+from ..kernel.laws import Laws
+from ..system import Evaluation, Increment, System
+from .direction import preconditioner, touching
 from .factor import Factor
+from .linear import NotPositiveDefiniteError
+from .newton import Equilibrium, NewtonControl, reaction_scale, residual_norm
 from .sensitivity import TOLERANCE, solve_with_adjoint
 
 Array = NDArray[np.float64]
-MOST_SWEEPS = 60
+# GMRES: vectors that it keeps, and how often it starts anew; the residual of Newton's directions.
+VECTORS, RESTARTS, FORCING = 40, 4, 1e-2
+# Newton's iterations, halvings of its step, and the share by which a full step must lower the residual.
+MOST_ITERATIONS, MOST_HALVINGS, LOWERED = 20, 6, 0.1
+
+
+class Coupling:
+    """The matrix C of a step at one displacement, by its products."""
+
+    def __init__(self, system: System, increment: Increment, u: Array) -> None:
+        self._bodies = system.bodies
+        self._rims = system.pressures.coupling(u, increment.pressures) if increment.pressures else None
+        self._blocks: Array | None = None
+        for i, (grip, tool) in enumerate(zip(increment.grips, system.tools(u, increment))):
+            found = None if grip is None else grip.coupling(tool)
+            if found is None:
+                continue
+            if self._blocks is None:
+                self._blocks = np.zeros((touching(system).count, 3, 3))
+            stiff = (increment.penalty * tool.surface.areas)[..., None, None]
+            in_space = tool.body.frame.T @ (stiff * found) @ tool.body.frame
+            self._blocks[touching(system).all[i].points] = in_space.reshape(-1, 3, 3)
+
+    def __bool__(self) -> bool:
+        return self._rims is not None or self._blocks is not None
+
+    def __call__(self, x: Array) -> Array:
+        """``C x (n, p)``."""
+        out = np.zeros_like(x) if self._rims is None else self._rims @ x
+        if self._blocks is None or self._bodies is None:
+            return np.asarray(out)
+        return np.asarray(out + self._bodies.at_springs(self._blocks @ self._bodies.springs_of(x)))
+
+    def along(self, x: Array) -> Array:
+        """What ``C x`` changes the force of the first body along its axis by (p,), N."""
+        if self._blocks is None or self._bodies is None:
+            return np.zeros(x.shape[1])
+        return self._bodies.along(self._blocks @ self._bodies.springs_of(x))
+
+
+def renewed(system: System, increment: Increment, u: Array) -> Increment:
+    """The step with grips and rims as they are at ``u (r, 3)``; itself where nothing changes."""
+    grips = tuple(g and g.renewed(tool) for g, tool in zip(increment.grips, system.tools(u, increment)))
+    if not increment.pressures and all(new is old for new, old in zip(grips, increment.grips)):
+        return increment
+    rims = system.pressures.rims(u, increment.pressures) if increment.pressures else 0.0
+    return replace(increment, grips=grips, rims=rims)
 
 
 def solve_coupled(
-    system: System, at: Evaluation, factor: Factor, b: Array, guess: Array,
-    couplings: Sequence[tuple[int, Array]], rims: sp.csr_matrix | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Solutions (n, p) for ``b (n, p)``, and what they change the force along the indenter's axis by (p,), N.
-
-    ``couplings``: numbers of rigid bodies with C (c, 3, 3) at their contact points, N/mm; ``rims (n, n)``:
-    C of follower pressures.
-    """
+    system: System, at: Evaluation, factor: Factor, b: Array, guess: Array, coupling: Coupling
+) -> tuple[Array, Array]:
+    """Solutions (n, p) for ``b (n, p)``, and what they change the force of the first body by (p,), N."""
     advance = np.zeros(len(b)) if at.advance is None else at.advance.ravel()[system.free]
-    if not couplings and rims is None:
+    if not coupling:
         x, advanced = solve_with_adjoint(at, factor, b, guess, advance)
         return x, -advanced
-    coupling = _Coupling(system, couplings, rims)
-    x, last = guess, coupling(guess)
-    bearable = TOLERANCE * np.linalg.norm(b, axis=0)
-    for _ in range(MOST_SWEEPS):
-        x, advanced = solve_with_adjoint(at, factor, b - last, x, advance)
-        before, last = last, coupling(x)
-        if (np.linalg.norm(last - before, axis=0) <= bearable).all():
-            break
-    else:
-        factor.counts["inexact"] += 1
-    return x, coupling.along(x) - advanced
+    x = _gmres(at, factor, coupling, b, guess, 0.1 * TOLERANCE)
+    return x, coupling.along(x) - advance @ x
 
 
-class _Coupling:
-    """The products ``C x`` of all that a step holds constant."""
+def _gmres(
+    at: Evaluation, factor: Factor, coupling: Coupling, b: Array, guess: Array, tolerance: float
+) -> Array:
+    """Solutions (n, p) of ``(K + C) x = b``; columns that are not within the tolerance count as inexact."""
+    apply, shape = preconditioner(at, factor), (len(b), len(b))
 
-    def __init__(
-        self, system: System, couplings: Sequence[tuple[int, Array]], rims: sp.csr_matrix | None
-    ) -> None:
-        self._bodies, self._rims = system.bodies, rims
-        self._blocks = np.zeros((0 if system.bodies is None else system.bodies.count, 3, 3))
-        for i, found in couplings:
-            self._blocks[touching(system).all[i].points] = found
+    def product(x: Array) -> Array:
+        x = x.reshape(-1, 1)
+        return (factor.product(at.tangent, x) + coupling(x)).ravel()
 
-    def __call__(self, x: Array) -> Array:
-        out = np.zeros_like(x) if self._rims is None else self._rims @ x
-        return out if self._bodies is None else out + self._bodies.at_springs(self._pushed(x))
+    A = spla.LinearOperator(shape, matvec=product, dtype=float)
+    M = spla.LinearOperator(shape, matvec=lambda r: apply(r.reshape(-1, 1)).ravel(), dtype=float)
+    out = guess.copy()
+    for i in range(b.shape[1]):
+        out[:, i], failed = spla.gmres(
+            A, b[:, i], guess[:, i], rtol=tolerance, restart=VECTORS, maxiter=RESTARTS, M=M
+        )
+        factor.counts["inexact"] += int(failed > 0)
+    return out
 
-    def _pushed(self, x: Array) -> Array:
-        assert self._bodies is not None
-        return np.asarray(self._blocks @ self._bodies.springs_of(x))
 
-    def along(self, x: Array) -> Array:
-        """What it changes the force of the first body along its axis by (p,), N."""
-        return np.zeros(x.shape[1]) if self._bodies is None else self._bodies.along(self._pushed(x))
+def couple(
+    system: System, laws: Laws, increment: Increment, u: Array, factor: Factor, control: NewtonControl,
+    floor: float, seconds: defaultdict[str, float],
+) -> tuple[Equilibrium, Increment] | None:  # fmt: skip
+    """Equilibrium near ``u (r, 3)`` with grips and rims as they are there; None where it is not found.
+
+    Newton's method on the residual, which must fall at every step: there is no energy.
+    """
+
+    def look(x: Array) -> tuple[Increment, Evaluation]:
+        started = time.perf_counter()
+        there = renewed(system, increment, x)
+        at = system.evaluate(x, laws, there)
+        seconds["assembly"] += time.perf_counter() - started
+        return there, at
+
+    now, here = look(u)
+    for iteration in range(MOST_ITERATIONS):
+        norm, scale = residual_norm(system, here), reaction_scale(system, here, floor)
+        if norm <= control.tolerance * scale:
+            return Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now
+        b = -here.residual.ravel()[system.free][:, None]
+        try:
+            d = _gmres(here, factor, Coupling(system, now, u), b, np.zeros_like(b), FORCING)
+        except NotPositiveDefiniteError:
+            return None
+        direction = np.zeros(here.residual.size)
+        direction[system.free] = d[:, 0]
+        way, step = direction.reshape(u.shape), 1.0
+        for _ in range(MOST_HALVINGS):
+            there, at = look(u + step * way)
+            if np.isfinite(at.energy) and residual_norm(system, at) <= (1.0 - LOWERED * step) * norm:
+                break
+            step *= 0.5
+        else:
+            return None
+        u, now, here = u + step * way, there, at
+    return None

@@ -7,6 +7,7 @@ solution.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -159,6 +160,14 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     if not found.convex:
         return factor.solve_indefinite(at.tangent, b, tolerance, x)
     return found.x
+
+
+def preconditioner(at: Evaluation, factor: Factor) -> Callable[[Array], Array]:
+    """The factor's solution of vectors (n, r), with the contact springs of an evaluation."""
+    if not factor.ready or not factor.lasting:
+        renew(at, factor)
+    springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
+    return lambda r: factor.precondition(r, springs)
 
 
 def _begin(system: System, at: Evaluation, factor: Factor) -> None:

@@ -21,7 +21,7 @@ from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
 from ..threads import single_threaded_numpy
 from .control import StepControl, schedule
-from .coupling import solve_coupled
+from .coupling import Coupling, couple, renewed, solve_coupled
 from .direction import renew
 from .factor import Factor
 from .guesses import Warm, extrapolation
@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
 TOO_DEEP, MOST_RAISES = 1.2, 5
+# Residual over reactions at which what a step holds constant is let go along.
+NEARLY = 0.1
 # How often the grip of a step is renewed; residual over reactions that is left then and is taken as it is.
 MOST_RENEWALS, UNSETTLED = 30, 1e-2
 # Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
@@ -154,17 +156,24 @@ class Simulation:
         self, increment: Increment, u: Array, control: NewtonControl
     ) -> tuple[Equilibrium, Increment]:
         """An equilibrium, and the increment with the grips and the rims of pressures that hold there."""
-        found = self._equilibrate(increment, self.system.impose(u, increment), control)
+        start = self.system.impose(u, increment)
+        lags = bool(Coupling(self.system, increment, start))
+        loosely = replace(control, tolerance=max(control.tolerance, NEARLY)) if lags else control
+        found = self._equilibrate(increment, start, loosely)
         for _ in range(MOST_RENEWALS):
-            lags = any(increment.grips) or increment.pressures
-            if found.reason or not lags or found.at.penetration > control.bearable:
+            if found.reason or found.at.penetration > control.bearable:
                 return found, increment
-            tools = self.system.tools(found.u, increment)
-            grips = tuple(g and g.renewed(tool) for g, tool in zip(increment.grips, tools))
-            if not increment.pressures and all(new is old for new, old in zip(grips, increment.grips)):
+            if lags:
+                settled = couple(
+                    self.system, self.laws, increment, found.u, self.factor, control, self.floor, self.seconds
+                )
+                if settled is not None:
+                    self.counts["newton_iterations"] += settled[0].iterations
+                    return settled
+            again = renewed(self.system, increment, found.u)
+            if again is increment:
                 return found, increment
-            rims = self.system.pressures.rims(found.u, increment.pressures)
-            increment = replace(increment, grips=grips, rims=rims)
+            increment = again
             found = self._equilibrate(increment, found.u, control)
             if not found.iterations:
                 return found, increment
@@ -279,26 +288,21 @@ class Simulation:
         system, laws, at, u = self.system, self.laws, found.at, found.u
         d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
         change = explicit.forces + system.contact_force(u, increment)[..., None] * d_penalty
-        d_reaction, couplings = np.zeros(laws.count), []
+        d_reaction = np.zeros(laws.count)
         for i, (grip, tool) in enumerate(zip(increment.grips, system.tools(u, increment))):
             if grip is None:
                 continue
-            stiff = (increment.penalty * tool.surface.areas)[..., None, None]
-            pushed = stiff * grip.explicit(tool)
+            pushed = (increment.penalty * tool.surface.areas)[..., None, None] * grip.explicit(tool)
             change += tool.distributed(pushed)
             if i == 0:
                 d_reaction -= pushed[:, :, 2].sum(axis=(0, 1))
-            coupling = grip.coupling(tool)
-            if coupling is not None:
-                in_space = tool.body.frame.T @ (stiff * coupling) @ tool.body.frame
-                couplings.append((i, in_space.reshape(-1, 3, 3)))
-        rims = system.pressures.coupling(u, increment.pressures) if increment.pressures else None
+        coupling = Coupling(system, increment, u)
         b = -change.reshape(-1, laws.count)[system.free]
         weights = self._foreseen(increment.time)
         guess = sum(w * s.slopes for w, s in zip(weights, self.states))
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
         du = np.zeros((u.size, laws.count))
-        du[system.free], d_force = solve_coupled(system, at, self.slopes, b, x, couplings, rims)
+        du[system.free], d_force = solve_coupled(system, at, self.slopes, b, x, coupling)
         du = du.reshape(*u.shape, laws.count)
         if self.problem.history.forced:  # the force is what is stated
             return du, np.zeros(laws.count)
