@@ -159,6 +159,23 @@ def test_own_curves_tell_their_tissue_and_how_well(solution):
     assert fit.plot().get_ylabel() == "force, N"
 
 
+def test_creep_under_a_force_tells_the_tissue(solution):
+    """The record is the displacement; the truth is recorded on finer steps, with noise."""
+    force = History([0.0, 1.0, 4.0], force=[0.0, 0.3, 0.3])
+    true = replace(solution.problem.with_materials({"skin": TISSUE, "muscle": TISSUE}), history=force)
+    times = np.linspace(0.2, 4.0, 60)
+    record = limbfit.solve(true, StepControl(load_steps=16, unload_steps=16), frames=False).displacement_at(
+        times
+    )
+    noisy = record + 0.005 * record.max() * np.random.default_rng(1).standard_normal(60)
+    assert record[-1] > 1.1 * record[np.searchsorted(times, 1.0)]
+    fit = limbfit.calibrate(true, (times, noisy), {"muscle.c": 0.5 * TISSUE.c})
+    assert fit.converged, fit.reason
+    assert fit.parameters["muscle.c"] == pytest.approx(TISSUE.c, rel=0.05)
+    assert fit.error_percent[0] < 1.0
+    assert fit.plot().get_ylabel() == "displacement, mm"
+
+
 @pytest.mark.parametrize(
     ("start", "bounds", "times", "text"),
     [

@@ -154,7 +154,18 @@ class Result:
 
     def sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `force_at` with respect to the parameters."""
-        if self.force_sensitivity is None:
+        return self._slope_at(self.force_sensitivity, t)
+
+    def response_at(self, t: Array) -> Array:
+        """What answers to the drive at times ``t (k,)``: force, N, or displacement, mm, under a force."""
+        return self.displacement_at(t) if self.problem.history.forced else self.force_at(t)
+
+    def response_sensitivity_at(self, t: Array) -> Array:
+        """Derivative (k, p) of `response_at` with respect to the parameters."""
+        forced = self.problem.history.forced
+        return self._slope_at(self.displacement_sensitivity if forced else self.force_sensitivity, t)
+
+    def _slope_at(self, slopes: Array | None, t: Array) -> Array:
+        if slopes is None:
             raise ValueError("the simulation ran without sensitivities")
-        at = self._inside(np.asarray(t, dtype=float))
-        return self._interpolate(self.force_sensitivity, at)
+        return self._interpolate(slopes, self._inside(np.asarray(t, dtype=float)))

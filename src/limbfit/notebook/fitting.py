@@ -28,7 +28,7 @@ from ..identify import calibrate as search
 from .solution import Solution, announce_compilation, new_axes, solve
 
 Array = NDArray[np.float64]
-Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s, force (n,) N
+Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s; force (n,) N, or displacement, mm, under a force
 WIDEST = 100.0  # of default bounds, over the start
 
 
@@ -81,9 +81,14 @@ class Fit:
         for number, ((times, force), response) in enumerate(zip(self.curves, self.responses, strict=True)):
             axes.plot(times, force, ".", color=f"C{number}", label=f"curve {number + 1}")
             axes.plot(times, response.force_N, color=f"C{number}")
-        axes.set(xlabel="time, s", ylabel="force, N")
+        axes.set(xlabel="time, s", ylabel=" or ".join(dict.fromkeys(map(response_label, self.problems))))
         axes.legend()
         return axes
+
+
+def response_label(problem: Problem) -> str:
+    """What a curve of the problem shows."""
+    return "displacement, mm" if problem.history.forced else "force, N"
 
 
 def calibrate(
@@ -95,12 +100,13 @@ def calibrate(
     steps: StepControl | None = None,
     listener: Callable[[str], None] | None = None,
 ) -> Fit:
-    """Fit parameters of tissues to measured forces, with exact derivatives of the solver.
+    """Fit parameters of tissues to measured forces or creep, with exact derivatives of the solver.
 
     Parameters
     ----------
-    problems, curves : for each problem the times (n,) s and forces (n,) N that were measured; all curves
-        count alike, whatever their size or number of points.
+    problems, curves : for each problem the times (n,) s and forces (n,) N that were measured, or the
+        displacements (n,) mm of an indenter that a force drives; all curves count alike, whatever their size
+        or number of points.
     start : where the search begins, by ``region.parameter`` as in ``problem.parameter_names``
         (``"skin.c"``, MPa); all other parameters stay as the problems have them.
     bounds : smallest and largest value of some of them; by default a hundredth of the start and a hundred
@@ -149,7 +155,7 @@ def with_parameters(problem: Problem, values: Mapping[str, float]) -> Problem:
 
 
 class _Model:
-    """Forces and derivatives of all problems at the free parameters (p,)."""
+    """Responses and derivatives of all problems at the free parameters (p,)."""
 
     def __init__(
         self,
@@ -180,10 +186,10 @@ class _Model:
             penalty = found.statistics["penalty_per_mm"]
             self.steps[number] = replace(self.steps[number], penalty=penalty, hold_penalty=True)
         known = [f"{region}.{parameter}" for region, parameter in found.parameter_names]
-        full = found.sensitivity_at(times)
+        full = found.response_sensitivity_at(times)
         absent = np.zeros(len(times))
         columns = [full[:, known.index(name)] if name in known else absent for name in self.names]
-        answer = found.force_at(times), np.stack(columns, axis=1), found.completed, found.reason
+        answer = found.response_at(times), np.stack(columns, axis=1), found.completed, found.reason
         doubts: dict[str, str] = {doubt.kind: doubt.text for doubt in found.doubts}
         return SiteResponse.with_doubts(*answer, f"curve {number + 1}", doubts)
 
@@ -197,8 +203,8 @@ def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple
         end = float(problem.history.times[-1])
         if times.ndim != 1 or times.shape != force.shape or not (np.diff(times) > 0).all():
             raise ProblemError(
-                f"curve {number} has times {times.shape} and forces {force.shape}",
-                remedy="give (times, forces), both (n,), times growing",
+                f"curve {number} has times {times.shape} and values {force.shape}",
+                remedy="give (times, values), both (n,), times growing",
             )
         if times[0] < 0.0 or times[-1] > end * (1.0 + 1e-9):
             raise ProblemError(
