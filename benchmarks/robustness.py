@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from driven_cases import driven
 from mapped_bodies import Array, Body, Indices, limb, slab
 
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, RigidSurface, solve
@@ -42,6 +43,14 @@ SITES = (
 )  # fmt: skip
 ELEMENT = "tet10p0"  # the default of studies
 FARTHEST_MM = 30.0  # travel to the bone that is taken where the indenter would pass it by
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What every case is solved with: an element, and whether it is one of `driven_cases`."""
+
+    element: str = ELEMENT
+    driven: bool = False
 
 
 @dataclass(frozen=True)
@@ -166,8 +175,8 @@ def body_of(case: Case) -> Body:
     return limb(*measures, inner, 3 if second else 2, second)
 
 
-def problem_of(case: Case, seed: int, element: str = ELEMENT) -> Problem:
-    """The case as a problem: loading to the drawn depth and unloading at the same speed."""
+def problem_of(case: Case, seed: int, asked: Asked = Asked()) -> Problem:
+    """The case as a problem: loading to the drawn depth and unloading at the same speed, or as `driven`."""
     body = body_of(case)
     rng = np.random.default_rng([seed, case.number, 1])
     centre, axis = body.site - 10.0 * body.inward, _tilted(body.inward, *case.tilt)
@@ -179,16 +188,17 @@ def problem_of(case: Case, seed: int, element: str = ELEMENT) -> Problem:
     reach = 0.71 * case.width + depth + 8.0
     near = np.linalg.norm(points[faces[:, :3]].mean(axis=1) - body.site, axis=1) < reach
     duration = depth / case.speed
-    return Problem(
+    problem = Problem(
         mesh=body.mesh,
         materials={tissue: _material(values) for tissue, values in case.parameters.items()},
         fixed=body.held,
         contact_faces=faces[near],
         indenter=tool,
         history=History(np.array([0.0, duration, 2.0 * duration]), np.array([0.0, depth, 0.0])),
-        element=element,
+        element=asked.element,
         name=f"{case.number} {case.site} {case.tool}",
     )
+    return driven(problem, depth, np.random.default_rng([seed, case.number, 2])) if asked.driven else problem
 
 
 def _material(values: dict[str, float]) -> OgdenQLV:
@@ -234,7 +244,7 @@ def broken_laws(result: Result) -> list[str]:
         broken.append("force not finite")
     if force.min() < -1e-9 * max(force.max(), 1e-12):
         broken.append("negative force")
-    if slipped(result.displacement, force):
+    if not result.problem.history.forced and slipped(result.displacement, force):
         broken.append("force falls in loading")
     if force[-1] > 0.01 * force.max():
         broken.append("force after unloading")
@@ -273,12 +283,12 @@ def _self_penetrating(points: Array, corners: Indices, tolerance: float = 0.05) 
     return count
 
 
-def run_case(seed: int, number: int, element: str = ELEMENT) -> Outcome:
+def run_case(seed: int, number: int, asked: Asked = Asked()) -> Outcome:
     """Draw, build and solve one case; an exception is a crash with its last line as the reason."""
     started = time.process_time()
     case = draw(seed, number)
     try:
-        problem = problem_of(case, seed, element)
+        problem = problem_of(case, seed, asked)
         result = solve(problem, store="all")
     except Exception:
         reason = traceback.format_exc().strip().splitlines()
@@ -299,7 +309,7 @@ def _facts(result: Result) -> dict[str, float]:
         shape = result.problem.mesh.with_points(result.problem.mesh.points + state.u)
         folded = max(folded, int((node_jacobians(shape) <= 0).any(axis=1).sum()))
     return {name: float(result.statistics[name]) for name in names} | {
-        "depth_mm": float(result.problem.history.displacement.max()),
+        "depth_mm": float(np.max(result.displacement)),
         "reached_mm": float(result.displacement.max()),
         "reached_share": float(result.times[-1] / result.problem.history.times[-1]),
         "peak_force_N": result.peak_force,
@@ -317,14 +327,14 @@ class Worker:
     hang; ten times as long on the clock is the limit for a process that only waits.
     """
 
-    def __init__(self, seed: int, limit_s: float, element: str = ELEMENT) -> None:
-        self.seed, self.limit_s, self.element = seed, limit_s, element
+    def __init__(self, seed: int, limit_s: float, asked: Asked = Asked()) -> None:
+        self.seed, self.limit_s, self.asked = seed, limit_s, asked
         self._start()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, far = context.Pipe()
-        arguments = (far, self.seed, self.limit_s, self.element)
+        arguments = (far, self.seed, self.limit_s, self.asked)
         self.process = context.Process(target=_serve, args=arguments, daemon=True)
         self.process.start()
         far.close()
@@ -353,7 +363,7 @@ class Worker:
         self.pipe.close()
 
 
-def _serve(pipe: Connection, seed: int, limit_s: float, element: str) -> None:
+def _serve(pipe: Connection, seed: int, limit_s: float, asked: Asked) -> None:
     """Warm up, then run the cases that are asked for."""
     body = slab(10.0, 2.0, 5.0, 20.0, 0.0, 0.0, 1)
     tool = Indenter(centre=body.site, axis=body.inward, width=8.0)
@@ -364,16 +374,16 @@ def _serve(pipe: Connection, seed: int, limit_s: float, element: str) -> None:
     while True:
         number = pipe.recv()
         signal.setitimer(signal.ITIMER_PROF, limit_s)
-        outcome = run_case(seed, number, element)
+        outcome = run_case(seed, number, asked)
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         pipe.send(outcome)
 
 
 def run_all(
-    seed: int, numbers: list[int], limit_s: float, workers: int, element: str = ELEMENT
+    seed: int, numbers: list[int], limit_s: float, workers: int, asked: Asked = Asked()
 ) -> Iterator[Outcome]:
     """Outcomes as they come, in order, from a number of workers."""
-    made = [Worker(seed, limit_s, element) for _ in range(workers)]
+    made = [Worker(seed, limit_s, asked) for _ in range(workers)]
     idle = list(made)
 
     def one(number: int) -> Outcome:
@@ -440,6 +450,7 @@ def main() -> None:
         "--limit", type=float, default=900.0, help="processor seconds until a case counts as hanging"
     )
     parser.add_argument("--element", default=ELEMENT, help=f"name in the element table (default {ELEMENT})")
+    parser.add_argument("--driven", action="store_true", help="with friction, forces and second bodies")
     parser.add_argument(
         "--json", type=Path, help="write every case and the summary here; cases found there are kept"
     )
@@ -447,16 +458,17 @@ def main() -> None:
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     numbers = options.only or list(range(options.first, options.first + options.cases))
-    kind = {"seed": options.seed, "element": options.element}
+    asked = Asked(options.element, options.driven)
+    kind = {"seed": options.seed, **asdict(asked)}
     outcomes = [] if options.json is None else _earlier(options.json, kind)
     wanted = [number for number in numbers if number not in {outcome.number for outcome in outcomes}]
-    for outcome in run_all(options.seed, wanted, options.limit, options.workers, options.element):
+    for outcome in run_all(options.seed, wanted, options.limit, options.workers, asked):
         outcomes = sorted([*outcomes, outcome], key=lambda o: o.number)
         print(_line(outcome), flush=True)
         if options.json is not None:
             content = {**kind, "summary": summary(outcomes), "cases": [asdict(o) for o in outcomes]}
             options.json.write_text(json.dumps(content, indent=1))
-    _report(outcomes, options.seed)
+    _report(outcomes, options.seed, options.driven)
 
 
 def _earlier(path: Path, kind: dict[str, Any]) -> list[Outcome]:
@@ -464,17 +476,19 @@ def _earlier(path: Path, kind: dict[str, Any]) -> list[Outcome]:
     if not path.exists():
         return []
     content = json.loads(path.read_text())
-    if {name: content.get(name) for name in kind} != kind:
-        sys.exit(f"{path} holds cases of another seed or element; name another file")
+    if {name: content.get(name, False) for name in kind} != kind:
+        sys.exit(f"{path} holds cases of another seed, element or kind; name another file")
     return [Outcome(**case) for case in content["cases"]]
 
 
-def _report(outcomes: list[Outcome], seed: int) -> None:
+def _report(outcomes: list[Outcome], seed: int, driven: bool) -> None:
     print(json.dumps(summary(outcomes), indent=1))
     wrong = [o for o in outcomes if o.outcome != "completed" or o.broken]
     for outcome in wrong:
         why = "; ".join(filter(None, [outcome.reason, *outcome.broken]))
-        command = f"python benchmarks/robustness.py --seed {seed} --only {outcome.number}"
+        command = (
+            f"python benchmarks/robustness.py --seed {seed} --only {outcome.number}{' --driven' * driven}"
+        )
         print(f"{outcome.outcome}: {why}\n    {command}")
     sys.exit(0 if not wrong else 1)
 
