@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import sys
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from guide import from_the_guide
 from layered import store_blocks
 from limbfit import History, OgdenQLV, Problem, load_study
 from limbfit.errors import InputError
@@ -28,17 +28,13 @@ sys.path.insert(0, str(Path(__file__).parent / "fe"))
 from blocks import block, punch
 from samples import point
 
-GUIDE = Path(__file__).parents[1] / "docs" / "extending.md"
 TRUTH = {"a_kPa": 9.0, "b": 1.6, "gamma": 2.0, "tau_s": 0.5}
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory) -> Path:
     """The law's file as the guide shows it."""
-    (code,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
-    file = tmp_path_factory.mktemp("extension") / "fung.py"
-    file.write_text(code, encoding="utf-8")
-    return file
+    return from_the_guide("Fung(", tmp_path_factory.mktemp("extension") / "fung.py")
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +131,7 @@ def test_every_parameter_of_a_simulation_has_its_sensitivity(tissue):
 
 
 def test_impossible_laws_are_refused():
-    with pytest.raises(InputError, match="already is a tissue law 'ogden'"):
+    with pytest.raises(InputError, match="tissue law 'ogden' exists already"):
         register_law(LAWS["ogden"])
     soft = Parameter("a", start=1.0, lower=2.0, upper=3.0, unit="kPa")
     with pytest.raises(InputError, match="parameter a needs"):
@@ -181,7 +177,7 @@ def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
     assert study.material.upper["b"] == 10.0
     before = keys(study)
     (tmp_path / "fung.py").write_text((tmp_path / "fung.py").read_text() + "# another thought\n")
-    with pytest.raises(InputError, match="already is a tissue law 'fung'"):
+    with pytest.raises(InputError, match="tissue law 'fung' exists already"):
         load_study(tmp_path)  # one that is known here from another file
     assert keys(study) != before
     wrong = GIVEN.replace("b = 2.0", "c_kPa = 2.0")

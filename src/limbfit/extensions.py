@@ -38,7 +38,7 @@ class Registry(Generic[T]):
         source = _running[-1] if _running else None
         known = self._added[name][1] if name in self._added else None
         if name in self._own or (known is not None and source is not None and known != source):
-            raise InputError(f"there already is a {self._kind} {name!r}", remedy="give yours another name")
+            raise InputError(f"the {self._kind} {name!r} exists already", remedy="give yours another name")
         self._added[name] = what, source
 
     def __getitem__(self, name: str) -> T:
