@@ -210,7 +210,7 @@ class IndenterTable(TomlTable):
     def _edge_fits(self) -> IndenterTable:
         shape = SHAPES[self.shape]
         if (self.file is not None) != shape.needs_file:
-            those = " or ".join(f'"{name}"' for name in SHAPES.names if SHAPES[name].needs_file)
+            those = " or ".join(f'"{one.name}"' for one in SHAPES if one.needs_file)
             raise ValueError(f"shape = {those} needs a file, and no other shape has one")
         if self.edge_radius_mm >= self.width_mm / 2:
             raise ValueError("edge_radius_mm must be smaller than half of width_mm")
