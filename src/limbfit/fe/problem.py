@@ -16,8 +16,6 @@ from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element, reference_gradients
 from .materials import Material
 
-FACE_NODES = {"tet4": 3, "tet10": 6, "hex8": 4}
-
 
 @dataclass(frozen=True)
 class History:
@@ -222,7 +220,8 @@ def _check_cells(problem: Problem) -> None:
         raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
     _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
     upright = (weights > 0).all(axis=1)
-    if mesh.cell_type == "tet10":  # a quadratic map may be upright at its points and its corners not
+    # A quadratic map may be upright at its points and its corners not.
+    if mesh.kind.is_tetrahedron and len(mesh.kind.nodes) > mesh.kind.corners:
         corners = mesh.points[mesh.corners]
         upright &= np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
     bad = np.flatnonzero(~upright)
@@ -237,6 +236,6 @@ def _check_cells(problem: Problem) -> None:
 def _check_contact(problem: Problem, faces: NDArray[np.int64]) -> None:
     if problem.indenter is None:
         return
-    width = FACE_NODES[problem.mesh.cell_type]
+    width = problem.mesh.kind.faces.shape[1]
     if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
         raise ProblemError(f"contact faces have shape {faces.shape}, not (f, {width}) with f > 0")
