@@ -25,6 +25,7 @@ def extensions(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("extensions")
     load_extensions([from_the_guide("read_npz", folder / "npz.py")])
     load_extensions([from_the_guide("stiffness.json", folder / "stiffness.py")])
+    load_extensions([from_the_guide("Tapered(", folder / "tapered.py")])
     return folder
 
 
@@ -58,11 +59,14 @@ def test_a_suffix_belongs_to_one_format():
 
 
 def named(study: Path, extensions: Path) -> Path:
-    """The study with the extension."""
-    (study / "stiffness.py").write_text((extensions / "stiffness.py").read_text())
+    """The study with the experiment, and an indenter of its own."""
+    for name in ("stiffness.py", "tapered.py"):
+        (study / name).write_text((extensions / name).read_text())
     file = study / "study.toml"
     head, _, rest = file.read_text().partition("[study]\n")
-    file.write_text(f'{head}[study]\nextensions = ["stiffness.py"]\n{rest}')
+    assert "[indenter]" not in rest
+    extended = f'{head}[study]\nextensions = ["stiffness.py", "tapered.py"]\n{rest}'
+    file.write_text(extended + '\n[indenter]\nshape = "tapered"\n')
     return study
 
 
@@ -79,6 +83,7 @@ def test_an_experiment_is_run_by_its_verb_kept_and_reported(study, extensions, l
     assert code == 0, err
     page = (study / "results" / "report" / "report.html").read_text()
     assert "Stiffness of the records" in page
+    assert "tapered indenter of 20.0 mm (edge radius 0.0 mm, taper in degrees 15.0)" in page
     deep = max(one["depth_mm"] for one in records.values())
     code, out, err = limbfit("experiment", study, "stiffness", "--option", f"depth_mm={deep}", "--json")
     assert code == 0, err

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Shape = Callable[[Array], tuple[Array, Array]]
+ShapeFunctions = Callable[[Array], tuple[Array, Array]]
 
 TET10_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
 TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # outward for positive volume
@@ -44,7 +44,7 @@ class CellType:
     face_corners: int
     faces: NDArray[np.int64]
     turned: tuple[int, ...]
-    shape: Shape
+    shape: ShapeFunctions
     points: Array
     weights: Array
     side: float = 1.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...mesh.cells import (
     QUAD_CORNERS,
-    Shape,
+    ShapeFunctions,
     linear_hexahedron,
     linear_quadrilateral,
     linear_simplex,
@@ -36,11 +36,11 @@ class Element:
 
     name: str
     cell_type: str
-    shape: Shape
+    shape: ShapeFunctions
     points: Array
     weights: Array
     mean_dilatation: bool
-    face_shape: Shape
+    face_shape: ShapeFunctions
     face_rules: Mapping[str, tuple[Array, Array]]
 
 

@@ -17,7 +17,7 @@ from ..experiments.catalogue import (
 )
 from ..shared.causes import causes, parts_of
 from ..shared.context import Context, Listener, executor_of
-from ..shared.corrections import keep_corrections
+from ..shared.hand_labels import keep_hand_labels
 from ..shared.keys import Keys, Stage
 from ..shared.provenance import input_digests, machine, settings_record, versions
 from ..shared.store import Store, lock, write_json
@@ -157,7 +157,7 @@ def run_study(
         executor_of(study) as executor,
     ):
         context = Context(study, store, executor, listener)
-        kept = keep_corrections(study)
+        kept = keep_hand_labels(study)
         if kept is not None:
             context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
         known = Keys(study)
