@@ -10,20 +10,16 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from guide import from_the_guide
-from layered import store_blocks
+from guide import from_the_guide, identified
 from limbfit import Indenter, Measure, load_study, register_shape
 from limbfit.bench.blocks import punched_block
 from limbfit.errors import InputError, ProblemError, StudyError
-from limbfit.execution import Limits, make_executor
 from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, solve
 from limbfit.febio import FebSettings, read_feb, to_problem, write_feb, write_inp
 from limbfit.indentation import SiteModel
 from limbfit.pipeline.experiments.sensitivity import other_indenters
-from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationJob, job_digest
-from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.verbs.run import keys
 from limbfit.shapes import SHAPES, TAKEN, Shape
 from limbfit.study import IndenterTable
@@ -214,60 +210,15 @@ def test_reports_call_it_by_its_words(shape):
     assert shape.said(settings) == "tapered indenter of 18.0 mm (edge radius 2.0 mm, taper in degrees 10.0)"
 
 
-BLOCKS = {"a": ((3.0, 5.0), 2.2, True), "b": ((3.0, 21.0), 6.0, True)}  # thicknesses, depth
-TRUTH = {"c_kPa": 9.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}
-STUDY = """
-[study]
-name = "blocks"
-extensions = ["tapered.py"]
-[surfaces]
-skin = "skin.stl"
+STATED = """
 [indenter]
 shape = "tapered"
 width_mm = 16.0
 edge_radius_mm = 2.0
-[solver]
-load_steps = 4
-unload_steps = 3
-penalty_per_mm = 100.0
-[mesh]
-element = "tet10"
-[mesh.coarse]
-edge_near_mm = 6.0
-[calibration]
-tied = [
-    ["skin.c_kPa", "muscle.c_kPa"], ["skin.m", "muscle.m"], ["skin.gamma", "muscle.gamma"],
-    ["skin.tau_s", "muscle.tau_s"],
-]
 """
-SITE = """
-[[sites]]
-name = "{name}"
-fitted = true
-trace = "{name}.csv"
-position = [0.0, 0.0, 0.0]
-"""
+TRUTH = {"c_kPa": 9.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}
 
 
 @pytest.mark.slow
 def test_a_study_is_identified_with_it(tmp_path, file, shape):
-    """Of records with known truth and noise, simulated by worker processes that load the study's file."""
-    shutil.copy(file, tmp_path / "tapered.py")
-    for name in ("skin.stl", "a.csv", "b.csv"):
-        (tmp_path / name).touch()
-    (tmp_path / "study.toml").write_text(STUDY + "".join(SITE.format(name=name) for name in BLOCKS))
-    study = load_study(tmp_path)
-    truth = dict.fromkeys(study.tissues, TRUTH)
-    store = store_blocks(study, BLOCKS, truth, 4, coarse=4)
-    store["calibrate"].mkdir()
-    with make_executor(2, Limits(0.0, 0.0)) as executor:
-        run_calibrate(Context(study, store, executor, lambda event: None), store["calibrate"])
-    found = store.read("calibrate", "calibration.json")
-    last, known = found["stages"][-1], found["uncertainty"]["intervals_95"]
-    assert last["converged"], last["reason"]
-    assert last["iterations"][-1]["error_percent"] < 1.0
-    for tissue, values in truth.items():
-        assert last["parameters"][tissue] == pytest.approx(values, rel=0.05)
-        for key, value in values.items():
-            low, high = known[tissue][key]
-            assert low < value < high, (tissue, key)
+    identified(tmp_path, file, STATED, TRUTH, within=0.05)
