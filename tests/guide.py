@@ -68,7 +68,7 @@ def identified(
     text = TEXT.format(extension=extension.name, tied=tied) + stated + sites
     (folder / "study.toml").write_text(text, encoding="utf-8")
     study = load_study(folder)
-    store = store_blocks(study, BLOCKS, dict.fromkeys(study.tissues, dict(truth)), 4, coarse=4)
+    store = store_blocks(study, BLOCKS, {tissue: dict(truth) for tissue in study.tissues}, 4, coarse=4)
     store["calibrate"].mkdir()
     with make_executor(2, Limits(0.0, 0.0)) as executor:
         run_calibrate(Context(study, store, executor, lambda event: None), store["calibrate"])

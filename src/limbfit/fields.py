@@ -56,7 +56,9 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
 def rest(system: System, problem: Problem) -> State:
     """The state before the first step."""
     memory = Memory.rest(system, _laws(problem))
-    return State(0.0, float(problem.history.at(0.0)), np.zeros_like(problem.mesh.points), 0.0, memory=memory)
+    return State(
+        0.0, problem.history.displacement_at(0.0), np.zeros_like(problem.mesh.points), 0.0, memory=memory
+    )
 
 
 class Animation:

@@ -17,6 +17,7 @@ from limbfit.fe import (
     Support,
     solve,
 )
+from limbfit.fe.motion import Drives
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
 
 HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
@@ -122,6 +123,11 @@ def quarter_punch(element: str, refinement: int, depth: float = 6.0, speed: floa
         mesh, {"skin": SKIN, "muscle": MUSCLE}, mesh.node_sets["bottom"], mesh.face_sets["top"], tool,
         history, supports=symmetry(mesh), element=element,
     )  # fmt: skip
+
+
+def drive(advance: float, x: float = 0.0, y: float = 0.0) -> Drives:
+    """What drives an indenter that has gone ``advance`` mm, and ``x, y`` mm across."""
+    return Drives(np.array([[x, y, advance, 0.0, 0.0, 0.0]]), np.zeros((1, 6), dtype=bool))
 
 
 def slope_and_difference(centre: Result, control: StepControl) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, punch
+from blocks import MUSCLE, SKIN, block, drive, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
@@ -28,7 +28,7 @@ def test_contact_force_and_stiffness_are_derivatives_of_its_energy(cell_type, ru
     rest = np.zeros((*system.weights.shape, 6))
 
     def at(u, d):
-        return system.evaluate(u, laws, Increment(0.0, d, np.zeros(2), rest, 0.5))
+        return system.evaluate(u, laws, Increment(0.0, d, np.zeros(2), rest, 0.5, drive(d)))
 
     rng, h = np.random.default_rng(1), 1e-6
     u = 0.01 * rng.normal(size=system.points.shape) * ~system.supported

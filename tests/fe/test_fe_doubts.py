@@ -35,7 +35,7 @@ def reactions(result: Result) -> np.ndarray:
     nothing, found = np.zeros(0), []
     for state in result.states:
         penalty = state.penalty * laws.modulus
-        increment = Increment(state.time, state.displacement, nothing, nothing, penalty)
+        increment = Increment(state.time, state.displacement, nothing, nothing, penalty, state.drives)
         found.append(result.system.contact_force(state.u, increment).sum(axis=0)[2])
     return np.array(found)
 

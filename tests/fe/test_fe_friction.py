@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, punch, slope_and_difference
+from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, Support, System, solve
 from limbfit.fe.contact.friction import Coulomb
+from limbfit.fe.contact.tool import Tool
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.solution.linear import symmetric_product
 from limbfit.fe.system import Increment
@@ -26,8 +27,8 @@ class Dragged:
         self.rest = np.zeros((*self.system.weights.shape, 6))
         self.rng = np.random.default_rng(1)
         self.u = self.field(0.01)
-        start = self.system.indenter.moved(3.2)
-        grip = Coulomb.none(mu, self.system.surface).after(self.system.surface, start, self.u, None)
+        start = self.system.bodies.tools(self.u, drive(3.2))[0]
+        grip = Coulomb.none(mu, self.system.surface).after(start, None)
         self.u = self.u + self.field(0.05)
         self.grip = self.renewed(grip, self.u)
 
@@ -35,10 +36,13 @@ class Dragged:
         return size * self.rng.normal(size=self.system.points.shape) * ~self.system.supported
 
     def increment(self, advance: float, grip: Coulomb) -> Increment:
-        return Increment(0.0, advance, np.zeros(2), self.rest, 0.5, grip, across=(0.03, 0.02))
+        return Increment(0.0, advance, np.zeros(2), self.rest, 0.5, drive(advance, 0.03, 0.02), (grip,))
 
     def renewed(self, grip: Coulomb, u: np.ndarray) -> Coulomb:
-        return grip.renewed(*self.system.tool(self.increment(3.3, grip)), u)
+        return grip.renewed(self.tool(u))
+
+    def tool(self, u: np.ndarray) -> Tool:
+        return self.system.bodies.tools(u, drive(3.3, 0.03, 0.02))[0]
 
     def at(self, u: np.ndarray, advance: float = 3.3, grip: Coulomb | None = None):
         return self.system.evaluate(u, self.laws, self.increment(advance, grip or self.grip))
@@ -72,13 +76,13 @@ def test_coupling_is_what_a_step_holds_constant(mu):
         system.contact_force(v, one.increment(3.3, one.renewed(one.grip, v))) for v in (u + h * d, u - h * d)
     )
     change = ((ahead - back) / (2 * h)).reshape(-1, 1)[system.free]
-    surface, tool = system.tool(one.increment(3.3, one.grip))
-    coupling = (0.5 * surface.areas)[..., None, None] * one.grip.coupling(surface, tool, u)
-    coupling = (tool.frame.T @ coupling @ tool.frame).reshape(-1, 3, 3)
-    moved = system.springs_of(d.reshape(-1, 1)[system.free])
-    lagged = system.at_springs(coupling @ moved)
+    tool, bodies = one.tool(u), system.bodies
+    coupling = (0.5 * tool.surface.areas)[..., None, None] * one.grip.coupling(tool)
+    coupling = (tool.body.frame.T @ coupling @ tool.body.frame).reshape(-1, 3, 3)
+    moved = bodies.springs_of(d.reshape(-1, 1)[system.free])
+    lagged = bodies.at_springs(coupling @ moved)
     assert np.abs(lagged).max() > (0.0 if mu > 1.0 else 0.02) * np.abs(change).max()  # little where all stick
-    found = system.at_springs(one.at(u).touch.blocks @ moved) + lagged
+    found = bodies.at_springs(one.at(u).touch.blocks @ moved) + lagged
     np.testing.assert_allclose(found, change, atol=1e-5 * np.abs(change).max())
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from blocks import punch
+from blocks import drive, punch
 
 from limbfit.bench.blocks import punched_block
 from limbfit.fe import StepControl, Support, System
@@ -73,7 +73,9 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
     problem = punch("tet10", 4, 1)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(system, laws, 0.3, 0.3, 0.1, 100.0 * laws.modulus)
+    increment = Memory.rest(system, laws).increment(
+        system, laws, 0.3, 0.3, 0.1, 100.0 * laws.modulus, drive(0.1)
+    )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
     factor = Factor(system, laws.moduli)
     factor.factorise(data)
@@ -98,11 +100,13 @@ def iterations(divisions: int) -> int:
     problem = punched_block("tet10", divisions)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus)
+    increment = Memory.rest(system, laws).increment(
+        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
+    )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
-    b = system.at_springs(np.ones((system.surface.areas.size, 3, 1)))
+    b = system.bodies.at_springs(np.ones((system.surface.areas.size, 3, 1)))
     found = factor.solve(data, b, None, 1e-3)
     assert found.converged
     assert np.linalg.norm(b - factor.product(data, found.x)) <= 1.1e-3 * np.linalg.norm(b)
@@ -122,7 +126,9 @@ def test_multigrid_is_symmetric_and_positive():
     sides = np.flatnonzero(problem.mesh.points[:, 0] <= -30.0)
     system = System(replace(problem, supports=(Support(sides, 0),)))
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus)
+    increment = Memory.rest(system, laws).increment(
+        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
+    )
     multigrid = Multigrid(system)
     multigrid.factorise(system.evaluate(np.zeros((n, 3)), laws, increment).tangent)
     v, w = np.random.default_rng(0).standard_normal((2, system.unknowns))
@@ -135,7 +141,9 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     problem = punched_block("tet10", 4)
     stiff = {name: replace(m, kappa_ratio=1e6) for name, m in problem.materials.items()}
     system, laws = System(problem), Laws.build([stiff[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus)
+    increment = Memory.rest(system, laws).increment(
+        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
+    )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)

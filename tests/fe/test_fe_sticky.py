@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, punch, slope_and_difference, symmetry
+from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference, symmetry
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, System, iterate, solve
@@ -24,12 +24,13 @@ def test_forces_and_stiffness_of_anchors_are_derivatives_of_their_energy(rule):
     rest, rng, h = np.zeros((*system.weights.shape, 6)), np.random.default_rng(1), 1e-6
     u = 0.01 * rng.normal(size=system.points.shape) * ~system.supported
     d = rng.normal(size=u.shape) * ~system.supported
-    tool = system.indenter.moved(1.6)
-    anchors = Anchors.none(system.surface).after(system.surface, tool, u, None)
+    anchors = Anchors.none(system.surface).after(system.bodies.tools(u, drive(1.6))[0], None)
     assert anchors.held.sum() > 4
 
     def at(u, advance):
-        return system.evaluate(u, laws, Increment(0.0, advance, np.zeros(2), rest, 0.5, anchors))
+        return system.evaluate(
+            u, laws, Increment(0.0, advance, np.zeros(2), rest, 0.5, drive(advance), (anchors,))
+        )
 
     u = u + 0.1 * d
     here, ahead, back = at(u, 1.7), at(u + h * d, 1.7), at(u - h * d, 1.7)
@@ -47,8 +48,8 @@ def test_anchors_neither_push_nor_pull_along_the_normal():
     system = System(punch("tet10", 4, 1, friction="sticky"))
     laws = Laws.build([SKIN, MUSCLE])
     rest, u = np.zeros((*system.weights.shape, 6)), np.zeros_like(system.points)
-    anchors = Anchors.none(system.surface).after(system.surface, system.indenter.moved(0.5), u, None)
-    at = system.evaluate(u, laws, Increment(0.0, -0.5, np.zeros(2), rest, 0.5, anchors))
+    anchors = Anchors.none(system.surface).after(system.bodies.tools(u, drive(0.5))[0], None)
+    at = system.evaluate(u, laws, Increment(0.0, -0.5, np.zeros(2), rest, 0.5, drive(-0.5), (anchors,)))
     assert anchors.held.any()
     assert at.force == 0.0
     assert np.abs(at.touch.blocks).max() > 0.0
@@ -64,7 +65,7 @@ def slip_and_force(friction: str) -> tuple[float, np.ndarray]:
     nodes = system.surface.faces[:, 0]
     slip, forces, pressed, u = 0.0, [], np.zeros(len(nodes), dtype=bool), np.zeros_like(system.points)
     for step in iterate(problem, StepControl(load_steps=6, unload_steps=5)):
-        gaps = system.surface.gaps(system.indenter.moved(step.displacement), step.state.u)[:, 0]
+        gaps = system.bodies.tools(step.state.u, step.state.drives)[0].gaps[:, 0]
         now = gaps < -0.1 * step.penetration
         moved = np.linalg.norm((step.state.u - u)[nodes, :2], axis=1)
         slip = max(slip, moved[pressed & now].max(initial=0.0))

@@ -101,8 +101,9 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     np.testing.assert_allclose(uniform * system.surface.areas, own[:, None] * rest, rtol=1e-12)
     for t, stretch in ((1.0, 1.0), (2.0, np.sqrt(1.105))):  # 1.21 is as far from 1.105 as that from 1
         u = np.column_stack([(stretch - 1.0) * points[:, :2], np.zeros(len(points))])
+        nothing = np.zeros((1, 6))
         state = State(t, float(problem.history.at(t)), u, 1.0, None)
-        weights.after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, np.zeros(3), state))
+        weights.after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, nothing, nothing, None, state))
     np.testing.assert_allclose(uniform * system.surface.areas, grown * own[:, None] * rest, rtol=1e-9)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..fe import History, StepControl
 from ..fe.history import Memory
 from ..fe.interpolation import interpolate
+from ..fe.motion import Drives
 from ..fe.solution.control import schedule
 from ..fe.solution.schedule import foresee
 
@@ -51,7 +52,7 @@ def solve_layer(
     while targets:
         t = targets.pop(0)
         dt, depth = t - times[-1], float(history.at(t))
-        increment = memory.increment(point, laws, t, dt, depth, 0.0)
+        increment = memory.increment(point, laws, t, dt, depth, 0.0, Drives.none())
         scale, kept = float(increment.scale[0]), float(increment.history[0, 0, 0])
         elastic = max(depth, 0.0) ** power
         force = scale * elastic + kept

@@ -24,9 +24,12 @@ from __future__ import annotations
 
 from ..shapes import RigidSurface
 from .contact.indenter import Indenter
+from .contact.open_surface import OpenSurface
 from .doubts import Doubt
 from .kernel.elements import ELEMENTS
 from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from .motion import Motion, RigidBody
+from .pressure import Pressure
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .solution.control import StepControl
@@ -44,11 +47,15 @@ __all__ = [
     "Indenter",
     "Material",
     "MooneyRivlin",
+    "Motion",
     "NeoHookean",
     "Ogden",
     "OgdenQLV",
+    "OpenSurface",
+    "Pressure",
     "Problem",
     "Result",
+    "RigidBody",
     "RigidSurface",
     "State",
     "Step",

@@ -12,6 +12,7 @@ from .kernel.laws import Laws
 from .kernel.response import elastic_response, elastic_stress
 from .lanes import LANES, workspace
 from .materials import prony_factors
+from .motion import Drives
 from .system import Increment, System
 
 Array = NDArray[np.float64]
@@ -44,8 +45,9 @@ class Memory:
         return Memory(self.elastic, self.prony)
 
     def increment(
-        self, system: System, laws: Laws, time: float, dt: float, displacement: float, penalty: float
-    ) -> Increment:
+        self, system: System, laws: Laws, time: float, dt: float, displacement: float, penalty: float,
+        drives: Drives,
+    ) -> Increment:  # fmt: skip
         """The step of ``dt`` s that ends at ``time``."""
         decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
         gamma = laws.prony[..., 0]
@@ -55,7 +57,8 @@ class Memory:
             K -= ((gamma * back).sum(axis=1))[of][:, None, None] * self.before
         for l in range(gamma.shape[1]):
             K += (gamma * decay)[of, l][:, None, None] * self.prony[l]
-        return Increment(time, displacement, 1.0 + (gamma * ramp).sum(axis=1), K, penalty)
+        scale = 1.0 + (gamma * ramp).sum(axis=1)
+        return Increment(time, displacement, scale, K, penalty, drives)
 
     def advanced(self, system: System, laws: Laws, elastic: Array, dt: float) -> Memory:
         """The memory at the end of a step of ``dt`` s that ended with the elastic stress ``elastic``."""

@@ -52,9 +52,10 @@ def nodal_forces(system: System, laws: Laws, state: State) -> Array:
     """
     increment = Increment(
         state.time, state.displacement, np.ones(len(laws.prony)), _relaxing(system, laws, state),
-        state.penalty * laws.modulus,
+        state.penalty * laws.modulus, state.drives,
     )  # fmt: skip
-    return system.evaluate(state.u, laws, increment, tangent=False).residual
+    found = system.evaluate(state.rows, laws, increment, tangent=False)
+    return found.residual[: system.nodes]
 
 
 def _relaxing(system: System, laws: Laws, state: State) -> Array:
@@ -76,13 +77,9 @@ def contact_pressure(system: System, laws: Laws, state: State) -> Array:
     a corner's force goes to the mid-edge nodes beside it, and it gets the mean of their pressures.
     """
     pressure = np.zeros(len(system.points))
-    if system.surface is None:
+    if system.bodies is None:
         return pressure
-    nothing, penalty = np.zeros(0), state.penalty * laws.modulus
-    force = system.contact_force(
-        state.u, Increment(state.time, state.displacement, nothing, nothing, penalty)
-    )
-    faces = np.asarray(system.problem.contact_faces)
+    force, faces = _contact_forces(system, laws, state), _touched(system)
     share = _nodal_areas(system.element, system.points + state.u, faces)
     to_middles = _corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
     if to_middles is not None:
@@ -94,6 +91,19 @@ def contact_pressure(system: System, laws: Laws, state: State) -> Array:
         corners = np.unique(faces[:, :3])
         pressure[corners] = (to_middles @ pressure)[corners]
     return pressure
+
+
+def _contact_forces(system: System, laws: Laws, state: State) -> Array:
+    """Nodal forces (n, 3) of all contact, N."""
+    nothing, penalty = np.zeros(0), state.penalty * laws.modulus
+    increment = Increment(state.time, state.displacement, nothing, nothing, penalty, state.drives)
+    return system.contact_force(state.rows, increment)[: system.nodes]
+
+
+def _touched(system: System) -> NDArray[np.int64]:
+    """The faces that bodies may touch, each once."""
+    faces = np.concatenate([np.asarray(body.faces) for body in system.problem.rigid_bodies])
+    return faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
 
 
 def _corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:

@@ -15,6 +15,8 @@ from ..phases import Phase, boundaries, find_phases, loading_end
 from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element, reference_gradients
 from .materials import Material
+from .motion import Drives, Motion, RigidBody
+from .pressure import Pressure
 
 
 @dataclass(frozen=True)
@@ -22,33 +24,63 @@ class History:
     """Piecewise linear advance of the indenter: ``times (n,)`` s from 0, ``displacement (n,)`` mm.
 
     ``across (n, 2)``: its move across its axis, along x and y of its frame, mm; None: none.
+    ``force (n,)``: the force, N, that presses it along its axis instead of a displacement.
     """
 
     times: NDArray[np.float64]
-    displacement: NDArray[np.float64]
+    displacement: NDArray[np.float64] | None = None
     across: NDArray[np.float64] | None = None
+    force: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        times, values = np.asarray(self.times, dtype=float), np.asarray(self.displacement, dtype=float)
+        if (self.displacement is None) == (self.force is None):
+            raise ProblemError("a history is one of displacement or one of force, not both or none")
+        driver = "displacement" if self.force is None else "force"
+        times, values = np.asarray(self.times, dtype=float), np.asarray(getattr(self, driver), dtype=float)
         if self.across is not None:
             across = np.asarray(self.across, dtype=float)
             if across.shape != (len(times), 2) or not np.isfinite(across).all():
                 raise ProblemError("a move across the axis needs two finite numbers for each time")
             object.__setattr__(self, "across", across)
         if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
-            raise ProblemError("a displacement history needs two or more times and as many displacements")
+            raise ProblemError(f"a {driver} history needs two or more times and as many {driver}s")
         if not (np.isfinite(times).all() and np.isfinite(values).all()):
-            raise ProblemError("the displacement history holds values that are not finite")
+            raise ProblemError(f"the {driver} history holds values that are not finite")
         if times[0] != 0.0:
-            raise ProblemError(f"the displacement history starts at {times[0]} s, not at 0")
+            raise ProblemError(f"the {driver} history starts at {times[0]} s, not at 0")
         if not (np.diff(times) > 0).all():
-            raise ProblemError("the displacement history goes backwards in time")
+            raise ProblemError(f"the {driver} history goes backwards in time")
         object.__setattr__(self, "times", times)
-        object.__setattr__(self, "displacement", values)
+        object.__setattr__(self, driver, values)
+
+    @property
+    def forced(self) -> bool:
+        """Whether a force drives the indenter along its axis."""
+        return self.force is not None
+
+    @property
+    def driver(self) -> NDArray[np.float64]:
+        """(n,) displacement, mm, or force, N."""
+        values = self.displacement if self.force is None else self.force
+        assert values is not None
+        return values
 
     def at(self, t: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement at time(s) ``t``, mm."""
-        return np.asarray(np.interp(t, self.times, self.displacement))
+        """What drives it at time(s) ``t``: mm, or N where it is a force."""
+        return np.asarray(np.interp(t, self.times, self.driver))
+
+    def displacement_at(self, t: float) -> float:
+        """Stated displacement at time ``t``, mm; 0 where a force drives it."""
+        return 0.0 if self.forced else float(self.at(t))
+
+    @cached_property
+    def motion(self) -> Motion:
+        """As that of a rigid body."""
+        values = np.zeros((len(self.times), 6))
+        values[:, 2] = self.driver
+        if self.across is not None:
+            values[:, :2] = self.across
+        return Motion(self.times, values, (False, False, self.forced, False, False, False))
 
     def across_at(self, t: float) -> tuple[float, float]:
         """Move across the axis at time ``t``, mm."""
@@ -58,13 +90,13 @@ class History:
         return x, y
 
     def travel(self, t: float) -> float:
-        """Advance and moves across together, mm: what changes while the indenter moves in any direction."""
+        """Driver and moves across together: what changes while the indenter moves in any direction."""
         return float(self.at(t)) + sum(self.across_at(t))
 
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """What the indenter does: loads, holds, unloads, in any number."""
-        return find_phases(self.times, self.displacement)
+        return find_phases(self.times, self.driver)
 
     @property
     def kinks(self) -> NDArray[np.float64]:
@@ -120,6 +152,8 @@ class Problem:
     contact_rule : where contact is enforced: ``nodes`` of the faces or their ``gauss`` points.
     friction : ``frictionless``, ``sticky`` (what touches does not slip along the indenter) or Coulomb's
         coefficient.
+    bodies : further rigid bodies, each driven by its own motion.
+    pressures : on boundary faces, normal to them as they move.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     """
 
@@ -134,11 +168,32 @@ class Problem:
     start: str = "touching"
     contact_rule: str = "gauss"
     friction: str | float = "frictionless"
+    bodies: tuple[RigidBody, ...] = ()
+    pressures: tuple[Pressure, ...] = ()
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
         """The same problem with other materials; a prepared system stays valid."""
         return replace(self, materials=materials)
+
+    @cached_property
+    def rigid_bodies(self) -> tuple[RigidBody, ...]:
+        """The indenter, where there is one, and the further bodies."""
+        if self.indenter is None:
+            return self.bodies
+        motion = self.history.motion
+        indenter = RigidBody(self.indenter, self.contact_faces, motion, self.friction, name="indenter")
+        return indenter, *self.bodies
+
+    def drives(self, t: float) -> Drives:
+        """What drives the rigid bodies at time ``t``."""
+        return Drives.of([body.motion for body in self.rigid_bodies], t)
+
+    @property
+    def turns(self) -> NDArray[np.float64]:
+        """Times where what drives a further body, or a pressure, turns, s."""
+        knots = [np.asarray(one.times)[1:-1] for one in self.pressures]
+        return np.unique(np.concatenate([np.zeros(0), *(body.motion.turns for body in self.bodies), *knots]))
 
     @property
     def formulation(self) -> Element:
@@ -168,8 +223,9 @@ def check(problem: Problem) -> None:
         raise ProblemError("the mesh has points that are not finite")
     if not len(mesh.cells):
         raise ProblemError("the mesh has no cells")
-    faces = np.asarray(problem.contact_faces)
-    indices = [("cells", mesh.cells), ("fixed nodes", problem.fixed), ("contact faces", faces)]
+    indices = [("cells", mesh.cells), ("fixed nodes", problem.fixed)]
+    indices += [("contact faces", np.asarray(body.faces)) for body in problem.rigid_bodies]
+    indices += [("pressed faces", np.asarray(one.faces)) for one in problem.pressures]
     indices += [("support nodes", support.nodes) for support in problem.supports]
     for name, value in indices:
         value = np.asarray(value)
@@ -178,7 +234,7 @@ def check(problem: Problem) -> None:
         if value.size and (value.min() < 0 or value.max() >= n):
             raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
     _check_cells(problem)
-    _check_contact(problem, faces)
+    _check_bodies(problem)
     if not len(problem.fixed) and not problem.supports:
         raise ProblemError("nothing is held in place", remedy="fix the bone and proximal nodes")
 
@@ -197,7 +253,6 @@ def _check_choices(problem: Problem) -> None:
     if problem.contact_rule not in ELEMENTS[name].face_rules:
         rules = ", ".join(ELEMENTS[name].face_rules)
         raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy=f"use one of {rules}")
-    _check_friction(problem.friction)
     if problem.start not in ("touching", "as-given"):
         raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
 
@@ -233,9 +288,24 @@ def _check_cells(problem: Problem) -> None:
         raise ProblemError(f"{(~used).sum()} nodes belong to no cell", remedy="drop them from the mesh")
 
 
-def _check_contact(problem: Problem, faces: NDArray[np.int64]) -> None:
-    if problem.indenter is None:
-        return
-    width = problem.mesh.kind.faces.shape[1]
-    if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
-        raise ProblemError(f"contact faces have shape {faces.shape}, not (f, {width}) with f > 0")
+def _check_bodies(problem: Problem) -> None:
+    width, bodies = problem.mesh.kind.faces.shape[1], problem.rigid_bodies
+    for i, body in enumerate(bodies):
+        faces, of = np.asarray(body.faces), f" of {body.name or f'body {i}'}" if len(bodies) > 1 else ""
+        if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
+            raise ProblemError(f"contact faces{of} have shape {faces.shape}, not (f, {width}) with f > 0")
+        _check_friction(body.friction)
+    for one in problem.pressures:
+        if np.asarray(one.faces).ndim != 2 or np.asarray(one.faces).shape[1] != width:
+            raise ProblemError(f"pressed faces have shape {np.asarray(one.faces).shape}, not (f, {width})")
+    end = problem.history.times[-1]
+    for i, body in enumerate(problem.bodies):
+        if body.motion.times[-1] < end * (1.0 - 1e-9):
+            raise ProblemError(
+                f"the motion of {body.name or f'body {i}'} ends at {body.motion.times[-1]:g} s, before the "
+                f"history does, at {end:g} s",
+                remedy="state it to the end",
+            )
+    moved = problem.indenter is None or any(support.factor for support in problem.supports)
+    if problem.history.forced and moved:
+        raise ProblemError("a history of force drives an indenter, not supports")

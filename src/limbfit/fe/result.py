@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .doubts import Doubt
 from .history import Memory
 from .interpolation import interpolate
+from .motion import Drives
 from .problem import Problem
 
 Array = NDArray[np.float64]
@@ -21,7 +22,9 @@ Array = NDArray[np.float64]
 class State:
     """An accepted step: ``u (n, 3)`` mm at ``time`` s; ``sensitivity (n, 3, p)``; stresses in ``memory``.
 
-    ``penalty`` (1/mm) is that of the contact which holds ``u`` in equilibrium.
+    ``penalty`` (1/mm) is that of the contact which holds ``u`` in equilibrium.  ``coordinates (2 k, 3)``:
+    moves and turns of the bodies that a force drives, mm, in the rows of `System`; ``bodies`` their
+    derivatives (2 k, 3, p).  ``drives`` are what drives all bodies then.
     """
 
     time: float
@@ -30,6 +33,21 @@ class State:
     penalty: float
     sensitivity: Array | None = None
     memory: Memory | None = None
+    coordinates: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    bodies: Array | None = None
+    drives: Drives = field(default_factory=Drives.none)
+
+    @property
+    def rows(self) -> Array:
+        """(r, 3) displacements of the nodes, then those of the bodies, mm."""
+        return np.concatenate([self.u, self.coordinates])
+
+    @property
+    def slopes(self) -> Array:
+        """(r, 3, p) derivatives of the `rows`."""
+        if self.sensitivity is None or self.bodies is None:
+            raise ValueError("the state has no derivatives")
+        return np.concatenate([self.sensitivity, self.bodies])
 
 
 @dataclass(frozen=True)
@@ -43,8 +61,15 @@ class Step:
     contact_area: float
     newton_iterations: int
     force_sensitivity: Array | None
-    reaction: Array
+    reactions: Array
+    coordinates: Array
+    displacement_sensitivity: Array | None
     state: State
+
+    @property
+    def reaction(self) -> Array:
+        """(3,) force of the indenter along x, y and z of its frame, N."""
+        return self.reactions[0, :3] if len(self.reactions) else np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -57,7 +82,9 @@ class Result:
     force_sensitivity : (n, p) derivative of the force with respect to each parameter (mm, N, s, MPa).
     parameter_names : (region, parameter) per column.
     penetration, contact_area : (n,) mm, mm^2 (reference).
-    reaction : (n, 3) force of the indenter along x, y and z of its frame, N; the last column is ``force``.
+    reactions : (n, b, 6) forces, N, and moments about the pivot, N mm, of every rigid body in its frame.
+    coordinates : (n, b, 6) its moves, mm, and its rotation vector, rad.
+    displacement_sensitivity : (n, p) derivative of the displacement, where a force drives the indenter.
     states : kept steps.
     completed, reason : False and why where the end of the history was not reached.
     doubts : what is doubtful about it, by kind; ``warnings`` are their texts.
@@ -76,7 +103,9 @@ class Result:
     parameter_names: tuple[tuple[str, str], ...]
     penetration: Array
     contact_area: Array
-    reaction: Array
+    reactions: Array
+    coordinates: Array
+    displacement_sensitivity: Array | None
     states: tuple[State, ...]
     completed: bool
     reason: str
@@ -92,6 +121,11 @@ class Result:
     def warnings(self) -> tuple[str, ...]:
         """What is doubtful about it, in words."""
         return tuple(doubt.text for doubt in self.doubts)
+
+    @property
+    def reaction(self) -> Array:
+        """(n, 3) force of the indenter along x, y and z of its frame, N; the last column is ``force``."""
+        return self.reactions[:, 0, :3]
 
     @property
     def peak_force(self) -> float:
@@ -113,6 +147,10 @@ class Result:
         """Force (k,) at times ``t (k,)``, N; interpolated between steps, never negative."""
         at = self._inside(np.asarray(t, dtype=float))
         return self._interpolate(self.force, at)
+
+    def displacement_at(self, t: Array) -> Array:
+        """Displacement (k,) at times ``t (k,)``, mm, between steps as `force_at`."""
+        return self._interpolate(self.displacement, self._inside(np.asarray(t, dtype=float)))
 
     def sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `force_at` with respect to the parameters."""

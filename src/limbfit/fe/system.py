@@ -7,29 +7,24 @@ every entry of every element's upper triangle knows its place in it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
-import scipy.sparse as sp
-from numba import njit
 from numpy.typing import NDArray
 
-from .contact.contact import (
-    ContactSurface,
-    Distances,
-    Touch,
-    add_springs,
-    check_clear,
-    contact,
-    touching_offset,
-)
+from .bodies import Bodies, Contacts, extra_rows
+from .contact.contact import ContactSurface, Touch
 from .contact.grip import Grip
 from .contact.indenter import Indenter
+from .contact.tool import Tool
 from .kernel.assembly import Elements, assemble
 from .kernel.elements import Element, reference_gradients
 from .kernel.laws import Laws
+from .motion import Drives
+from .pattern import Pattern, bordered, node_graph, positions, upper_pattern
+from .pressure import Pressures
 from .problem import Problem, ProblemError, check
 from .threads import thread_pool
 
@@ -41,9 +36,10 @@ T = TypeVar("T")
 class Increment:
     """What is constant while one step is solved.
 
-    ``displacement`` is the indenter's advance, ``across (2,)`` its move across its axis, mm; ``scale (r,)``
-    and ``history (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grip`` holds points
-    along the indenter; points deeper than ``flat_from`` (mm) have the tangent of a flat indenter.
+    ``displacement`` is that of the history, mm, which drives the supports; ``scale (r,)`` and ``history
+    (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grips`` hold points along the bodies;
+    points deeper than ``flat_from`` (mm) have the tangent of a flat body; the ``drives`` move the
+    rigid bodies.  The ``pressures (k,)`` in MPa act, with ``rims (n, 3)`` as `Pressures.rims` gave them.
     """
 
     time: float
@@ -51,17 +47,20 @@ class Increment:
     scale: Array
     history: Array
     penalty: float
-    grip: Grip | None = None
+    drives: Drives = field(default_factory=Drives.none)
+    grips: tuple[Grip | None, ...] = ()
     flat_from: float = np.inf
-    across: tuple[float, float] = (0.0, 0.0)
+    pressures: tuple[float, ...] = ()
+    rims: Array | float = 0.0
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """The potential and its derivatives at one displacement field.
 
-    ``data``: entries of the tangent; None where it was not asked for.  ``reaction (3,)``: force of the
-    indenter in its frame, N; the last is the ``force`` along the axis.
+    ``data``: entries of the tangent; None where it was not asked for.  ``reactions (b, 6)``: what moves the
+    coordinates of each body, N and N mm; ``force`` is the first body's along its axis.  ``contact_norm,
+    load_norm``: norms of the nodal contact forces, and of the forces that drive bodies, N.
     """
 
     energy: float
@@ -73,7 +72,8 @@ class Evaluation:
     advance: Array | None = None
     contact_norm: float = 0.0
     touch: Touch | None = None
-    reaction: Array | None = None
+    reactions: Array | None = None
+    load_norm: float = 0.0
 
     @property
     def tangent(self) -> Array:
@@ -95,57 +95,55 @@ class System:
         mesh = problem.mesh
         self.problem = problem
         self.element: Element = problem.formulation
+        self.nodes = len(mesh.points)
+        self.rows = self.nodes + extra_rows(problem.rigid_bodies)
         self.points = np.ascontiguousarray(mesh.points, dtype=float)
         self.cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
         self.regions = np.ascontiguousarray(mesh.regions, dtype=np.int32)
         self.gradients, self.weights = reference_gradients(self.element, self.points, mesh.cells)
         self._number_unknowns(problem)
-        self._build_pattern()
-        self.surface: ContactSurface | None = None
-        self.indenter = problem.indenter
-        if problem.indenter is not None:
-            faces = np.asarray(problem.contact_faces, dtype=np.int64)
-            self.surface = ContactSurface.build(self.element, self.points, faces, problem.contact_rule)
-            nothing = np.zeros(self.surface.areas.shape)
-            vectors = np.zeros((*nothing.shape, 3))
-            self._slipping = nothing > 0.0, vectors, vectors, nothing
-            self.spread = self._spread(self.surface)
-            touching = self.surface.faces
-            self.face_positions = _positions(touching, self.numbers, self.indptr, self.indices)
-            indenter = problem.indenter
-            if problem.start == "touching":
-                indenter = indenter.moved(self._touching(indenter))
-            check_clear(self.surface, indenter.moved(float(problem.history.at(0.0))))
-            self.indenter = indenter
+        self._build_pattern(problem)
+        self.bodies: Bodies | None = None
+        pattern = Pattern(self.indptr, self.indices, self.numbers)
+        self.pressures = Pressures(self.element, self.points, problem.pressures, pattern)
+        if problem.rigid_bodies:
+            self.bodies = Bodies(problem, self.element, self.points, pattern)
 
-    def _touching(self, indenter: Indenter) -> float:
-        assert self.surface is not None
-        offset = touching_offset(self.surface, indenter)
-        if abs(self.surface.gaps(indenter.moved(offset)).min()) > 1e-6:
-            raise ProblemError(
-                "the indenter never meets the contact faces", remedy="check its centre, axis and the faces"
-            )
-        return offset
+    @property
+    def surface(self) -> ContactSurface | None:
+        """The contact faces of the indenter, or of the first body."""
+        return None if self.bodies is None else self.bodies.first.surface
+
+    @property
+    def indenter(self) -> Indenter | None:
+        """The problem's indenter where it starts."""
+        if self.bodies is None or self.problem.indenter is None:
+            return None
+        start = self.bodies.first.start
+        assert isinstance(start, Indenter)
+        return start
 
     def _number_unknowns(self, problem: Problem) -> None:
-        n = len(self.points)
-        factors = np.full((n, 3), np.nan)
+        factors = np.full((self.rows, 3), np.nan)
         for support in problem.supports:
             factors[np.asarray(support.nodes), support.component] = support.factor
         factors[np.asarray(problem.fixed, dtype=int)] = 0.0
         free = np.isnan(factors)
+        forced = [body.motion.free for body in problem.rigid_bodies if body.motion.free.any()]
+        free[self.nodes :] = np.array(forced, dtype=bool).reshape(-1, 3)
         self.supported = ~free
-        self.factors = np.where(free, 0.0, factors)
+        self.factors = np.where(free | np.isnan(factors), 0.0, factors)
         self.free = np.flatnonzero(free.ravel())
-        self.numbers = np.full((n, 3), -1, dtype=np.int32)
+        self.numbers = np.full((self.rows, 3), -1, dtype=np.int32)
         self.numbers.ravel()[self.free] = np.arange(len(self.free), dtype=np.int32)
         if not len(self.free):
             raise ProblemError("every node is held: nothing is left to solve")
 
-    def _build_pattern(self) -> None:
-        graph, numbers = node_graph(self.cells, len(self.points)), self.numbers
+    def _build_pattern(self, problem: Problem) -> None:
+        moved = [np.unique(body.faces) for body in problem.rigid_bodies if body.motion.free.any()]
+        graph, numbers = bordered(node_graph(self.cells, self.nodes), moved), self.numbers
         self.indptr, self.indices = upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
-        self.cell_positions = _positions(self.cells, numbers, self.indptr, self.indices)
+        self.cell_positions = positions(self.cells, numbers, self.indptr, self.indices)
 
     @property
     def unknowns(self) -> int:
@@ -159,14 +157,18 @@ class System:
             and mine.fixed is problem.fixed
             and mine.contact_faces is problem.contact_faces
             and mine.indenter is problem.indenter
+            and mine.bodies is problem.bodies
+            and mine.pressures is problem.pressures
+            and mine.history.forced == problem.history.forced
             and mine.supports == problem.supports
             and (mine.element, mine.start, mine.contact_rule)
             == (problem.element, problem.start, problem.contact_rule)
         )
 
-    def impose(self, u: Array, displacement: float) -> Array:
-        """``u`` with the supported components at their values."""
-        return np.where(self.supported, self.factors * displacement, u)
+    def impose(self, u: Array, increment: Increment) -> Array:
+        """``u`` with supported components, and coordinates of bodies that are held, at their values."""
+        held = np.where(self.supported, self.factors * increment.displacement, u)
+        return held if self.bodies is None else self.bodies.impose(held, increment.drives)
 
     def elements(self, cells: slice) -> Elements:
         """Some of the elements, as the kernels take them."""
@@ -179,7 +181,7 @@ class System:
         return [work(parts[0])] if len(parts) == 1 else list(thread_pool(self.threads).map(work, parts))
 
     def evaluate(self, u: Array, laws: Laws, increment: Increment, tangent: bool = True) -> Evaluation:
-        """Energy, residual (n, 3) and, if wanted, tangent entries at ``u (n, 3)``."""
+        """Energy, residual (r, 3) and, if wanted, tangent entries at ``u (r, 3)``."""
         size = len(self.indices) if tangent else 0
         mean = self.element.mean_dilatation
 
@@ -196,145 +198,36 @@ class System:
             energy += more[0]
             residual += more[1]
             data += more[2]
-        if not np.isfinite(energy) or self.surface is None or self.indenter is None:
-            return Evaluation(energy, residual, data if tangent else None)
-        (found, deepest, area), reaction, pushed, advance, touch = self._contact(u, increment)
+        load_norm = 0.0
+        if increment.pressures:
+            pressing, pressed, load_norm = self.pressures.evaluate(u, increment.pressures, increment.rims)
+            energy, residual = energy + pressing, residual + pressed
+            if tangent:
+                self.pressures.tangent(u, increment.pressures, data)
+        if not np.isfinite(energy) or self.bodies is None:
+            return Evaluation(energy, residual, data if tangent else None, load_norm=load_norm)
+        found = self._contact(u, increment, tangent)
+        driving, loads = self.bodies.driven(u, increment.drives, increment.penalty)
         if tangent:
-            blocks = touch.blocks.reshape(*self.surface.areas.shape, 3, 3)
-            add_springs(self.surface.N, blocks, self.face_positions, data)
-        norm = float(np.linalg.norm(pushed))
+            self.bodies.tangent(found, increment.drives, increment.penalty, data)
         return Evaluation(
-            energy + found, residual + pushed, data if tangent else None, float(reaction[2]), deepest, area,
-            advance, norm, touch, reaction,
+            energy + found.energy + driving, residual + found.residual + loads.residual,
+            data if tangent else None, float(found.reactions[0, 2]), found.penetration, found.area,
+            self.bodies.advance(found) if tangent else None,
+            float(np.linalg.norm(found.residual[: self.nodes])), found.touch, found.reactions,
+            max(loads.norm, load_norm),
         )  # fmt: skip
+
+    def _contact(self, u: Array, increment: Increment, tangent: bool = False) -> Contacts:
+        assert self.bodies is not None
+        return self.bodies.evaluate(
+            u, increment.drives, increment.penalty, increment.flat_from, increment.grips, tangent
+        )
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
-        """The contact part of the residual (n, 3), N."""
-        return np.zeros_like(u) if self.surface is None else self._contact(u, increment)[2]
+        """The contact part of the residual (r, 3), N."""
+        return np.zeros_like(u) if self.bodies is None else self._contact(u, increment).residual
 
-    def tool(self, increment: Increment) -> tuple[ContactSurface, Indenter]:
-        """The contact surface, and the indenter where it is in a step."""
-        if self.surface is None or self.indenter is None:
-            raise ProblemError("the problem has no indenter")
-        return self.surface, self.indenter.moved(increment.displacement, increment.across)
-
-    def _contact(
-        self, u: Array, increment: Increment
-    ) -> tuple[tuple[float, float, float], Array, Array, Array, Touch]:
-        """What `contact` returns, the reaction, residual and advance that it fills, and its springs."""
-        surface, indenter = self.tool(increment)
-        grip = increment.grip
-        near = Distances.of(surface, indenter, u, None if grip is None else grip.held)
-        holding = self._slipping if grip is None else (grip.held, grip.places, grip.normals, grip.bounds)
-        shape, reaction = surface.areas.shape, np.zeros(3)
-        residual, advance, gaps = np.zeros_like(u), np.zeros_like(u), np.full(shape, np.inf)
-        normals, blocks, stick = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3)), np.zeros((*shape, 3, 3))
-        found = contact(
-            surface.faces, surface.N, surface.areas,
-            (near.points, near.places, near.gaps, near.slopes, near.bends), indenter.frame,
-            increment.penalty, increment.flat_from, holding, reaction, residual, advance, gaps, normals,
-            blocks, stick,
-        )  # fmt: skip
-        weights = increment.penalty * surface.areas.ravel()
-        touch = Touch(
-            gaps.ravel(), normals.reshape(-1, 3), weights, blocks.reshape(-1, 3, 3), stick.reshape(-1, 3, 3)
-        )
-        return found, reaction, residual, advance, touch
-
-    def with_springs(self, data: Array, blocks: Array) -> Array:
-        """``data`` plus a stiffness (c, 3, 3) at every contact point."""
-        assert self.surface is not None
-        data = data.copy()
-        surface = self.surface
-        shape = *surface.areas.shape, 3, 3
-        add_springs(surface.N, np.ascontiguousarray(blocks).reshape(shape), self.face_positions, data)
-        return data
-
-    def at_springs(self, forces: Array) -> Array:
-        """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns."""
-        return np.asarray(self.spread @ forces.reshape(-1, *forces.shape[2:]))
-
-    def springs_of(self, x: Array) -> Array:
-        """Values (c, 3, ...) of a vector (or matrix) of the unknowns at the contact points."""
-        return np.asarray(self.spread.T @ x).reshape(-1, 3, *x.shape[1:])
-
-    def _spread(self, surface: ContactSurface) -> sp.csr_matrix:
-        """Shares (unknowns, 3 c) of the unknowns in the position of every contact point."""
-        f, q = len(surface.faces), len(surface.N)
-        columns = np.arange(3 * f * q).reshape(f, q, 1, 3)
-        rows = self.numbers[surface.faces][:, None]
-        shares = surface.N[None, :, :, None]
-        rows, columns, shares = np.broadcast_arrays(rows, columns, shares)
-        held = rows < 0
-        entries = shares[~held], (rows[~held], columns[~held])
-        return sp.csr_matrix(entries, shape=(self.unknowns, 3 * f * q))
-
-
-def node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
-    """Which nodes share a cell, themselves included; rows sorted."""
-    m, k = cells.shape
-    incidence = sp.csr_matrix(
-        (np.ones(m * k, dtype=np.int32), cells.ravel(), np.arange(0, m * k + 1, k)), shape=(m, nodes)
-    )
-    graph = (incidence.T @ incidence).tocsr()
-    graph.sort_indices()
-    return graph
-
-
-@njit(cache=True)
-def upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
-    """Upper triangle of the unknowns' graph, rows sorted, from the sorted graph of the nodes."""
-    indptr = np.zeros(n + 1, dtype=np.int32)
-    for sweep in range(2):
-        if sweep == 1:
-            for i in range(n):
-                indptr[i + 1] += indptr[i]
-            indices = np.empty(indptr[n], dtype=np.int32)
-        for a in range(numbers.shape[0]):
-            for i in range(3):
-                row = numbers[a, i]
-                if row < 0:
-                    continue
-                count = 0
-                for p in range(start[a], start[a + 1]):
-                    for j in range(3):
-                        column = numbers[neighbours[p], j]
-                        if column >= row:
-                            if sweep == 1:
-                                indices[indptr[row] + count] = column
-                            count += 1
-                if sweep == 0:
-                    indptr[row + 1] = count
-    return indptr, indices
-
-
-@njit(cache=True)
-def place_of(columns, left, right, column):  # type: ignore[no-untyped-def]
-    """Place of a column among the sorted ``columns[left:right]`` of a row."""
-    while left < right:
-        middle = (left + right) // 2
-        if columns[middle] < column:
-            left = middle + 1
-        else:
-            right = middle
-    return left
-
-
-@njit(cache=True)
-def _positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
-    """Place of each upper-triangle entry (component-major rows) of each cell in the sparse data."""
-    m, k = cells.shape
-    n = 3 * k
-    out = np.empty((m, n * (n + 1) // 2), dtype=np.int32)
-    for e in range(m):
-        at = 0
-        for r in range(n):
-            row = numbers[cells[e, r % k], r // k]
-            for c in range(r, n):
-                column = numbers[cells[e, c % k], c // k]
-                low, high = min(row, column), max(row, column)
-                out[e, at] = -1
-                if low >= 0:
-                    out[e, at] = place_of(indices, indptr[low], indptr[low + 1], high)
-                at += 1
-    return out
+    def tools(self, u: Array, increment: Increment) -> list[Tool]:
+        """The rigid bodies where they are at ``u (r, 3)``."""
+        return [] if self.bodies is None else self.bodies.tools(u, increment.drives)

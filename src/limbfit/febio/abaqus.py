@@ -164,7 +164,7 @@ def _step(problem: Problem, system: System, handle: int, settings: FebSettings) 
     history, axis = problem.history, system.indenter.frame[2]
     end = float(history.times[-1])
     yield "*AMPLITUDE, NAME=advance"
-    yield from (f"{float(t)!r}, {float(d)!r}" for t, d in zip(history.times, history.displacement))
+    yield from (f"{float(t)!r}, {float(d)!r}" for t, d in zip(history.times, history.driver))
     yield f"*BOUNDARY\n{HELD}, 1, 3\nhandle, 4, 6"
     relaxing = any(g for m in problem.materials.values() for g, _ in m.table().prony)
     kind = "*VISCO, CETOL=0.1" if relaxing else "*STATIC"

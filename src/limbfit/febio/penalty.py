@@ -106,8 +106,9 @@ class FaceWise:
         return face_quadrature(problem.formulation, points, self.faces, problem.contact_rule)[1]
 
     def _weigh(self, areas: Array) -> None:
-        assert self.system.surface is not None
-        self.system.surface = replace(self.system.surface, areas=self.share * areas)
+        assert self.system.bodies is not None
+        body = self.system.bodies.first
+        body.surface = replace(body.surface, areas=self.share * areas)
 
 
 def automatic_penalties(problem: Problem, faces: Indices, dt: float) -> Array:
@@ -158,11 +159,12 @@ def _normals(points: Array, faces: Indices) -> Array:
 def _covered(problem: Problem) -> Indices:
     """The contact faces that the indenter would pass through at its deepest; all, where there are none."""
     faces, indenter = np.asarray(problem.contact_faces), problem.indenter
-    assert indenter is not None
+    if indenter is None:
+        return faces
     if problem.start == "touching":
         surface = ContactSurface.build(problem.formulation, problem.mesh.points, faces, problem.contact_rule)
         indenter = indenter.moved(touching_offset(surface, indenter))
-    deepest = indenter.moved(float(problem.history.displacement.max()))
+    deepest = indenter.moved(float(problem.history.driver.max()))
     middle = problem.mesh.points[faces[:, : 4 if faces.shape[1] == 4 else 3]].mean(axis=1)
     inside = deepest.signed_distance(middle) < 0.0
     return faces[inside] if inside.any() else faces

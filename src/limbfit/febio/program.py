@@ -137,7 +137,8 @@ def _end(process: subprocess.Popen) -> None:
 def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: float = 0.0) -> Result:
     """FEBio's force over time as a `Result`, complete or not.
 
-    FEBio's table says nothing of penetration and area, and forces across the axis are not read: they are NaN;
+    FEBio's table says nothing of penetration and area; forces across the axis, moments and coordinates are
+    not read: all are NaN;
     there are no states.
 
     Raises
@@ -153,7 +154,8 @@ def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: 
             f"the table goes on to {times[-1]:.4g} s, the indentation to {problem.history.times[-1]:.4g} s",
             remedy="give the table of the same indentation",
         )
-    unknown = np.full(len(times), np.nan)
+    unknown, reactions = np.full(len(times), np.nan), np.full((len(times), 1, 6), np.nan)
+    reactions[:, 0, 2] = force
     return Result(
         problem=problem,
         times=times,
@@ -163,7 +165,9 @@ def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: 
         parameter_names=problem.parameter_names,
         penetration=unknown,
         contact_area=unknown,
-        reaction=np.column_stack([np.full((len(times), 2), np.nan), force]),
+        reactions=reactions,
+        coordinates=np.full((len(times), 1, 6), np.nan),
+        displacement_sensitivity=None,
         states=(),
         completed=verdict.completed,
         reason=verdict.reason,

@@ -118,6 +118,8 @@ def check_exportable(problem: Problem, program: str) -> None:
         raise ProblemError(f"only indentations with fixed nodes are written for {program}")
     if problem.history.across is not None:
         raise ProblemError(f"a move across the indenter's axis is not written for {program}")
+    if problem.history.forced or problem.bodies:
+        raise ProblemError(f"an indenter under force, or further rigid bodies, are not written for {program}")
     if problem.friction != "frictionless":
         raise ProblemError(
             f"friction is not written for {program}, nor is limbfit's sticky contact",
@@ -288,7 +290,7 @@ def _rigid(axis: Array) -> Iterator[str]:
 
 def _contact(problem: Problem, settings: FebSettings) -> Iterator[str]:
     """The way of the reference cases; the search reaches as far as the punch goes in, and half again."""
-    reach = max(1.5 * float(problem.history.displacement.max()), 2.0)
+    reach = max(1.5 * float(problem.history.driver.max()), 2.0)
     yield '<Contact><contact name="indentation" type="sliding-elastic" surface_pair="indentation">'
     contact = contact_of(problem, settings)
     yield f"<laugon>PENALTY</laugon><penalty>{contact.penalty!r}</penalty>"
@@ -302,7 +304,7 @@ def _load_curves(problem: Problem, settings: FebSettings) -> Iterator[str]:
     history = problem.history
     musts = np.concatenate([[0.0], schedule(history, settings.steps)])
     curves = [
-        ("advance", "LINEAR", np.column_stack([history.times, history.displacement])),
+        ("advance", "LINEAR", np.column_stack([history.times, history.driver])),
         ("must_points", "STEP", np.column_stack([musts, np.full(len(musts), largest_step(problem))])),
     ]
     yield "<LoadData>"

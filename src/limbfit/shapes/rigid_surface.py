@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from .closest_point import INSIDE, Tree, build_tree, closest_point
+from .triangles import beyond_edges, normal_spread, triangle_normals
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -96,13 +97,13 @@ class RigidSurface:
 
     def _shrunk(self, radius: float) -> Array | None:
         """Points (n, 3) of the surface whose faces moved in by ``radius``; None where a face turns over."""
-        normals, areas = _normals(self.points[self.faces])
-        spread, along = _spread(self.points, self.faces, normals)
+        normals, areas = triangle_normals(self.points[self.faces])
+        spread, along = normal_spread(self.points, self.faces, normals)
         values, axes = np.linalg.eigh(spread)
         keep = values > SPREAD * values[:, -1:]
         inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
         moved = self.points - radius * np.einsum("nij,nj,nkj,nk->ni", axes, inverse, axes, along)
-        after, left = _normals(moved[self.faces])
+        after, left = triangle_normals(moved[self.faces])
         solid = areas > 1e-12 * areas.max()
         upright = (np.einsum("mi,mi->m", normals, after) > 0.5) & (left > 0.0)
         return moved if upright[solid].all() else None
@@ -145,55 +146,25 @@ def _check_size(points: Array) -> None:
         )
 
 
-def _normals(corners: Array) -> tuple[Array, Array]:
-    """Unit normals (m, 3), zero for degenerate triangles, and areas (m,)."""
-    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(vectors, axis=1)
-    flat = length <= 1e-14 * length.max()
-    return np.where(flat[:, None], 0.0, vectors / np.where(flat, 1.0, length)[:, None]), 0.5 * length
-
-
-def _angles(corners: Array) -> Array:
-    """Angles (m, 3) of triangles at their corners."""
-    ahead = np.roll(corners, -1, axis=1) - corners
-    back = np.roll(corners, 1, axis=1) - corners
-    sine = np.linalg.norm(np.cross(ahead, back), axis=2)
-    return np.arctan2(sine, np.einsum("mij,mij->mi", ahead, back))
-
-
-def _spread(points: Array, faces: Faces, normals: Array) -> tuple[Array, Array]:
-    """Sums over the faces at each point, weighted by angle, of ``n n^T (n, 3, 3)`` and ``n (n, 3)``."""
-    weights = _angles(points[faces])
-    outer, sums = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    for corner in range(3):
-        w = weights[:, corner, None] * normals
-        np.add.at(outer, faces[:, corner], w[:, :, None] * normals[:, None, :])
-        np.add.at(sums, faces[:, corner], w)
-    return outer, sums
-
-
 def _body(points: Array, faces: Faces) -> Body:
     """The arrays of the kernels; pseudo-normals after Baerentzen and Aanaes (2005)."""
     corners = np.ascontiguousarray(points[faces])
-    normals, areas = _normals(corners)
-    spread, sums = _spread(points, faces, normals)
+    normals, areas = triangle_normals(corners)
+    spread, sums = normal_spread(points, faces, normals)
     values, axes = np.linalg.eigh(spread)
     on_edge = (values[:, 0] < STRAIGHT * values[:, 2]) & (values[:, 1] > STRAIGHT * values[:, 2])
     along = np.where(on_edge[:, None], axes[:, :, 0], 0.0)
     solid = np.flatnonzero(areas > 1e-12 * areas.max())
     facing = normals[solid, 2] > min(FRONT, 0.5 * normals[solid, 2].max())
     trees = build_tree(corners, solid), build_tree(corners, solid[facing])
-    return corners, normals, _edge_normals(faces, normals), sums[faces], along[faces], *trees
-
-
-def _edge_normals(faces: Faces, normals: Array) -> Array:
-    """Sum (m, 3, 3) of the normals of the two faces at the edge from each corner to the next."""
-    ahead = np.roll(faces, -1, axis=1)
-    count = int(faces.max()) + 1
-    there, back = (faces * count + ahead).ravel(), (ahead * count + faces).ravel()
-    order = np.argsort(there)
-    other = order[np.searchsorted(there[order], back)] // 3
-    return normals[:, None, :] + normals[other].reshape(*faces.shape, 3)
+    return (
+        corners,
+        normals,
+        normals[:, None] + normals[beyond_edges(faces)],
+        sums[faces],
+        along[faces],
+        *trees,
+    )
 
 
 @njit(cache=True)

@@ -8,14 +8,16 @@ gives distances, gradients and hessians (`Distances`); the energy's kernel knows
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ..kernel.elements import Element, face_quadrature
-from .indenter import Indenter
+from .rigid import RigidShape
 
 Array = NDArray[np.float64]
 START_MM = 0.02  # inside the tissue is a start that is deeper; other quadratures touch a little sooner
@@ -42,26 +44,29 @@ class ContactSurface:
             return cls(nodes[:, None], np.ones((1, 1)), share[:, None], points)
         return cls(np.ascontiguousarray(faces), np.ascontiguousarray(N), areas, points)
 
-    def gaps(self, indenter: Indenter, u: Array | None = None) -> Array:
-        """Signed distances (f, q) at the quadrature points, mm."""
-        return indenter.local_distance(self.local(indenter, u))[0]
+    @property
+    def points_at_rest(self) -> Array:
+        """The quadrature points (f, q, 3) of the undeformed surface, mm."""
+        return self.at(self.points)
 
-    def local(self, indenter: Indenter, u: Array | None = None) -> Array:
-        """The quadrature points (f, q, 3) in the indenter's frame, mm."""
-        at = np.empty((*self.areas.shape, 3))
-        place_points(self.faces, self.N, self.points if u is None else self.points + u, at)
-        return (at - np.asarray(indenter.centre)) @ indenter.frame.T
+    def gaps_at_rest(self, indenter: RigidShape) -> Array:
+        """Signed distances (f, q) of the undeformed surface, mm."""
+        points = self.points_at_rest
+        return indenter.signed_distance(points.reshape(-1, 3)).reshape(points.shape[:2])
 
-    def moved(self, indenter: Indenter, du: Array) -> Array:
-        """What displacements (n, 3, p) of the nodes do to the points in the indenter's frame (f, q, 3, p)."""
-        return np.einsum("ij,qk,fkjp->fqip", indenter.frame, self.N, du[self.faces], optimize=True)
-
-    def distributed(self, indenter: Indenter, forces: Array) -> Array:
-        """Forces (f, q, 3, p) at the points, in the indenter's frame, as those of the nodes (n, 3, p)."""
-        out = np.zeros((len(self.points), 3, forces.shape[-1]))
-        parts = np.einsum("ij,qk,fqip->fkjp", indenter.frame, self.N, forces, optimize=True)
-        np.add.at(out, self.faces, parts)
+    def at(self, nodes: Array) -> Array:
+        """The quadrature points (f, q, 3) of nodes that are at ``nodes (n, 3)``, mm."""
+        out = np.empty((*self.areas.shape, 3))
+        place_points(self.faces, self.N, nodes, out)
         return out
+
+    @cached_property
+    def shares(self) -> sp.csr_matrix:
+        """(n, f q): how the force at every quadrature point is that of the nodes."""
+        (f, k), q = self.faces.shape, len(self.N)
+        nodes, shares = np.broadcast_arrays(self.faces[:, None], self.N[None])
+        columns = np.repeat(np.arange(f * q), k)
+        return sp.csr_matrix((shares.ravel(), (nodes.ravel(), columns)), shape=(len(self.points), f * q))
 
 
 @njit(cache=True)
@@ -79,13 +84,15 @@ def place_points(faces, N, x, out):  # type: ignore[no-untyped-def]
 class Touch:
     """Contact points (c,) as springs: gap (mm, infinite where far), unit normal (c, 3), stiffness
     ``weights (c,)`` along it (N/mm), and the tangent ``blocks (c, 3, 3)``; the part ``stick (c, 3, 3)`` of
-    the tangent is that of anchors, there whether the gap is closed or not."""
+    the tangent is that of anchors, there whether the gap is closed or not.  ``forces (c, 3)``: derivative
+    of the energy with respect to the points, N."""
 
     gaps: Array
     normals: Array
     weights: Array
     blocks: Array
     stick: Array
+    forces: Array
 
     @property
     def closed(self) -> NDArray[np.bool_]:
@@ -104,13 +111,13 @@ class Touch:
         return self.stick + pushing * closed[:, None, None], forces
 
 
-def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: float = 1e-9) -> float:
+def touching_offset(surface: ContactSurface, indenter: RigidShape, tolerance: float = 1e-9) -> float:
     """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface.
 
     From far outside it advances by the smallest distance, which cannot jump over the first touch, or by a
     thousandth of its width where that is less; the last advance is then halved.
     """
-    at = np.einsum("qk,fki->fqi", surface.N, surface.points[surface.faces]).reshape(-1, 3)
+    at = surface.points_at_rest.reshape(-1, 3)
     along = (at - np.asarray(indenter.centre)) @ indenter.frame[2]
     low = high = float(along.min()) - indenter.width
     end, least = float(along.max()) + indenter.length, 1e-3 * indenter.width
@@ -126,101 +133,63 @@ def touching_offset(surface: ContactSurface, indenter: Indenter, tolerance: floa
     return low
 
 
-def check_clear(surface: ContactSurface, indenter: Indenter) -> None:
-    """Raise `ProblemError` where the indenter starts inside the undeformed body."""
-    gaps = surface.gaps(indenter)
-    face, point = np.unravel_index(gaps.argmin(), gaps.shape)
-    depth = -float(gaps[face, point])
+def check_clear(surface: ContactSurface, indenter: RigidShape, name: str = "indenter") -> None:
+    """Raise `ProblemError` where the body starts inside the undeformed tissue."""
+    gaps = surface.gaps_at_rest(indenter)
+    at = np.unravel_index(gaps.argmin(), gaps.shape)
+    depth = -float(gaps[at])
     if depth > START_MM:
-        where = ", ".join(f"{v:.2f}" for v in surface.N[point] @ surface.points[surface.faces[face]])
+        where = ", ".join(f"{v:.2f}" for v in surface.points_at_rest[at])
         raise ProblemError(
-            f"the indenter starts {depth:.3g} mm inside the tissue, deepest at ({where}) mm",
+            f"the {name} starts {depth:.3g} mm inside the tissue, deepest at ({where}) mm",
             remedy="move it out along its axis, or start it touching",
         )
 
 
-@dataclass(frozen=True)
-class Distances:
-    """Contact points near a rigid body.
-
-    ``points (k,)``: their numbers among all (f, q).  In the body's frame: ``places (k, 3)``, signed distances
-    ``gaps (k,)``, mm, their gradients ``slopes (k, 3)`` and hessians ``bends (k, 3, 3)``, 1/mm.
-    """
-
-    points: NDArray[np.int64]
-    places: Array
-    gaps: Array
-    slopes: Array
-    bends: Array
-
-    @classmethod
-    def of(
-        cls, surface: ContactSurface, indenter: Indenter, u: Array, also: NDArray[np.bool_] | None = None
-    ) -> Distances:
-        """From the indenter where it is at the displacement ``u (n, 3)``; ``also (f, q)`` points far away."""
-        local = surface.local(indenter, u).reshape(-1, 3)
-        wanted = indenter.near(local)
-        if also is not None:
-            wanted |= also.ravel()
-        points = np.flatnonzero(wanted)
-        return cls(points, local[points], *indenter.local_distance(local[points]))
-
-
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    faces, N, areas, near, frame, penalty, flat_from, grip, reaction, residual, advance, gaps, normals,
-    blocks, stick,
+    near, frame, weights, areas, flat_from, grip, forces, gaps, normals, blocks, stick
 ):  # fmt: skip
-    """Add the contact energy's gradient to ``residual``; its hessian is that of the springs ``blocks``.
+    """Energy and forces of the contact points of one body; the hessian is that of the springs ``blocks``.
 
     ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
-    ``flat_from``: penetration from which a point's tangent leaves the indenter's curvature out (mm).
-    ``grip``: the held points, their anchors, normals and bounds (`Grip`).  ``reaction (3,)`` receives the
-    force of the body in its frame, N; ``advance (n, 3)`` the mixed derivative with respect to displacement
-    and indenter advance (times -1 it is the derivative of the residual); ``gaps (f, q)``, ``normals
-    (f, q, 3)`` and ``blocks (f, q, 3, 3)`` receive distance, its gradient and the tangent of each point,
-    ``stick (f, q, 3, 3)`` the part of the tangent that holds it along the body.
+    ``weights, areas (c,)``: penalty times area (N/mm) and area of every point.  ``flat_from``: penetration
+    from which a point's tangent leaves the body's curvature out (mm).  ``grip``: the held points, their
+    anchors, normals and bounds (`Grip`).  ``forces (c, 3)`` receive the derivative of the energy with respect
+    to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks (c, 3, 3)`` distance, its gradient and
+    the tangent of each point, ``stick (c, 3, 3)`` the part of the tangent that holds it along the body.
     Returns energy, largest penetration (mm), reference area in touch (mm^2).
     """
     points, local, phis, slopes, bends = near
     held, places, planes, bounds = grip
-    k = faces.shape[1]
     t, h, hold = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     energy = deepest = area = 0.0
     for p in range(len(points)):
-        f, q = divmod(points[p], N.shape[0])
-        phi, g, w = phis[p], slopes[p], penalty * areas[f, q]
-        gaps[f, q] = phi
+        c = points[p]
+        phi, g, w = phis[p], slopes[p], weights[c]
+        gaps[c] = phi
         t[:], h[:] = 0.0, 0.0
         for i in range(3):
-            normals[f, q, i] = frame[0, i] * g[0] + frame[1, i] * g[1] + frame[2, i] * g[2]
+            normals[c, i] = frame[0, i] * g[0] + frame[1, i] * g[1] + frame[2, i] * g[2]
         if phi < 0.0:
             energy += 0.5 * w * phi * phi
             deepest = max(deepest, -phi)
-            area += areas[f, q]
+            area += areas[c]
             for i in range(3):
                 t[i] = w * phi * g[i]
                 for j in range(3):
                     h[i, j] = w * (g[i] * g[j] + (phi * bends[p, i, j] if phi > -flat_from else 0.0))
-        if held[f, q]:
-            energy += _hold(local[p], places[f, q], planes[f, q], bounds[f, q], w, t, hold)
-            _rotated(frame, hold, stick[f, q])
+        if held[c]:
+            energy += _hold(local[p], places[c], planes[c], bounds[c], w, t, hold)
+            _rotated(frame, hold, stick[c])
             for i in range(3):
                 for j in range(3):
                     h[i, j] += hold[i, j]
         elif phi >= 0.0:
             continue
         for i in range(3):
-            reaction[i] -= t[i]
-            push = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
-            for a in range(k):
-                residual[faces[f, a], i] += N[q, a] * push
-        H = blocks[f, q]
-        _rotated(frame, h, H)
-        for a in range(k):
-            for i in range(3):
-                along = H[i, 0] * frame[2, 0] + H[i, 1] * frame[2, 1] + H[i, 2] * frame[2, 2]
-                advance[faces[f, a], i] += N[q, a] * along
+            forces[c, i] = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
+        _rotated(frame, h, blocks[c])
     return energy, deepest, area
 
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .contact import ContactSurface, Distances
+from .contact import ContactSurface
 from .grip import Grip
-from .indenter import Indenter
+from .tool import Distances, Tool
 
 Array = NDArray[np.float64]
 
@@ -37,9 +37,9 @@ class Coulomb(Grip):
         nothing, vectors = np.zeros(shape), np.zeros((*shape, 3))
         return cls(nothing > 0.0, vectors, vectors, nothing, np.zeros((*shape, 3, parameters)), mu)
 
-    def renewed(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Coulomb:
-        """Planes and bounds as they are at ``u (n, 3)``."""
-        return self._at(Distances.of(surface, indenter, u, self.held))
+    def renewed(self, tool: Tool) -> Coulomb:
+        """Planes and bounds as they are where the tool is."""
+        return self._at(Distances.of(tool, self.held))
 
     def _at(self, near: Distances) -> Coulomb:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
@@ -47,33 +47,33 @@ class Coulomb(Grip):
         bounds.ravel()[near.points] = self.mu * np.maximum(-near.gaps, 0.0)
         return replace(self, normals=normals, bounds=bounds)
 
-    def after(self, surface: ContactSurface, indenter: Indenter, u: Array, du: Array | None) -> Coulomb:
+    def after(self, tool: Tool, du: Array | None) -> Coulomb:
         """The anchors at the end of a step: those of new points where they are, those of slipping ones drawn
-        along; planes and bounds are those of ``u (n, 3)``."""
-        near = Distances.of(surface, indenter, u, self.held)
+        along; planes and bounds are those that hold there."""
+        near = Distances.of(tool, self.held)
         now = self._at(near)
-        closed, local = now.bounds > 0.0, surface.local(indenter, u)
+        closed, local = now.bounds > 0.0, tool.local
         slip = _Slip.of(now, local)
         new, drawn = (closed & ~self.held)[..., None], (closed & self.held & ~slip.stuck)[..., None]
         places = np.where(new, local, np.where(drawn, local - slip.elastic, self.places))
         d_places = self.d_places
         if du is not None:
-            moved = surface.moved(indenter, du)
+            moved = tool.moved(du)
             tangent = slip.tangent + now._coupling(near, slip)
             d_elastic = tangent @ moved - slip.tangent @ d_places
             d_drawn = np.where(drawn[..., None], moved - d_elastic, d_places)
             d_places = np.where(new[..., None], moved, d_drawn)
         return replace(now, held=closed, places=places, d_places=d_places)
 
-    def explicit(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+    def explicit(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
-        return np.asarray(-_Slip.of(self, surface.local(indenter, u)).tangent @ self.d_places)
+        return np.asarray(-_Slip.of(self, tool.local).tangent @ self.d_places)
 
-    def coupling(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+    def coupling(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, 3) of the forces, over penalty and area, through planes and bounds, which are
-        those of ``u (n, 3)``."""
-        near = Distances.of(surface, indenter, u, self.held)
-        return self._coupling(near, _Slip.of(self, surface.local(indenter, u)))
+        those that hold where the tool is."""
+        near = Distances.of(tool, self.held)
+        return self._coupling(near, _Slip.of(self, tool.local))
 
     def _coupling(self, near: Distances, slip: _Slip) -> Array:
         bends = np.zeros(slip.tangent.shape)

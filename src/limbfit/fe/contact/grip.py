@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .contact import ContactSurface
-from .indenter import Indenter
+from .tool import Tool
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -40,20 +39,26 @@ class Grip(ABC):
     bounds: Array
     d_places: Array
 
-    @abstractmethod
-    def renewed(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Grip:
-        """The grip that an equilibrium at ``u (n, 3)``, with the indenter where it is, asks for; itself where
-        it holds."""
+    @property
+    def arrays(self) -> tuple[Bools, Array, Array, Array]:
+        """What the contact kernel takes of it, point by point."""
+        places, normals = self.places.reshape(-1, 3), self.normals.reshape(-1, 3)
+        return self.held.ravel(), places, normals, self.bounds.ravel()
 
     @abstractmethod
-    def after(self, surface: ContactSurface, indenter: Indenter, u: Array, du: Array | None) -> Grip:
-        """The grip after a step that ended at ``u (n, 3)``; ``du (n, 3, p)`` its derivative, where wanted."""
+    def renewed(self, tool: Tool) -> Grip:
+        """The grip that an equilibrium with the tool where it is asks for; itself where it holds."""
 
     @abstractmethod
-    def explicit(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+    def after(self, tool: Tool, du: Array | None) -> Grip:
+        """The grip after a step that ended there; ``du (r, 3, p)`` the derivative of the tool's ``u``, where
+        wanted."""
+
+    @abstractmethod
+    def explicit(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
 
     @abstractmethod
-    def coupling(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array | None:
+    def coupling(self, tool: Tool) -> Array | None:
         """Derivative (f, q, 3, 3) of the forces, over penalty and area, through what a step holds constant
         although it follows the displacement; None where nothing does."""

@@ -95,6 +95,12 @@ class Indenter:
         move = np.array([*across, distance]) @ self.frame
         return replace(self, centre=np.asarray(self.centre, dtype=float) + move)
 
+    def placed(
+        self, centre: NDArray[np.float64], axis: NDArray[np.float64], edge: NDArray[np.float64]
+    ) -> Indenter:
+        """The indenter with another frame."""
+        return replace(self, centre=centre, axis=axis, edge=edge)
+
     def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (n,) of points (n, 3), mm; negative inside."""
         local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .contact import ContactSurface
 from .grip import Grip
-from .indenter import Indenter
+from .tool import Tool
 
 Array = NDArray[np.float64]
 
@@ -33,36 +33,36 @@ class Anchors(Grip):
         vectors, slopes = np.zeros((*shape, 3)), np.zeros((*shape, 3, parameters))
         return cls(np.zeros(shape, dtype=bool), vectors, vectors, np.full(shape, np.inf), slopes, slopes)
 
-    def renewed(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Anchors:
-        """The anchors without those whose points left the indenter (where it is now) at ``u (n, 3)``."""
-        lost = self.held & (surface.gaps(indenter, u) >= 0.0)
+    def renewed(self, tool: Tool) -> Anchors:
+        """The anchors without those whose points left the indenter."""
+        lost = self.held & (tool.gaps >= 0.0)
         return replace(self, held=self.held & ~lost) if lost.any() else self
 
-    def after(self, surface: ContactSurface, indenter: Indenter, u: Array, du: Array | None) -> Anchors:
+    def after(self, tool: Tool, du: Array | None) -> Anchors:
         """The anchors at the end of a step: points that touch for the first time are held where they are.
 
-        ``du (n, 3, p)`` is the derivative of ``u (n, 3)``, where that is wanted.
+        ``du (r, 3, p)`` is the derivative of the tool's ``u``, where that is wanted.
         """
-        local = surface.local(indenter, u)
-        gaps, normals, curvatures = indenter.local_distance(local)
+        local = tool.local
+        gaps, normals, curvatures = tool.body.local_distance(local)
         closed = gaps < 0.0
         new = (closed & ~self.held)[..., None]
         d_places, d_normals = self.d_places, self.d_normals
         if du is not None:
-            moved = surface.moved(indenter, du)
+            moved = tool.moved(du)
             d_places = np.where(new[..., None], moved, d_places)
             d_normals = np.where(new[..., None], curvatures @ moved, d_normals)
         places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)
         return Anchors(closed, places, normals, self.bounds, d_places, d_normals)
 
-    def explicit(self, surface: ContactSurface, indenter: Indenter, u: Array) -> Array:
+    def explicit(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
-        move = surface.local(indenter, u) - self.places
+        move = tool.local - self.places
         n, d_n, d_a = self.normals[..., None], self.d_normals, self.d_places
         across = np.einsum("fqi,fqi->fq", self.normals, move)[..., None, None]
         turned = np.einsum("fqip,fqi->fqp", d_n, move) + -np.einsum("fqi,fqip->fqp", self.normals, d_a)
         change = -(d_n * across + n * turned[:, :, None]) - d_a
         return np.asarray(self.held[..., None, None] * change)
 
-    def coupling(self, surface: ContactSurface, indenter: Indenter, u: Array) -> None:
+    def coupling(self, tool: Tool) -> None:
         """Nothing: anchors and planes stay."""

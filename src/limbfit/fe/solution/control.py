@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..problem import History, ProblemError
 from .newton import NewtonControl
-from .schedule import graded
+from .schedule import graded, with_turns
 
 Array = NDArray[np.float64]
 
@@ -67,10 +68,15 @@ class StepControl:
         return NewtonControl(tolerance=self.tolerance, max_iterations=self.max_iterations)
 
 
-def schedule(history: History, control: StepControl) -> Array:
-    """Times (k,) of the steps, s, before any is cut: those stated, or as `graded` places them."""
+def schedule(history: History, control: StepControl, turns: Sequence[float] | Array = ()) -> Array:
+    """Times (k,) of the steps, s, before any is cut: those stated, or as `graded` places them.
+
+    The ``turns (k,)`` of further bodies are among those placed.
+    """
     if control.times is None:
-        return graded(history, control.load_steps, control.unload_steps)
+        return with_turns(
+            graded(history, control.load_steps, control.unload_steps), np.asarray(turns, dtype=float)
+        )
     if control.times[-1] > history.times[-1] * (1.0 + 1e-9):
         raise ProblemError(
             f"a step at {control.times[-1]} s lies beyond the history's end at {history.times[-1]} s"

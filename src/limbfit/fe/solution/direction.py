@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies import Bodies
 from ..contact.contact import Touch
 from ..system import Evaluation, System
 from .factor import Factor, Solution
@@ -50,6 +51,12 @@ def newton_direction(
     return direction.reshape(at.residual.shape)
 
 
+def touching(system: System) -> Bodies:
+    """The rigid bodies of a system that has some."""
+    assert system.bodies is not None
+    return system.bodies
+
+
 def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> SpringChange | None:
     """How the springs of a set of closed points differ from the factor's; None where too many close or open.
 
@@ -77,21 +84,22 @@ def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: fl
 def _with_contact(
     system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float
 ) -> Solution:
+    bodies = touching(system)
     found, closed = Solution(np.zeros_like(b), True, True), touch.closed
     for _ in range(ROUNDS):
         guess = found.x
         if factor.lasting:
             guess, closed = _foresee(system, at, touch, factor, b, guess, closed)
         blocks, change = touch.under(closed)
-        data = system.with_springs(at.tangent, blocks - touch.blocks)
+        data = bodies.with_springs(at.tangent, blocks - touch.blocks)
         springs = _matched(factor, at, touch, closed, data)
-        right = b - system.at_springs(change)[:, None]
+        right = b - bodies.at_springs(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
             found = factor.solve_anew(data, right, blocks, tolerance, found.x)
         if not found.convex and factor.lasting:
             found = _of_descent(factor, data, right, blocks, tolerance)
-        foreseen = _closed(touch, system.springs_of(found.x[:, 0]))
+        foreseen = _closed(touch, bodies.springs_of(found.x[:, 0]))
         if (foreseen == closed).all() or (factor.lasting and springs is None) or not found.convex:
             break
         closed = foreseen
@@ -119,9 +127,10 @@ def _foresee(
     springs = _change(factor, at, touch, closed)
     if springs is None:
         return x, touch.closed
-    before = system.springs_of(x[:, 0])
+    bodies = touching(system)
+    before = bodies.springs_of(x[:, 0])
     y = factor.apply(b - factor.product(at.tangent, x) if x.any() else b)
-    moved = system.springs_of(y[:, 0])
+    moved = bodies.springs_of(y[:, 0])
     part = None
     for _ in range(SWEEPS):
         blocks, change = touch.under(closed)
@@ -157,7 +166,8 @@ def _begin(system: System, at: Evaluation, factor: Factor) -> None:
     if at.touch is None:
         factor.factorise(at.tangent)
     else:
-        factor.factorise(system.with_springs(at.tangent, -at.touch.blocks), np.zeros_like(at.touch.blocks))
+        without = touching(system).with_springs(at.tangent, -at.touch.blocks)
+        factor.factorise(without, np.zeros_like(at.touch.blocks))
 
 
 def renew(at: Evaluation, factor: Factor) -> None:

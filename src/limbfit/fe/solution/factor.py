@@ -17,7 +17,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from ..system import System
-from .convexity import shear_stiffness
+from .convexity import body_stiffness, shear_stiffness
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
 from .multigrid import Multigrid
 from .springs import SpringChange, SpringColumns
@@ -31,6 +31,8 @@ FEWEST_MULTIGRID, MOST_CYCLES = 60_000, 150
 # Smallest and largest shear stiffness added to a tangent that is not positive definite, as a share of each
 # tissue's own: tissues differ by up to a hundredfold, and a common one would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 0.1, 1e6
+# Share of `body_stiffness` in every factor.
+GROUNDING = 0.1
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,13 @@ class Factor:
         self, system: System, moduli: Array, name: str = "auto", threads: int = 1, lasting: bool = False
     ) -> None:
         self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
-        suits = system.cells.shape[1] == 10 and system.unknowns >= FEWEST_MULTIGRID
+        moving = system.bodies is not None and system.bodies.free > 0
+        suits = not moving and system.cells.shape[1] == 10 and system.unknowns >= FEWEST_MULTIGRID
         if name == "auto" and suits and not lasting:
             self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]
         self._shear: Array | None = None
+        self._ground = body_stiffness(system, moduli)
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._shift = self._next_shift = 0.0
@@ -148,8 +152,12 @@ class Factor:
 
     def _factorised(self, data: Array, shift: float) -> bool:
         self.counts["factorisations" if self.lasting else "multigrids"] += 1
+        data = self.stiffened(data, shift) if shift else data
+        if len(self._ground[0]):  # a body that touches nothing yet is held by nothing
+            data = data.copy()
+            data[self._ground[0]] += GROUNDING * self._ground[1]
         try:
-            self._solver.factorise(self.stiffened(data, shift) if shift else data)
+            self._solver.factorise(data)
         except NotPositiveDefiniteError:
             return False
         return True

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies import extra_rows
 from ..history import Memory
 from ..kernel.laws import Laws
 from ..problem import Problem
-from ..result import Result
+from ..result import Result, State
 from ..system import System
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ def extrapolation(travels: Sequence[float], travel: float) -> Array:
 
 @dataclass(frozen=True)
 class Warm:
-    """The displacements ``u`` of another simulation at ``times`` (k,) s, ascending."""
+    """The displacements ``u`` (r, 3), rows of bodies included, of another simulation at ``times`` (k,) s."""
 
     times: Array
     u: tuple[Array, ...]
@@ -49,15 +50,15 @@ class Warm:
     @classmethod
     def of(cls, problem: Problem, found: Result | None) -> Warm:
         """Those of a result on the same mesh, moved to the new parameters along their sensitivities."""
-        if found is None or not len(found.states) or found.states[0].u.shape != problem.mesh.points.shape:
+        rows = extra_rows(problem.rigid_bodies)
+        shapes = [(state.u.shape, len(state.coordinates)) for state in found.states[:1]] if found else []
+        if found is None or shapes != [(problem.mesh.points.shape, rows)]:
             return cls(np.zeros(0), ())
         new, old = problem.parameters, found.problem.parameters
         with np.errstate(all="ignore"):  # moduli act by their ratio
             change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
         times = np.array([state.time for state in found.states])
-        return cls(
-            times, tuple(s.u if s.sensitivity is None else s.u + s.sensitivity @ change for s in found.states)
-        )
+        return cls(times, tuple(_moved(state, change) for state in found.states))
 
     def at(self, t: float) -> Array | None:
         """Displacement (n, 3) at a time, linear between the states; None outside of them."""
@@ -71,10 +72,15 @@ class Warm:
         return self.u[before] + share * (self.u[after] - self.u[before])
 
 
+def _moved(state: State, change: Array) -> Array:
+    """All rows (r, 3) of a state, after a ``change (p,)`` of the parameters if its derivatives are known."""
+    return state.rows if state.sensitivity is None else state.rows + state.slopes @ change
+
+
 def tangent_at_rest(system: System) -> Array:
     """Entries of the tangent of the undeformed body, before contact, with its problem's materials."""
     problem = system.problem
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    start = float(problem.history.at(0.0))
-    increment = Memory.rest(system, laws).increment(system, laws, 1.0, 1.0, start, 0.0)
-    return system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    start = problem.history.displacement_at(0.0)
+    increment = Memory.rest(system, laws).increment(system, laws, 1.0, 1.0, start, 0.0, problem.drives(0.0))
+    return system.evaluate(np.zeros((system.rows, 3)), laws, increment).tangent

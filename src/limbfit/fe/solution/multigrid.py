@@ -16,7 +16,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...mesh import TET10_EDGES
-from ..system import System, node_graph, place_of, upper_pattern
+from ..pattern import node_graph, place_of, upper_pattern
+from ..system import System
 from .linear import Index, NotPositiveDefiniteError, linear_solver
 
 Array = NDArray[np.float64]

@@ -140,8 +140,9 @@ def residual_norm(system: System, at: Evaluation) -> float:
 
 def reaction_scale(system: System, at: Evaluation, floor: float) -> float:
     """The force against which a residual is judged: contact or support reactions, at least ``floor``, N."""
-    supports = float(np.linalg.norm(np.where(system.supported, at.residual, 0.0)))
-    return max(at.contact_norm, supports, floor)
+    held = system.supported[: system.nodes]
+    supports = float(np.linalg.norm(np.where(held, at.residual[: system.nodes], 0.0)))
+    return max(at.contact_norm, at.load_norm, supports, floor)
 
 
 class _Evaluator:

@@ -39,7 +39,7 @@ def graded(history: History, load_steps: int, unload_steps: int) -> Array:
     budget = {"load": load_steps, "unload": unload_steps - 1, "hold": unload_steps}
     budget["approach"] = 2
     times: list[Array] = []
-    travel = float(history.displacement.max())
+    travel = float(history.driver.max())
     for kind, group in groupby(history.phases, key=lambda phase: phase.kind):
         row = list(group)
         whole = sum(phase.duration_s for phase in row)
@@ -50,9 +50,14 @@ def graded(history: History, load_steps: int, unload_steps: int) -> Array:
             power = FROM_REST if fresh else AFTER_TURN
             part = (np.arange(1, count + 1) / count) ** power
             times.append(phase.start_s + phase.duration_s * part)
-    found = np.concatenate(times)
-    apart = np.abs(found[:, None] - history.turns).min(axis=0) > 1e-9 * found[-1]
-    return np.union1d(found, history.turns[apart])
+    return with_turns(np.concatenate(times), history.turns)
+
+
+def with_turns(times: Array, turns: Array) -> Array:
+    """The times and those of the ``turns (k,)`` that are not among them, up to the last time."""
+    inside = turns[turns < times[-1]]
+    apart = np.abs(times[:, None] - inside).min(axis=0) > 1e-9 * times[-1]
+    return np.union1d(times, inside[apart])
 
 
 def foresee(
@@ -64,6 +69,8 @@ def foresee(
     one step leads to the end of the history: there are no more steps than planned and one.
     """
     targets, now = list(left), times[-1]
+    if history.forced:  # contact ends where the force is stated to
+        return targets
     phase = _at(history, now, targets[0]) if targets else None
     if phase is None or phase.kind != "unload":
         return targets

@@ -15,6 +15,7 @@ from ..contact.grip import Grip
 from ..contact.sticky import Anchors
 from ..history import Memory, elastic_stresses
 from ..kernel.laws import Laws
+from ..motion import Drives
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
@@ -65,15 +66,18 @@ class Simulation:
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
         self.damping = 0.0  # to begin a step with, after one that needed it
-        self.grip = _grip(self.system, problem.friction, self.laws.count if sensitivities else 0)
+        self.grips = _grips(self.system, self.laws.count if sensitivities else 0)
         self.warm = Warm.of(problem, warm_start)
         self.floor, self.pushing = 0.0, False
         width = problem.indenter.width if problem.indenter is not None else 1.0
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
-        self.deepest = control.penetration * float(np.abs(problem.history.displacement).max())
-        rest = np.zeros_like(self.system.points)
+        self.deepest = control.penetration * _travel(problem)
+        rest = np.zeros((self.system.rows, 3))
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
-        self.states = [State(0.0, float(problem.history.at(0.0)), rest, self.stiffness, still)]
+        drives = problem.drives(0.0)
+        self.rest = self._coordinates(rest, drives)
+        start = problem.history.displacement_at(0.0)
+        self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives)]
         self.reason = ""
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
@@ -81,7 +85,7 @@ class Simulation:
 
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
-        planned = schedule(self.problem.history, self.control)
+        planned = schedule(self.problem.history, self.control, self.problem.turns)
         targets = list(planned)
         pace, why = Pace(self.control.max_iterations), ""
         times, forces = [0.0], [0.0]
@@ -122,15 +126,18 @@ class Simulation:
         """
         before = self.states[-1]
         history, dt = self.problem.history, t - before.time
-        displacement, stiffness, u = float(history.at(t)), self.stiffness, self._predict(t)
+        displacement, drives = history.displacement_at(t), self.problem.drives(t)
+        stiffness, u = self.stiffness, self._predict(t)
+        pressures = tuple(pressure.at(t) for pressure in self.problem.pressures)
         for raises in range(MOST_RAISES, -1, -1):
             may_rise = raises > 0 and not self.control.hold_penalty
             increment = self.memory.increment(
-                self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus
+                self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus, drives
             )
             increment = replace(
-                increment, grip=self.grip, flat_from=STEEP_PRESSURE / stiffness, across=history.across_at(t)
-            )
+                increment, grips=self.grips, flat_from=STEEP_PRESSURE / stiffness, pressures=pressures,
+                rims=self.system.pressures.rims(self.states[-1].rows, pressures) if pressures else 0.0,
+            )  # fmt: skip
             control = replace(
                 self.control.newton, damping=self.damping, max_iterations=patience,
                 bearable=TOO_DEEP * self.deepest if may_rise else np.inf,
@@ -146,24 +153,27 @@ class Simulation:
     def _settle(
         self, increment: Increment, u: Array, control: NewtonControl
     ) -> tuple[Equilibrium, Increment]:
-        """An equilibrium, and the increment with the grip that holds there."""
-        found = self._equilibrate(increment, u, control)
+        """An equilibrium, and the increment with the grips and the rims of pressures that hold there."""
+        found = self._equilibrate(increment, self.system.impose(u, increment), control)
         for _ in range(MOST_RENEWALS):
-            if found.reason or increment.grip is None or found.at.penetration > control.bearable:
+            lags = any(increment.grips) or increment.pressures
+            if found.reason or not lags or found.at.penetration > control.bearable:
                 return found, increment
-            grip = increment.grip.renewed(*self.system.tool(increment), found.u)
-            if grip is increment.grip:
+            tools = self.system.tools(found.u, increment)
+            grips = tuple(g and g.renewed(tool) for g, tool in zip(increment.grips, tools))
+            if not increment.pressures and all(new is old for new, old in zip(grips, increment.grips)):
                 return found, increment
-            increment = replace(increment, grip=grip)
+            rims = self.system.pressures.rims(found.u, increment.pressures)
+            increment = replace(increment, grips=grips, rims=rims)
             found = self._equilibrate(increment, found.u, control)
             if not found.iterations:
                 return found, increment
-        reason = "" if found.first <= UNSETTLED else "friction does not settle"
+        reason = "" if found.first <= UNSETTLED else "friction, or the rim of a pressure, does not settle"
         return replace(found, reason=reason, unsettled=found.first), increment
 
     def _equilibrate(self, increment: Increment, guess: Array, control: NewtonControl) -> Equilibrium:
-        """From the predicted displacement or the last one; from the last one where that fails."""
-        guesses = [self.system.impose(u, increment.displacement) for u in (guess, self.states[-1].u)]
+        """From the guess or the last displacement; from the last one where that fails."""
+        guesses = [guess, self.system.impose(self.states[-1].rows, increment)]
         found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
         for tried in (guesses, guesses[1:]):
             found = equilibrate(
@@ -185,9 +195,9 @@ class Simulation:
     def _predict(self, t: float) -> Array:
         warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
         if warm is not None:  # what it missed by in the step before, it will miss by in this one
-            return warm if last is None else warm + (self.states[-1].u - last)
+            return warm if last is None else warm + (self.states[-1].rows - last)
         weights = self._foreseen(t)
-        return np.asarray(sum(w * state.u for w, state in zip(weights, self.states)))
+        return np.asarray(sum(w * state.rows for w, state in zip(weights, self.states)))
 
     def _foreseen(self, t: float) -> Array:
         """Weights of the last states in a guess of the one at time ``t``."""
@@ -216,23 +226,42 @@ class Simulation:
         after = self.memory.advanced(self.system, self.laws, stress, dt)
         if self._turns(increment.time, at.force):
             after, self.slope = after.turned(), None if self.slope is None else self.slope.turned()
-        if increment.grip is not None:
-            self.grip = increment.grip.after(*self.system.tool(increment), u, du)
+        tools = self.system.tools(u, increment)
+        self.grips = tuple(g and g.after(tool, du) for g, tool in zip(increment.grips, tools))
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
-        state = State(increment.time, increment.displacement, u, stiffness, du, after.turned())
+        coordinates, deepening = self._coordinates(u, increment.drives), None
+        displacement = increment.displacement
+        if self.problem.history.forced:
+            displacement = float(coordinates[0, 2])
+            deepening = None if du is None else du[self.system.nodes, 2]
+        state = self._state(increment.time, displacement, u, stiffness, du, after.turned(), increment.drives)
         self.states = [*self.states[-2:], state]
         if found.residual > self.control.tolerance:
-            self.unbalanced.append((increment.displacement, found.residual))
+            self.unbalanced.append((displacement, found.residual))
         if found.unsettled > self.control.tolerance:
-            self.unsettled.append((increment.displacement, found.unsettled))
+            self.unsettled.append((displacement, found.unsettled))
         self.counts["steps"] += 1
         self.seconds["accept"] += time.perf_counter() - started
         return Step(
-            increment.time, increment.displacement, at.force, at.penetration, at.contact_area,
-            found.iterations, force_slope, np.zeros(3) if at.reaction is None else at.reaction, state,
+            increment.time, displacement, at.force, at.penetration, at.contact_area, found.iterations,
+            force_slope, np.zeros((0, 6)) if at.reactions is None else at.reactions, coordinates, deepening,
+            state,
         )  # fmt: skip
+
+    def _coordinates(self, u: Array, drives: Drives) -> Array:
+        """Where the rigid bodies are (b, 6), mm and rad."""
+        bodies = [] if self.system.bodies is None else self.system.bodies.tools(u, drives)
+        return np.array([tool.pose.coordinates for tool in bodies]).reshape(-1, 6)
+
+    def _state(
+        self, time: float, displacement: float, u: Array, stiffness: float, du: Array | None,
+        memory: Memory | None, drives: Drives,
+    ) -> State:  # fmt: skip
+        n = self.system.nodes
+        slopes = (None, None) if du is None else (du[:n], du[n:])
+        return State(time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives)
 
     def _turns(self, t: float, force: float) -> bool:
         """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
@@ -240,7 +269,8 @@ class Simulation:
         met, self.pushing = (force > 0.0) != self.pushing, force > 0.0
         if self.control.stress == "linear" or (met and len(self.states) > 1):
             return True
-        return bool(np.isclose(t, self.problem.history.kinks, rtol=1e-9, atol=0.0).any())
+        kinks = np.concatenate([self.problem.history.kinks, self.problem.turns])
+        return bool(np.isclose(t, kinks, rtol=1e-9, atol=0.0).any())
 
     def _differentiate(
         self, explicit: Explicit, found: Equilibrium, increment: Increment
@@ -249,32 +279,54 @@ class Simulation:
         system, laws, at, u = self.system, self.laws, found.at, found.u
         d_penalty = laws.modulus_gradient / laws.modulus  # the penalty moves with the mean modulus
         change = explicit.forces + system.contact_force(u, increment)[..., None] * d_penalty
-        d_reaction, coupling = np.zeros(laws.count), None
-        if increment.grip is not None:
-            surface, tool = system.tool(increment)
-            stiff = (increment.penalty * surface.areas)[..., None, None]
-            pushed = stiff * increment.grip.explicit(surface, tool, u)
-            change += surface.distributed(tool, pushed)
-            d_reaction -= pushed[:, :, 2].sum(axis=(0, 1))
-            coupling = increment.grip.coupling(surface, tool, u)
+        d_reaction, couplings = np.zeros(laws.count), []
+        for i, (grip, tool) in enumerate(zip(increment.grips, system.tools(u, increment))):
+            if grip is None:
+                continue
+            stiff = (increment.penalty * tool.surface.areas)[..., None, None]
+            pushed = stiff * grip.explicit(tool)
+            change += tool.distributed(pushed)
+            if i == 0:
+                d_reaction -= pushed[:, :, 2].sum(axis=(0, 1))
+            coupling = grip.coupling(tool)
             if coupling is not None:
-                coupling = (tool.frame.T @ (stiff * coupling) @ tool.frame).reshape(-1, 3, 3)
+                in_space = tool.body.frame.T @ (stiff * coupling) @ tool.body.frame
+                couplings.append((i, in_space.reshape(-1, 3, 3)))
+        rims = system.pressures.coupling(u, increment.pressures) if increment.pressures else None
         b = -change.reshape(-1, laws.count)[system.free]
         weights = self._foreseen(increment.time)
-        guess = sum(w * s.sensitivity for w, s in zip(weights, self.states) if s.sensitivity is not None)
+        guess = sum(w * s.slopes for w, s in zip(weights, self.states))
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
         du = np.zeros((u.size, laws.count))
-        du[system.free], d_force = solve_coupled(system, at, self.slopes, b, x, coupling)
-        return du.reshape(*u.shape, laws.count), at.force * d_penalty + d_reaction + d_force
+        du[system.free], d_force = solve_coupled(system, at, self.slopes, b, x, couplings, rims)
+        du = du.reshape(*u.shape, laws.count)
+        if self.problem.history.forced:  # the force is what is stated
+            return du, np.zeros(laws.count)
+        return du, at.force * d_penalty + d_reaction + d_force
 
 
-def _grip(system: System, friction: str | float, parameters: int) -> Grip | None:
-    """What holds the points at first; None where nothing ever does."""
-    if system.surface is None or friction in ("frictionless", 0.0):
-        return None
-    if isinstance(friction, str):
-        return Anchors.none(system.surface, parameters)
-    return Coulomb.none(float(friction), system.surface, parameters)
+def _travel(problem: Problem) -> float:
+    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
+    or half the largest body's width where only forces drive them."""
+    bodies = problem.rigid_bodies
+    if not bodies:
+        return float(np.abs(problem.history.driver).max())
+    ways = [np.abs(body.motion.values[:, :3]) * ~body.motion.free[:3] for body in bodies]
+    return max(float(way.max()) for way in ways) or max(body.shape.width for body in bodies) / 2
+
+
+def _grips(system: System, parameters: int) -> tuple[Grip | None, ...]:
+    """What holds the points of each body at first; None where nothing ever does."""
+    found: list[Grip | None] = []
+    for body in [] if system.bodies is None else system.bodies.all:
+        friction = body.stated.friction
+        if friction in ("frictionless", 0.0):
+            found.append(None)
+        elif isinstance(friction, str):
+            found.append(Anchors.none(body.surface, parameters))
+        else:
+            found.append(Coulomb.none(float(friction), body.surface, parameters))
+    return tuple(found)
 
 
 def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:

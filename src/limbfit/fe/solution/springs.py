@@ -27,7 +27,7 @@ class SpringColumns:
     """
 
     def __init__(self, system: System, apply: Callable[[Array], Array]) -> None:
-        self._system, self._apply = system, apply
+        self._bodies, self._unknowns, self._apply = system.bodies, system.unknowns, apply
         self.clear(None)
 
     def clear(self, blocks: Array | None) -> None:
@@ -35,7 +35,7 @@ class SpringColumns:
         self.blocks = blocks
         self.keys: dict[tuple[int, int], int] = {}
         # In single precision like the factor: they only precondition.
-        self.Z = np.empty((self._system.unknowns, 0), dtype=np.float32, order="F")
+        self.Z = np.empty((self._unknowns, 0), dtype=np.float32, order="F")
         count = 0 if blocks is None else len(blocks)
         self.at_points = np.empty((count, 3, 0))
 
@@ -44,33 +44,39 @@ class SpringColumns:
 
         ``touched (c,)``: springs to be pushed along ``normals (c, 3)`` although they may not differ.
         """
-        if self.blocks is None or self._system.indenter is None:
+        if self.blocks is None or self._bodies is None:
             return None
-        frame = self._system.indenter.frame  # on a flat face only its last axis is stiff
-        change = frame @ (blocks - self.blocks) @ frame.T
+        frames = self._bodies.frames  # on a flat face only the last axis is stiff
+        change = frames @ (blocks - self.blocks) @ frames.transpose(0, 2, 1)
         typical = max(float(np.abs(blocks).max()), float(np.abs(self.blocks).max()), 1e-300)
         wanted = np.abs(change).max(axis=2) > NOTABLE * typical
-        wanted |= touched[:, None] & (np.abs(normals @ frame.T) > 0.2)
-        if not self._complete(wanted, frame, most):
+        wanted |= touched[:, None] & (np.abs(np.einsum("cij,cj->ci", frames, normals)) > 0.2)
+        if not self._complete(wanted, most):
             return None
         points, axes = np.array(list(self.keys), dtype=int).reshape(-1, 2).T
         together = points[:, None] == points
         D = np.where(together, change[points[:, None], axes[:, None], axes], 0.0)
-        return SpringChange(self, points, frame[axes], D)
+        return SpringChange(self, points, frames[points, axes], D)
 
-    def _complete(self, wanted: Bools, frame: Array, most: int) -> bool:
+    def moved(self, x: Array) -> Array:
+        """Values (c, 3, ...) at the contact points of the unknowns ``x (n, ...)``."""
+        assert self._bodies is not None
+        return self._bodies.springs_of(x)
+
+    def _complete(self, wanted: Bools, most: int) -> bool:
         """Make the columns that are missing, unless they would be too many in all."""
         new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
         if len(self.keys) + len(new) > most:
             return False
         if new:
+            assert self._bodies is not None
             self.keys.update({key: len(self.keys) + i for i, key in enumerate(new)})
             points, axes = np.array(new).T
             unit = np.zeros((len(wanted), 3, len(new)))
-            unit[points, :, np.arange(len(new))] = frame[axes]
-            Z = self._apply(self._system.at_springs(unit))
+            unit[points, :, np.arange(len(new))] = self._bodies.frames[points, axes]
+            Z = self._apply(self._bodies.at_springs(unit))
             self.Z = np.concatenate([self.Z.T, Z.T.astype(np.float32)]).T
-            self.at_points = np.concatenate([self.at_points, self._system.springs_of(Z)], axis=2)
+            self.at_points = np.concatenate([self.at_points, self._bodies.springs_of(Z)], axis=2)
         return True
 
 
@@ -92,7 +98,7 @@ class SpringChange:
         """Solutions (n, r) of the changed matrix from solutions ``y (n, r)`` of the factor."""
         if not len(self._points):
             return y
-        moved = self._inverse @ self.project(self._columns._system.springs_of(y))
+        moved = self._inverse @ self.project(self._columns.moved(y))
         return y - self._columns.Z @ (self._D @ moved).astype(np.float32)
 
     def coefficients(self, moved: Array, forces: Array) -> Array:

@@ -100,12 +100,14 @@ def _result(
     def column(name: str, rest: float = 0.0) -> Array:
         return np.array([rest, *(getattr(row, name) for row in rows)])
 
-    slopes = None
+    slopes = deepening = None
     if sensitivities:
         nothing = np.zeros(run.laws.count)
         slopes = np.array([nothing, *(row.force_sensitivity for row in rows)])
-    displacement, force = column("displacement", float(problem.history.at(0.0))), column("force")
-    penetration = column("penetration")
+        if problem.history.forced:
+            deepening = np.array([nothing, *(row.displacement_sensitivity for row in rows)])
+    displacement, force = column("displacement", problem.history.displacement_at(0.0)), column("force")
+    penetration, bodies = column("penetration"), len(problem.rigid_bodies)
     doubts = _doubts(run, deepest, displacement, force, penetration)
     return Result(
         problem=problem,
@@ -116,7 +118,9 @@ def _result(
         parameter_names=problem.parameter_names,
         penetration=penetration,
         contact_area=column("contact_area"),
-        reaction=np.array([np.zeros(3), *(row.reaction for row in rows)]),
+        reactions=np.array([np.zeros((bodies, 6)), *(row.reactions for row in rows)]),
+        coordinates=np.array([run.rest, *(row.coordinates for row in rows)]),
+        displacement_sensitivity=deepening,
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,

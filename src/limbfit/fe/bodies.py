@@ -1,0 +1,325 @@
+"""The rigid bodies of a discretised problem: their contact as energy, forces, springs and matrix entries.
+
+What is free to move a body joins the unknowns: its coordinates come after those of the nodes, in mm (turns
+times `Tool.unit`).  All contact points of all bodies are numbered in one row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
+from .contact.grip import Grip
+from .contact.pose import Pose
+from .contact.rigid import RigidShape
+from .contact.tool import Distances, Tool
+from .kernel.elements import Element
+from .motion import Drives, RigidBody
+from .pattern import Pattern, places_of, positions
+from .problem import Problem, ProblemError
+
+Array = NDArray[np.float64]
+
+
+# Stiffness that holds a coordinate while a displacement drives it which a force drives at other times, over
+# that of all its contact faces: it stays unknown, so that nothing is numbered anew.
+HOLDING = 100.0
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """The contact of all bodies in one state.
+
+    ``area`` and ``penetration`` are mm^2 and mm over all bodies; ``reactions (b, 6)`` the forces, N, and
+    moments, N mm, that move each body's coordinates; ``residual (r, 3)`` N; ``turning (c, 3, k)`` and
+    ``bending (k, k)`` the parts of the tangent that turns of bodies have beyond the springs.
+    """
+
+    energy: float
+    penetration: float
+    area: float
+    reactions: Array
+    residual: Array
+    touch: Touch
+    turning: Array
+    bending: Array
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Derivative (r, 3) of the energy of what drives bodies, and the norm of the forces among it, N."""
+
+    residual: Array
+    norm: float
+
+
+class _Body:
+    """One body: its surface, where it starts, and which of all contact points and unknowns are its own."""
+
+    def __init__(self, stated: RigidBody, surface: ContactSurface, start: RigidShape, row: int) -> None:
+        self.stated, self.surface, self.start = stated, surface, start
+        self.free = np.flatnonzero(stated.motion.free)
+        self.row = row
+        self.unit = start.width / 2
+        self.frame = start.frame
+        self.points = slice(0, 0)
+        self.columns = slice(0, 0)
+        nothing = np.zeros(surface.areas.size)
+        vectors = np.zeros((nothing.size, 3))
+        self.loose = nothing > 0.0, vectors, vectors, nothing
+
+    @property
+    def pivot(self) -> Array:
+        """The stated one, moved as the body was to where it starts."""
+        return self.stated.origin + np.asarray(self.start.centre) - np.asarray(self.stated.shape.centre)
+
+    @property
+    def units(self) -> Array:
+        """(k,) mm in ``u`` per unit of the free coordinates."""
+        return np.where(self.free > 2, self.unit, 1.0)
+
+    def tool(self, u: Array, drive: Array) -> Tool:
+        """Where it is at ``u (r, 3)``; the coordinates that no force ever drives are at ``drive (6,)``."""
+        coordinates = drive.copy()
+        if len(self.free):
+            found = u[self.row : self.row + 2].ravel() * np.repeat([1.0, 1.0 / self.unit], 3)
+            coordinates[self.free] = found[self.free]
+        pose = Pose(self.start, self.pivot, coordinates)
+        return Tool(self.surface, pose, u, self.free, self.row, self.unit)
+
+
+def extra_rows(bodies: Sequence[RigidBody]) -> int:
+    """Rows of ``u`` beyond those of the nodes: two for each body that something is free to move."""
+    return 2 * sum(bool(body.motion.free.any()) for body in bodies)
+
+
+class Bodies:
+    """See the module docstring.  ``levers (c, 3, k)`` are those of the last tangent that was evaluated."""
+
+    def __init__(self, problem: Problem, element: Element, points: Array, pattern: Pattern) -> None:
+        self.pattern, self.nodes = pattern, len(points)
+        self.unknowns = len(pattern.indptr) - 1
+        row, first, column = len(points), 0, 0
+        self.all: list[_Body] = []
+        for stated in problem.rigid_bodies:
+            surface = ContactSurface.build(
+                element, points, np.asarray(stated.faces, dtype=np.int64), problem.contact_rule
+            )
+            body = _Body(stated, surface, _start(problem, stated, surface), row)
+            body.points = slice(first, first + surface.areas.size)
+            body.columns = slice(column, column + len(body.free))
+            first, column = body.points.stop, body.columns.stop
+            row += 2 if len(body.free) else 0
+            self.all.append(body)
+            start = impose_on(body, np.zeros((row, 3)), *stated.motion.at(0.0))
+            check_clear(surface, body.tool(start, stated.motion.at(0.0)[0]).body, stated.name)
+        self.rows, self.count, self.free = row, first, column
+        self.levers = np.zeros((first, 3, column))
+        self.frames = np.concatenate(
+            [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
+        )
+        self._spread = sp.hstack([self._share(body.surface) for body in self.all], format="csr")
+        self._positions = [positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
+                           for b in self.all]  # fmt: skip
+        self._border()
+
+    def _share(self, surface: ContactSurface) -> sp.csr_matrix:
+        """Shares (unknowns, 3 c) of the unknowns in the position of every contact point."""
+        whole = sp.kron(surface.shares, sp.eye(3), format="csr")
+        numbers = self.pattern.numbers[: self.nodes].ravel()
+        picked = np.flatnonzero(numbers >= 0)
+        place = sp.csr_matrix(
+            (np.ones(len(picked)), (numbers[picked], picked)), shape=(self.unknowns, numbers.size)
+        )
+        return place @ whole
+
+    def _border(self) -> None:
+        """Where the entries of the bodies' coordinates are in the matrix."""
+        start = self.unknowns - self.free
+        own = np.arange(start, self.unknowns)
+        touching = np.flatnonzero(np.diff(self._spread.indptr))
+        pairs = np.array([(r, c) for r in touching for c in own], dtype=np.int64).reshape(-1, 2)
+        places = places_of(self.pattern.indptr, self.pattern.indices, pairs)
+        self._beside = pairs[places >= 0] - [0, start], places[places >= 0]
+        corner = np.array([(r, c) for r in own for c in own if c >= r], dtype=np.int64).reshape(-1, 2)
+        places = places_of(self.pattern.indptr, self.pattern.indices, corner)
+        self._corner = corner[places >= 0] - start, places[places >= 0]
+
+    @property
+    def first(self) -> _Body:
+        """The indenter, or the first body where there is none."""
+        return self.all[0]
+
+    def tools(self, u: Array, drives: Drives) -> list[Tool]:
+        """Where every body is at ``u (r, 3)``."""
+        return [body.tool(u, drive) for body, drive in zip(self.all, drives.values)]
+
+    def impose(self, u: Array, drives: Drives) -> Array:
+        """``u`` with the free coordinates that displacements drive now at their values."""
+        for body, value, forced in zip(self.all, drives.values, drives.forced):
+            if len(body.free):
+                u = impose_on(body, u, value, forced)
+        return u
+
+    def evaluate(
+        self, u: Array, drives: Drives, penalty: float, flat_from: float, grips: Sequence[Grip | None],
+        tangent: bool,
+    ) -> Contacts:  # fmt: skip
+        """Energy and forces of all contact at ``u (r, 3)``; what a tangent needs where it is wanted."""
+        gaps, weights, size = np.full(self.count, np.inf), np.zeros(self.count), (self.count, 3)
+        forces, normals, blocks, stick = (
+            np.zeros(size),
+            np.zeros(size),
+            np.zeros((*size, 3)),
+            np.zeros((*size, 3)),
+        )
+        residual, reactions = np.zeros_like(u), np.zeros((len(self.all), 6))
+        turning, bending = np.zeros((*size, self.free)), np.zeros((self.free, self.free))
+        energy = deepest = area = 0.0
+        for i, (body, tool) in enumerate(zip(self.all, self.tools(u, drives))):
+            at, grip = body.points, grips[i] if i < len(grips) else None
+            near = Distances.of(tool, None if grip is None else grip.held)
+            areas = body.surface.areas.ravel()
+            weights[at] = penalty * areas
+            found = contact(
+                (near.points, near.places, near.gaps, near.slopes, near.bends), tool.body.frame, weights[at],
+                areas, flat_from, body.loose if grip is None else grip.arrays, forces[at], gaps[at],
+                normals[at], blocks[at], stick[at],
+            )  # fmt: skip
+            energy, deepest, area = energy + found[0], max(deepest, found[1]), area + found[2]
+            pushed = np.flatnonzero(forces[at].any(axis=1))
+            places = tool.places.reshape(-1, 3)[pushed]
+            levers = tool.pose.levers(places, np.arange(6))
+            reactions[i] = np.einsum("cik,ci->k", levers, forces[at][pushed])
+            residual += tool.gathered(forces[at][..., None])[..., 0]
+            if tangent and len(body.free):
+                units, columns = tool.units, body.columns
+                self.levers[at, :, columns] = tool.levers
+                turning[at, :, columns] = tool.pose.turning(forces[at], body.free) * units
+                bent = tool.pose.bending(places, forces[at][pushed], body.free)
+                bending[columns, columns] = bent * units * units[:, None] + _mixed(
+                    np.einsum("cij,cik->jk", self.levers[at, :, columns], turning[at, :, columns]), body.free
+                )
+        touch = Touch(gaps, normals, weights, blocks, stick, forces)
+        return Contacts(energy, deepest, area, reactions, residual, touch, turning, bending)
+
+    def tangent(self, found: Contacts, drives: Drives, penalty: float, data: Array) -> None:
+        """Add the hessian of the contact energy, and of what holds bodies, to the entries ``data``."""
+        self._add(found.touch.blocks, data)
+        if self.free:
+            held = [~forced[body.free] * self._holding(body, penalty)
+                    for body, forced in zip(self.all, drives.forced)]  # fmt: skip
+            self._add_border(found.turning, found.bending + np.diag(np.concatenate(held)), data)
+
+    def _holding(self, body: _Body, penalty: float) -> float:
+        """What holds a free coordinate where a displacement drives it, N/mm."""
+        return HOLDING * penalty * float(body.surface.areas.sum())
+
+    def with_springs(self, data: Array, blocks: Array) -> Array:
+        """``data`` plus a stiffness (c, 3, 3) at every contact point."""
+        data = data.copy()
+        self._add(np.ascontiguousarray(blocks), data)
+        return data
+
+    def _add(self, blocks: Array, data: Array) -> None:
+        for body, places in zip(self.all, self._positions):
+            shape = (*body.surface.areas.shape, 3, 3)
+            add_springs(body.surface.N, blocks[body.points].reshape(shape), places, data)
+        if self.free:
+            columns = blocks @ self.levers
+            self._add_border(columns, np.einsum("cij,cik->jk", self.levers, columns), data)
+
+    def _add_border(self, columns: Array, corner: Array, data: Array) -> None:
+        """Add what points feel of the coordinates (c, 3, k), and coordinates of each other (k, k)."""
+        beside = self._spread @ columns.reshape(-1, self.free)
+        pairs, places = self._beside
+        data[places] += beside[pairs[:, 0], pairs[:, 1]]
+        pairs, places = self._corner
+        data[places] += corner[pairs[:, 0], pairs[:, 1]]
+
+    def advance(self, found: Contacts) -> Array:
+        """Mixed derivative (r, 3) with respect to displacement and advance of the first body, times -1."""
+        body, axis = self.first, self.first.frame[2]
+        at, n = body.points, self.nodes
+        pushed = found.touch.blocks[at] @ axis
+        out = np.zeros((self.rows, 3))
+        out[:n] = body.surface.shares @ pushed
+        if len(body.free):
+            columns = self.levers[at, :, body.columns]
+            on_body = np.zeros(6)
+            on_body[body.free] = np.einsum("cik,ci->k", columns, pushed)
+            on_body[body.free] += axis @ found.turning[at, :, body.columns].sum(axis=0)
+            out[body.row : body.row + 2] = on_body.reshape(2, 3)
+        return out
+
+    def along(self, forces: Array) -> Array:
+        """What forces (c, 3, p) on the points ask of the first body along its axis (p,), N."""
+        return -np.einsum("i,cip->p", self.first.frame[2], forces[self.first.points])
+
+    def at_springs(self, forces: Array) -> Array:
+        """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns."""
+        out = np.asarray(self._spread @ forces.reshape(-1, *forces.shape[2:]))
+        if self.free:
+            out[-self.free :] += np.einsum("cik,ci...->k...", self.levers, forces)
+        return out
+
+    def springs_of(self, x: Array) -> Array:
+        """Values (c, 3, ...) of a vector (or matrix) of the unknowns at the contact points, relative to the
+        bodies."""
+        out = np.asarray(self._spread.T @ x).reshape(-1, 3, *x.shape[1:])
+        if self.free:
+            out += np.einsum("cik,k...->ci...", self.levers, x[-self.free :])
+        return out
+
+    def driven(self, u: Array, drives: Drives, penalty: float) -> tuple[float, Loads]:
+        """Energy of what drives the free coordinates at ``u (r, 3)``, and its derivative."""
+        energy, norm, residual = 0.0, 0.0, np.zeros_like(u)
+        for body, value, forced in zip(self.all, drives.values, drives.forced):
+            if not len(body.free):
+                continue
+            now, units = u[body.row : body.row + 2].ravel()[body.free], body.units
+            pulls, off = value[body.free] / units, now - value[body.free] * units
+            under = forced[body.free]
+            stiff = self._holding(body, penalty)
+            energy += float(np.where(under, -pulls * now, 0.5 * stiff * off**2).sum())
+            out = np.zeros(6)
+            out[body.free] = np.where(under, -pulls, stiff * off)
+            residual[body.row : body.row + 2] = out.reshape(2, 3)
+            norm += float((pulls[under] ** 2).sum())
+        return energy, Loads(residual, norm**0.5)
+
+
+def impose_on(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) -> Array:
+    """``u (r, 3)`` with the coordinates of a body at ``value (6,)`` that are free and not ``forced`` now."""
+    held = np.zeros(6, dtype=bool)
+    held[body.free] = ~forced[body.free]
+    if held.any():
+        u = u.copy()
+        rows = u[body.row : body.row + 2].ravel()
+        rows[held] = value[held] * np.repeat([1.0, body.unit], 3)[held]
+        u[body.row : body.row + 2] = rows.reshape(2, 3)
+    return u
+
+
+def _mixed(moved: Array, free: NDArray[np.intp]) -> Array:
+    """The part (k, k) between moves and turns, for ``moved``: lever of row times turning of column."""
+    cross = np.where((free[:, None] < 3) & (free > 2), moved, 0.0)
+    return cross + cross.T
+
+
+def _start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> RigidShape:
+    """Where a body starts: the indenter just in touch, if the problem says so."""
+    if stated.shape is not problem.indenter or problem.start != "touching":
+        return stated.shape
+    offset = touching_offset(surface, stated.shape)
+    start = stated.shape.moved(offset)
+    if abs(surface.gaps_at_rest(start).min()) > 1e-6:
+        raise ProblemError(
+            "the indenter never meets the contact faces", remedy="check its centre, axis and the faces"
+        )
+    return start

@@ -1,0 +1,196 @@
+"""An open rigid surface that is met from one side: a socket, whose inside the limb touches.
+
+Its triangles run counter-clockwise seen from the tissue.  The distance is that to the closest point, positive
+on the tissue's side.  Points beyond the brim, or farther away than the surface's reach, are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...errors import ProblemError
+from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point
+from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
+
+Array = NDArray[np.float64]
+# What lies beyond the brim by less than this share of the triangle beside it is still met.
+BEYOND = 0.02
+Wall = tuple[Array, Array, Array, Array, NDArray[np.bool_], Tree]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenSurface:
+    """An open surface as a rigid body; see the module docstring.
+
+    Parameters
+    ----------
+    points : (n, 3) mm, in the body's frame.
+    faces : (m, 3) corners, counter-clockwise seen from the tissue.
+    centre : (3,) the origin of the body's frame, mm.
+    axis, edge : (3,) third and first axis of the frame; an advance moves along ``axis``.
+    reach : distance from which the surface is not felt, mm.
+
+    Raises
+    ------
+    ProblemError
+        Where it is no triangle surface, or its triangles do not agree on a side.
+    """
+
+    points: Array
+    faces: NDArray[np.int64]
+    centre: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    axis: Sequence[float] | Array = (0.0, 0.0, 1.0)
+    edge: Sequence[float] | Array = (1.0, 0.0, 0.0)
+    reach: float = 20.0
+
+    def __post_init__(self) -> None:
+        points, faces = np.asarray(self.points, dtype=float), np.asarray(self.faces)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise ProblemError("the open surface has points that are not three finite numbers each")
+        if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+            raise ProblemError("the open surface is not made of triangles", remedy="triangulate it")
+        if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
+            raise ProblemError("the faces of the open surface refer to points that it does not have")
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        if len(np.unique(edges, axis=0)) < len(edges):
+            raise ProblemError(
+                "the triangles of the open surface do not agree on a side, or more than two meet at an edge",
+                remedy="orient them alike, counter-clockwise seen from the tissue",
+            )
+        if not self.reach > 0.0:
+            raise ProblemError(f"a reach of {self.reach} mm is not positive")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "faces", faces.astype(np.int64))
+
+    @cached_property
+    def frame(self) -> Array:
+        """(3, 3) orthonormal rows: edge, axis x edge, axis."""
+        axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
+        edge = np.asarray(self.edge, dtype=float)
+        edge = edge - (edge @ axis) * axis
+        edge = edge / np.linalg.norm(edge)
+        return np.array([edge, np.cross(axis, edge), axis])
+
+    @property
+    def width(self) -> float:
+        """Its largest extent across the axis, mm."""
+        return float(np.ptp(self.points[self.faces][..., :2], axis=(0, 1)).max())
+
+    @property
+    def length(self) -> float:
+        """Its extent along the axis, mm."""
+        return float(np.ptp(self.points[self.faces][..., 2]))
+
+    @cached_property
+    def _box(self) -> tuple[Array, Array]:
+        used = self.points[np.unique(self.faces)]
+        return used.min(axis=0) - self.reach, used.max(axis=0) + self.reach
+
+    @cached_property
+    def _wall(self) -> Wall:
+        corners = np.ascontiguousarray(self.points[self.faces])
+        normals = triangle_normals(corners)[0]
+        sums = normal_spread(self.points, self.faces, normals)[1]
+        beyond = beyond_edges(self.faces)
+        edges = normals[:, None] + np.where(beyond[..., None] >= 0, normals[beyond], 0.0)
+        tree = build_tree(corners, np.arange(len(corners)))
+        return corners, normals, edges, sums[self.faces], _brim(self.faces, beyond < 0), tree
+
+    def placed(self, centre: Array, axis: Array, edge: Array) -> OpenSurface:
+        """The same surface with another frame; what was derived from its triangles is kept."""
+        other = replace(self, centre=centre, axis=axis, edge=edge)
+        other.__dict__.update(_wall=self._wall, _box=self._box)
+        return other
+
+    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> OpenSurface:
+        """The surface, advanced along its axis by ``distance`` mm and ``across`` it along x and y."""
+        move = np.array([*across, distance]) @ self.frame
+        return self.placed(np.asarray(self.centre, dtype=float) + move, *self.frame[[2, 0]])
+
+    def signed_distance(self, points: Array) -> Array:
+        """Distance (n,) of points (n, 3), mm; negative behind the surface, infinite where it is not felt."""
+        local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
+        return self.local_distance(local)[0]
+
+    def near(self, points: Array) -> NDArray[np.bool_]:
+        """Which points (n, 3) of its frame it may touch."""
+        low, high = self._box
+        return np.asarray(((points >= low) & (points <= high)).all(axis=1))
+
+    def local_distance(self, points: Array) -> tuple[Array, Array, Array]:
+        """Distance (...), mm, gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
+        shape = points.shape[:-1]
+        x = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
+        values, slopes, bends = wall_distances(x, self._wall, self.reach)
+        return values.reshape(shape), slopes.reshape(*shape, 3), bends.reshape(*shape, 3, 3)
+
+
+def _brim(faces: NDArray[np.int64], open_edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(m, 6) which edges and corners of each triangle are part of the brim."""
+    ends = np.concatenate([faces[open_edges], np.roll(faces, -1, axis=1)[open_edges]])
+    return np.concatenate([open_edges, np.isin(faces, ends)], axis=1)
+
+
+@njit(cache=True)
+def _wall_distance(wall, reach, x, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Distance of ``x (3,)`` from the surface; fills its gradient (3,) and hessian (3, 3)."""
+    corners, normals, edge_normals, sums, brim, tree = wall
+    point, outward, axis = np.empty(3), np.empty(3), np.zeros(3)
+    gradient[:], hessian[:, :] = 0.0, 0.0
+    face, feature, squared = closest_point(corners, tree, x, point)
+    if squared > reach * reach:
+        return np.inf
+    side = size = 0.0
+    for i in range(3):
+        side += (x[i] - point[i]) * normals[face, i]
+        size += (corners[face, 1, i] - corners[face, 0, i]) ** 2
+    gradient[:] = normals[face]
+    if feature == INSIDE:
+        return side
+    if brim[face, feature - 1]:
+        # Beside a plane of symmetry the brim is met; beyond it, nothing is.
+        return side if squared - side * side <= BEYOND * BEYOND * size else np.inf
+    if feature < 4:
+        outward[:] = edge_normals[face, feature - 1]
+    else:
+        outward[:] = sums[face, feature - 4]
+    along = length = 0.0
+    for i in range(3):
+        along += (x[i] - point[i]) * outward[i]
+        length += outward[i] * outward[i]
+    d = np.sqrt(squared)
+    if d <= 1e-9 * np.sqrt(size):
+        for i in range(3):
+            gradient[i] = outward[i] / np.sqrt(length)
+        return 0.0
+    sign = 1.0 if along >= 0.0 else -1.0
+    if feature < 4:
+        a, b = feature - 1, feature % 3
+        length = 0.0
+        for i in range(3):
+            axis[i] = corners[face, b, i] - corners[face, a, i]
+            length += axis[i] * axis[i]
+        axis /= np.sqrt(length)
+    for i in range(3):
+        gradient[i] = sign * (x[i] - point[i]) / d
+    for i in range(3):
+        for j in range(3):
+            identity = 1.0 if i == j else 0.0
+            hessian[i, j] = sign * (identity - gradient[i] * gradient[j] - axis[i] * axis[j]) / d
+    return sign * d
+
+
+@njit(cache=True)
+def wall_distances(points, wall, reach):  # type: ignore[no-untyped-def]
+    """`_wall_distance` of many points (n, 3) with its derivatives."""
+    n = len(points)
+    values, slopes, bends = np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3))
+    for i in range(n):
+        values[i] = _wall_distance(wall, reach, points[i], slopes[i], bends[i])
+    return values, slopes, bends

@@ -1,0 +1,158 @@
+"""Rigid bodies beside the indenter, and how they are driven: by displacement or by force, each coordinate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from .contact.rigid import RigidShape
+
+Array = NDArray[np.float64]
+# A body's coordinates: its move along the axes of its frame at the start, mm, and its rotation vector about
+# them, rad.  Conjugate to them are the force, N, and the moment about the pivot, N mm.
+COORDINATES = ("x", "y", "z", "turn_x", "turn_y", "turn_z")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What drives a rigid body over time, piecewise linear.
+
+    Parameters
+    ----------
+    times : (n,) s, from 0.  One that stands twice ends what went before and begins what follows: there a
+        coordinate may go over from displacement to force, or back.
+    values : (n, 6) of the `COORDINATES`: mm and rad; of forced ones the force, N, or the moment, N mm.
+    forced : (6,), or (n - 1, 6) for each interval: which coordinates are driven by force; the others are
+        held at their values.
+    """
+
+    times: Array
+    values: Array
+    forced: Sequence[bool] | NDArray[np.bool_] = (False,) * 6
+
+    def __post_init__(self) -> None:
+        times, values = np.asarray(self.times, dtype=float), np.asarray(self.values, dtype=float)
+        if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 6):
+            raise ProblemError("a motion needs two or more times and six values for each")
+        if not (np.isfinite(times).all() and np.isfinite(values).all()):
+            raise ProblemError("a motion holds values that are not finite")
+        steps = np.diff(times)
+        twice = np.flatnonzero(steps == 0.0)
+        if times[0] != 0.0 or (steps < 0.0).any() or 0 in twice or (np.diff(twice) == 1).any():
+            raise ProblemError("the times of a motion do not grow from 0")
+        forced = np.asarray(self.forced, dtype=bool)
+        if forced.shape not in ((6,), (len(times) - 1, 6)):
+            raise ProblemError("a motion says of six coordinates whether they are forced")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "forced", np.broadcast_to(forced, (len(times) - 1, 6)))
+
+    @classmethod
+    def of(
+        cls, times: Sequence[float] | Array, *, force: dict[str, Sequence[float] | float] | None = None,
+        **moves: Sequence[float] | float,
+    ) -> Motion:  # fmt: skip
+        """From the coordinates by name, ``z=[0, 2, 2]``; those driven by ``force={"z": [0, 15, 15]}``.
+
+        A coordinate that is not named is held at 0.
+        """
+        values, forced = np.zeros((len(np.asarray(times)), 6)), [False] * 6
+        driven = force or {}
+        for name, given in (*moves.items(), *driven.items()):
+            if name not in COORDINATES:
+                raise ProblemError(f"no coordinate {name!r}", remedy=f"use one of {', '.join(COORDINATES)}")
+            if name in moves and name in driven:
+                raise ProblemError(f"the coordinate {name!r} is driven by displacement and by force")
+            try:
+                values[:, COORDINATES.index(name)] = given
+            except ValueError:
+                raise ProblemError(f"the values of {name!r} are not one for each time") from None
+            forced[COORDINATES.index(name)] = name in driven
+        return cls(np.asarray(times, dtype=float), values, tuple(forced))
+
+    def then(self, after: Motion) -> Motion:
+        """This motion, and when it ends another, whose times begin at 0 anew."""
+        return Motion(
+            np.concatenate([self.times, self.times[-1] + after.times]),
+            np.concatenate([self.values, after.values]),
+            np.concatenate([self.forced, after.forced[:1], after.forced]),
+        )
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(6,) which coordinates a force drives at some time."""
+        return np.asarray(self.forced).max(axis=0).astype(bool)
+
+    def at(self, t: float) -> tuple[Array, NDArray[np.bool_]]:
+        """The values (6,) at time ``t``, and which of them are forces; at the end of an interval, its own."""
+        i = min(max(int(np.searchsorted(self.times, t)) - 1, 0), len(self.times) - 2)
+        share = np.clip((t - self.times[i]) / (self.times[i + 1] - self.times[i]), 0.0, 1.0)
+        value = (1.0 - share) * self.values[i] + share * self.values[i + 1]
+        return value, np.asarray(self.forced)[i]
+
+    @property
+    def turns(self) -> Array:
+        """Times between the ends where a rate changes, or what drives, s."""
+        steps = np.diff(self.times)
+        kept = steps > 0.0
+        rates, forced = np.diff(self.values, axis=0)[kept] / steps[kept, None], np.asarray(self.forced)[kept]
+        size = np.abs(rates).max(axis=0, initial=0.0)
+        changed = (np.abs(np.diff(rates, axis=0)) > 1e-9 * size).any(axis=1)
+        changed |= (forced[1:] != forced[:-1]).any(axis=1)
+        return self.times[:-1][kept][1:][changed]
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What drives the rigid bodies at one time: ``values (b, 6)``, and which of them are forces."""
+
+    values: Array
+    forced: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, motions: Sequence[Motion], t: float) -> Drives:
+        found = [motion.at(t) for motion in motions]
+        values, forced = np.array([v for v, _ in found]), np.array([f for _, f in found], dtype=bool)
+        return cls(values.reshape(-1, 6), forced.reshape(-1, 6))
+
+    @classmethod
+    def none(cls) -> Drives:
+        """Those of no body."""
+        return cls.of((), 0.0)
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A rigid body that touches the tissue.
+
+    Parameters
+    ----------
+    shape : what it is and where it starts.
+    faces : (f, k) outward boundary faces that it may touch.
+    motion : what drives it.
+    friction : as in `Problem`.
+    pivot : (3,) mm, the point about which it turns; the shape's centre where not given.
+    name : for messages and results.
+    """
+
+    shape: RigidShape
+    faces: NDArray[np.int64]
+    motion: Motion
+    friction: str | float = "frictionless"
+    pivot: Sequence[float] | Array | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.pivot is not None:
+            pivot = np.asarray(self.pivot, dtype=float)
+            if pivot.shape != (3,) or not np.isfinite(pivot).all():
+                raise ProblemError("the pivot of a rigid body is not three finite numbers")
+
+    @property
+    def origin(self) -> Array:
+        """(3,) the pivot, mm."""
+        return np.asarray(self.shape.centre if self.pivot is None else self.pivot, dtype=float)

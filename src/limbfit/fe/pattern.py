@@ -1,0 +1,123 @@
+"""The sparse pattern of a discretisation: which unknowns meet, and where their entries are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numba import njit
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """The upper triangle in CSR form, and the number of each unknown (r, 3); -1: none."""
+
+    indptr: NDArray[np.int32]
+    indices: NDArray[np.int32]
+    numbers: NDArray[np.int32]
+
+
+def node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
+    """Which nodes share a cell, themselves included; rows sorted."""
+    m, k = cells.shape
+    incidence = sp.csr_matrix(
+        (np.ones(m * k, dtype=np.int32), cells.ravel(), np.arange(0, m * k + 1, k)), shape=(m, nodes)
+    )
+    graph = (incidence.T @ incidence).tocsr()
+    graph.sort_indices()
+    return graph
+
+
+def bordered(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> sp.csr_matrix:
+    """A graph with two further rows for each of the ``borders``: they meet its nodes and each other."""
+    n = graph.shape[0]
+    size = n + 2 * len(borders)
+    meetings = [
+        (extra, other)
+        for i, nodes in enumerate(borders)
+        for extra in (n + 2 * i, n + 2 * i + 1)
+        for other in (*nodes.tolist(), n + 2 * i, n + 2 * i + 1)
+    ]
+    if not meetings:
+        return graph
+    rows, columns = np.array(meetings).T
+    new = sp.csr_matrix((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(size, size))
+    old = graph.copy()
+    old.resize(size, size)
+    whole = (old + new + new.T).tocsr()
+    whole.sort_indices()
+    return whole
+
+
+@njit(cache=True)
+def upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
+    """Upper triangle of the unknowns' graph, rows sorted, from the sorted graph of the nodes."""
+    indptr = np.zeros(n + 1, dtype=np.int32)
+    for sweep in range(2):
+        if sweep == 1:
+            for i in range(n):
+                indptr[i + 1] += indptr[i]
+            indices = np.empty(indptr[n], dtype=np.int32)
+        for a in range(numbers.shape[0]):
+            for i in range(3):
+                row = numbers[a, i]
+                if row < 0:
+                    continue
+                count = 0
+                for p in range(start[a], start[a + 1]):
+                    for j in range(3):
+                        column = numbers[neighbours[p], j]
+                        if column >= row:
+                            if sweep == 1:
+                                indices[indptr[row] + count] = column
+                            count += 1
+                if sweep == 0:
+                    indptr[row + 1] = count
+    return indptr, indices
+
+
+@njit(cache=True)
+def place_of(columns, left, right, column):  # type: ignore[no-untyped-def]
+    """Place of a column among the sorted ``columns[left:right]`` of a row."""
+    while left < right:
+        middle = (left + right) // 2
+        if columns[middle] < column:
+            left = middle + 1
+        else:
+            right = middle
+    return left
+
+
+@njit(cache=True)
+def positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
+    """Place of each upper-triangle entry (component-major rows) of each cell in the sparse data."""
+    m, k = cells.shape
+    n = 3 * k
+    out = np.empty((m, n * (n + 1) // 2), dtype=np.int32)
+    for e in range(m):
+        at = 0
+        for r in range(n):
+            row = numbers[cells[e, r % k], r // k]
+            for c in range(r, n):
+                column = numbers[cells[e, c % k], c // k]
+                low, high = min(row, column), max(row, column)
+                out[e, at] = -1
+                if low >= 0:
+                    out[e, at] = place_of(indices, indptr[low], indptr[low + 1], high)
+                at += 1
+    return out
+
+
+@njit(cache=True)
+def places_of(indptr, indices, pairs):  # type: ignore[no-untyped-def]
+    """Place (k,) in the data of the entries at ``pairs (k, 2)`` of row and column; -1 where there is none."""
+    out = np.full(len(pairs), -1, dtype=np.int64)
+    for i in range(len(pairs)):
+        end = indptr[pairs[i, 0] + 1]
+        at = place_of(indices, indptr[pairs[i, 0]], end, pairs[i, 1])
+        if at < end and indices[at] == pairs[i, 1]:
+            out[i] = at
+    return out

@@ -1,0 +1,229 @@
+"""Rigid bodies that turn, that forces drive, and several of them at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import MUSCLE, SKIN, punch
+from scipy.spatial.transform import Rotation
+
+from limbfit.errors import ProblemError
+from limbfit.fe import History, Indenter, Motion, OgdenQLV, RigidBody, StepControl, System, solve
+from limbfit.fe.contact.friction import Coulomb
+from limbfit.fe.contact.pose import Pose
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.motion import Drives
+from limbfit.fe.solution.linear import symmetric_product
+from limbfit.fe.system import Increment
+
+TOOL = Indenter("square", 20.0, 3.0, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
+FREE = Motion(np.array([0.0, 20.0]), np.zeros((2, 6)), (True,) * 6)
+STILL = History(np.array([0.0, 2.0]), np.zeros(2))
+
+
+def test_a_pose_is_a_rotation_about_the_pivot_and_a_move():
+    coordinates = np.array([0.5, -0.2, 3.0, 0.3, -0.2, 0.6])
+    pose = Pose(TOOL, np.array([5.0, 3.0, 20.0]), coordinates)
+    turn = Rotation.from_rotvec(coordinates[3:] @ TOOL.frame)
+    np.testing.assert_allclose(pose.rotation, turn.as_matrix(), atol=1e-14)
+    centre = pose.pivot + coordinates[:3] @ TOOL.frame + turn.apply(np.asarray(TOOL.centre) - pose.pivot)
+    np.testing.assert_allclose(pose.body.centre, centre, atol=1e-12)
+    np.testing.assert_allclose(pose.body.frame, TOOL.frame @ turn.as_matrix().T, atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.4])
+def test_derivatives_of_a_pose_are_differences(turned):
+    w, h = turned * np.array([0.3, -0.5, 0.8]), 1e-5
+
+    def pose(w):
+        return Pose(TOOL, np.zeros(3), np.array([0.0, 0.0, 0.0, *w]))
+
+    for k, unit in enumerate(np.eye(3)):
+        ahead, back = pose(w + h * unit), pose(w - h * unit)
+        np.testing.assert_allclose(pose(w).slopes[k], (ahead.rotation - back.rotation) / (2 * h), atol=1e-9)
+        np.testing.assert_allclose(pose(w).bends[k], (ahead.slopes - back.slopes) / (2 * h), atol=1e-9)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+@pytest.mark.parametrize("turned", [0.0, 0.15])
+def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, turned):
+    """All six coordinates unknown: residual, tangent and the border of the matrix, moved and turned."""
+    body = RigidBody(TOOL, punch("tet10", 4, 1).contact_faces, FREE, mu, pivot=(3.0, 2.0, 12.0))
+    problem = punch("tet10", 4, 1, indenter=None, bodies=(body,))
+    system, laws = System(problem), Laws.build([SKIN, MUSCLE])
+    rest, rng, h = np.zeros((*system.weights.shape, 6)), np.random.default_rng(1), 1e-6
+    u = np.zeros((system.rows, 3))
+    u[: system.nodes] = 0.01 * rng.normal(size=(system.nodes, 3)) * ~system.supported[: system.nodes]
+    u[system.nodes :] = [[0.2, -0.1, 3.6], [0.6 * turned, -0.4 * turned, turned]]
+    u[system.nodes + 1] *= 10.0  # mm per radian: half the width
+    d = rng.normal(size=u.shape) * ~system.supported
+    drives, grips = Drives(np.array([[0.1, 0.2, -0.4, 3.0, -2.0, 5.0]]), np.ones((1, 6), dtype=bool)), ()
+    if mu:
+        before = u - 0.05 * d
+        grip = Coulomb.none(mu, system.surface).after(system.bodies.tools(before, drives)[0], None)
+        grips = (grip.renewed(system.bodies.tools(u, drives)[0]),)
+        assert grips[0].held.any()
+
+    def at(u):
+        return system.evaluate(u, laws, Increment(0.0, 0.0, np.zeros(2), rest, 0.5, drives, grips))
+
+    here, ahead, back = at(u), at(u + h * d), at(u - h * d)
+    assert here.contact_area > 10.0
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
+    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
+    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
+    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
+    border = np.abs(change[-6:]).max()
+    np.testing.assert_allclose(K_d[-6:], change[-6:], atol=1e-5 * border)
+
+
+CONTROL = StepControl(load_steps=5, unload_steps=5, tolerance=1e-9, penalty=200.0, hold_penalty=True)
+TIMES = np.array([0.0, 2.0, 4.0])
+
+
+def test_force_control_gives_back_the_displacement():
+    """The forces of a run under displacement, stated as forces at its steps: its displacements come back.
+
+    Both with stresses that are linear in a step: a quadratic course begins anew where what drives turns.
+    """
+    problem = punch("tet10", 4, 1, history=History(TIMES, np.array([0.0, 4.0, 4.0])))
+    linear = replace(CONTROL, stress="linear")
+    driven = solve(problem, linear)
+    history = History(driven.times, force=driven.force)
+    steps = replace(linear, times=tuple(driven.times[1:]))
+    found = solve(replace(problem, history=history), steps)
+    assert found.completed, found.reason
+    np.testing.assert_allclose(found.force, driven.force, atol=1e-7 * driven.force.max())
+    np.testing.assert_allclose(found.displacement, driven.displacement, atol=1e-4 * 4.0)
+
+
+def test_a_held_force_creeps_and_its_displacement_has_sensitivities():
+    problem = punch("tet10", 4, 1, history=History(TIMES, force=np.array([0.0, 2.0, 2.0])))
+    centre = solve(problem, CONTROL, sensitivities=True, store="all")
+    loaded = centre.times >= 2.0 - 1e-9
+    assert (np.diff(centre.displacement[loaded]) > 0.0).all()
+    assert centre.displacement[-1] > 1.05 * centre.displacement[loaded][0]
+    np.testing.assert_allclose(centre.force[loaded], 2.0, rtol=1e-6)
+    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
+
+    def displacement(sign):
+        values = (problem.parameters + sign * change).reshape(2, 4)
+        changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
+        return solve(problem.with_materials(changed), CONTROL, warm_start=centre).displacement
+
+    slope = centre.displacement_sensitivity @ change
+    difference = 0.5 * (displacement(1) - displacement(-1))
+    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+
+
+def test_a_body_goes_over_from_displacement_to_force():
+    """Pressed 3 mm and held, then left with the force that it had at the end: it creeps on from there."""
+    problem = punch("tet10", 4, 1)
+    pressed = Motion.of([0.0, 1.0, 3.0], z=[0.0, 3.0, 3.0])
+    tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed)
+    control = replace(CONTROL, times=(0.25, 0.5, 0.75, 1.0, 2.0, 3.0), tolerance=1e-8)
+    still = History([0.0, 3.0], [0.0, 0.0])
+    plain = solve(replace(problem, indenter=None, bodies=(tool,), history=still), control)
+    force = plain.reactions[-1, 0, 2]
+    left = Motion.of([0.0, 1.0, 2.0], force={"z": [force, force, 0.0]})
+    both = replace(tool, motion=pressed.then(left))
+    history = History([0.0, 5.0], [0.0, 0.0])
+    control = replace(control, times=(*control.times, 3.2, 3.5, 4.0, 4.5, 4.9))
+    found = solve(replace(problem, indenter=None, bodies=(both,), history=history), control)
+    assert found.completed, found.reason
+    np.testing.assert_allclose(found.coordinates[:7, 0, 2], plain.coordinates[:, 0, 2], atol=1e-4)
+    np.testing.assert_allclose(found.reactions[:7, 0, 2], plain.reactions[:, 0, 2], rtol=1e-4)
+    np.testing.assert_allclose(found.reactions[7:10, 0, 2], force, rtol=1e-6)
+    assert (np.diff(found.coordinates[6:10, 0, 2]) > 0.0).all()
+    assert (np.diff(found.coordinates[9:, 0, 2]) < 0.0).all()  # unloaded, it comes out again
+
+
+def test_a_free_plate_lies_down_on_what_is_askew():
+    """A plate pressed by a force and free to turn rests without moment, turned towards the softer side."""
+    problem = punch("tet10", 4, 1)
+    motion = Motion.of([0.0, 1.0, 2.0], force={"z": [0.0, 2.0, 2.0], "turn_x": 0.0, "turn_y": 0.0})
+    plate = RigidBody(
+        Indenter("square", 20.0, centre=(22.0, 0.0, 0.0), axis=(0, 0, -1)), problem.contact_faces, motion
+    )
+    free = replace(
+        problem, indenter=None, bodies=(plate,), history=History(np.array([0.0, 2.0]), np.zeros(2))
+    )
+    found = solve(free, replace(CONTROL, times=(0.5, 1.0, 2.0), tolerance=1e-7))
+    assert found.completed, found.reason
+    assert found.reactions[-1, 0, 2] == pytest.approx(2.0, rel=1e-4)
+    np.testing.assert_allclose(found.reactions[-1, 0, 3:5], 0.0, atol=1e-4)
+    turn = found.coordinates[-1, 0, 3:] @ plate.shape.frame
+    assert abs(turn[1]) > 10.0 * abs(turn[0])
+    assert abs(turn[1]) > 0.01
+    # the unbacked edge of the block at x = 30 gives way more
+    deepest = np.cross(turn, [1.0, 0.0, 0.0])
+    assert deepest[2] < 0.0
+
+
+def test_two_bodies_are_each_other_s_mirror():
+    """Two equal bodies on either side press as two halves of a symmetric problem; one of them by force."""
+    problem = punch("hex8", 4, 1)
+    left, right = (Indenter("sphere", 16.0, centre=(x, 0.0, 0.0), axis=(0, 0, -1)) for x in (-13.0, 13.0))
+    times = [0.0, 1.0, 2.0]
+    down = RigidBody(left, problem.contact_faces, Motion.of(times, z=[0.0, 3.0, 3.0]), name="left")
+    both = tuple(replace(down, shape=shape) for shape in (left, right))
+    control = replace(CONTROL, times=(0.25, 0.5, 0.75, 1.0, 1.5, 2.0), tolerance=1e-8, stress="linear")
+    found = solve(replace(problem, indenter=None, bodies=both, history=STILL), control)
+    assert found.completed, found.reason
+    np.testing.assert_allclose(found.reactions[:, 0, 2], found.reactions[:, 1, 2], rtol=1e-6)
+    alone = solve(replace(problem, indenter=None, bodies=both[:1], history=STILL), control)
+    assert found.reactions[3, 0, 2] != pytest.approx(alone.reactions[3, 0, 2], rel=1e-3)
+    force = Motion.of(found.times, force={"z": found.reactions[:, 1, 2]})
+    mixed = (both[0], replace(both[1], motion=force))
+    driven = solve(replace(problem, indenter=None, bodies=mixed, history=STILL), control)
+    assert driven.completed, driven.reason
+    np.testing.assert_allclose(driven.coordinates[:, 1, 2], found.coordinates[:, 1, 2], atol=1e-4 * 3.0)
+
+
+def test_a_rotation_of_everything_changes_nothing():
+    """Block, supports and tool turned together: the same forces."""
+    problem = punch("tet10", 3, 1, history=History(TIMES, np.array([0.0, 3.0, 3.0])))
+    plain = solve(problem, CONTROL)
+    turn = Rotation.from_rotvec([0.4, -0.8, 1.1])
+    tool = problem.indenter
+    turned = replace(
+        problem,
+        mesh=replace(problem.mesh, points=turn.apply(problem.mesh.points)),
+        indenter=replace(
+            tool, centre=turn.apply(tool.centre), axis=turn.apply(tool.axis), edge=turn.apply(tool.frame[0])
+        ),
+    )
+    np.testing.assert_allclose(solve(turned, CONTROL).force, plain.force, rtol=1e-6, atol=1e-8)
+
+
+PUNCHED, SHORT = punch("tet10", 2, 1).contact_faces, Motion.of([0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"history": History(TIMES, force=[0.0, 1.0, 0.0]), "indenter": None}, "not supports"),
+        (
+            {"bodies": (RigidBody(TOOL, np.zeros((0, 6), dtype=int), FREE, name="pin"),)},
+            "contact faces of pin",
+        ),
+        ({"bodies": (RigidBody(TOOL, PUNCHED, SHORT, name="pin"),)}, "motion of pin ends at 1 s"),
+    ],
+)
+def test_what_cannot_be_is_refused(change, said):
+    with pytest.raises(ProblemError, match=said):
+        solve(punch("tet10", 2, 1, **change), CONTROL)
+
+
+def test_a_motion_is_told_what_is_wrong():
+    with pytest.raises(ProblemError, match="no coordinate 'w'"):
+        Motion.of([0.0, 1.0], w=1.0)
+    with pytest.raises(ProblemError, match="by displacement and by force"):
+        Motion.of([0.0, 1.0], z=1.0, force={"z": 1.0})
+    with pytest.raises(ProblemError, match="one for each time"):
+        Motion.of([0.0, 1.0], z=[1.0, 2.0, 3.0])
+    with pytest.raises(ProblemError, match="displacement or one of force"):
+        History(TIMES)

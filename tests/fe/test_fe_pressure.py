@@ -1,0 +1,182 @@
+"""Follower pressure: its derivatives, tubes and spheres in closed form, and a tube of FEBio."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import MUSCLE, SKIN, block, boundary, punch
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from limbfit.errors import ProblemError
+from limbfit.fe import (
+    ELEMENTS,
+    History,
+    NeoHookean,
+    OgdenQLV,
+    Pressure,
+    Problem,
+    StepControl,
+    Support,
+    System,
+    solve,
+)
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.pressure import Pressed
+from limbfit.fe.solution.linear import symmetric_product
+from limbfit.fe.system import Increment
+from limbfit.mesh import Mesh
+
+STILL = History(np.array([0.0, 1.0]), np.zeros(2))
+
+
+@pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
+def test_volume_forces_and_their_derivatives(cell_type):
+    lines = np.linspace(0.0, 1.0, 3)
+    mesh = block(cell_type, lines, lines, lines, jitter=0.05)
+    pressed = Pressed(ELEMENTS[cell_type], mesh.points, boundary(mesh.cells, cell_type))
+    volume, gradient, forces = pressed.volume(mesh.points)
+    assert volume == pytest.approx(1.0, rel=1e-12)
+    np.testing.assert_allclose(gradient, forces, atol=1e-12)  # nothing differs where there is no rim
+    top = Pressed(ELEMENTS[cell_type], mesh.points, mesh.face_sets["top"])
+    rng, h = np.random.default_rng(0), 1e-5
+    x = mesh.points + 0.05 * rng.normal(size=mesh.points.shape)
+    d = rng.normal(size=x.shape)
+    here, ahead, back = (top.volume(x + step * d) for step in (0.0, h, -h))
+    assert (ahead[0] - back[0]) / (2 * h) == pytest.approx((here[1] * d).sum(), rel=1e-8)
+    hessian, slope = (top.matrix(blocks, len(x)) @ d.ravel() for blocks in (top.hessian(x), top.slope(x)))
+    np.testing.assert_allclose(hessian, ((ahead[1] - back[1]) / (2 * h)).ravel(), atol=1e-9)
+    np.testing.assert_allclose(slope, ((ahead[2] - back[2]) / (2 * h)).ravel(), atol=1e-9)
+    assert np.abs(slope - hessian).max() > 1e-3
+
+
+def test_forces_and_tangent_of_a_pressed_block_are_derivatives_of_its_energy():
+    problem = punch("tet10", 4, 1, indenter=None)
+    pressures = (Pressure(problem.contact_faces, [0.0, 1.0], [0.0, 0.004]),)
+    system, laws = System(replace(problem, pressures=pressures)), Laws.build([SKIN, MUSCLE])
+    rng, h = np.random.default_rng(1), 1e-6
+    u, d = (size * rng.normal(size=system.points.shape) * ~system.supported for size in (0.05, 1.0))
+    rest, rims = np.zeros((*system.weights.shape, 6)), system.pressures.rims(u, (0.004,))
+
+    def at(u):
+        return system.evaluate(
+            u, laws, Increment(0.0, 0.0, np.zeros(2), rest, 0.5, pressures=(0.004,), rims=rims)
+        )
+
+    here, ahead, back = at(u), at(u + h * d), at(u - h * d)
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
+    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
+    np.testing.assert_allclose(K_d, change, atol=1e-6 * np.abs(change).max())
+    pressed = system.pressures.all[0].volume(system.points + u)[2]
+    np.testing.assert_allclose(here.residual - at_without(system, laws, u), 0.004 * pressed, atol=1e-12)
+
+
+def at_without(system: System, laws: Laws, u: np.ndarray) -> np.ndarray:
+    """The residual at ``u`` without a pressure."""
+    rest = np.zeros((*system.weights.shape, 6))
+    return system.evaluate(u, laws, Increment(0.0, 0.0, np.zeros(2), rest, 0.5)).residual
+
+
+def sector(radii: np.ndarray, n: int, cell_type: str = "hex8") -> Mesh:
+    """A quarter of a tube about z, one element high; node sets of its planes, face sets of its walls."""
+    z = np.array([0.0, float(radii[-1] - radii[0]) / 4])
+    mesh = block(cell_type, radii, np.linspace(0.0, np.pi / 2, n + 1), z)
+    r, angle, height = mesh.points.T
+    points = np.column_stack([r * np.cos(angle), r * np.sin(angle), height])
+    faces = boundary(mesh.cells, cell_type)
+    at = r[faces].mean(axis=1)
+    sets = {"y0": np.flatnonzero(angle < 1e-9), "x0": np.flatnonzero(angle > np.pi / 2 - 1e-9)}
+    sets |= {"ends": np.flatnonzero((height < 1e-9) | (height > z[-1] - 1e-9))}
+    inside, outside = (faces[np.abs(at - value) < 1e-6] for value in (radii[0], radii[-1]))
+    return Mesh(
+        points, mesh.cells, cell_type, mesh.regions, mesh.region_names, sets,
+        {"inside": inside, "outside": outside},
+    )  # fmt: skip
+
+
+def held(mesh: Mesh) -> tuple[Support, ...]:
+    sets = mesh.node_sets
+    return Support(sets["y0"], 1), Support(sets["x0"], 0), Support(sets["ends"], 2)
+
+
+NONE = np.zeros(0, dtype=int)
+
+
+def test_inflation_of_a_tube_is_the_closed_form():
+    """Plane strain, incompressible neo-Hookean: p = mu [ln(k_a / k_b) + (1/k_a^2 - 1/k_b^2) / 2]; 0.5 %."""
+    a, b, mu = 10.0, 20.0, 0.01
+    law = NeoHookean(mu, kappa_ratio=1e4)
+
+    def pressure(inner: float) -> float:
+        """At the inner radius ``inner``, by integrating (sigma_tt - sigma_rr) / r."""
+        grown = inner**2 - a**2
+
+        def density(r: float) -> float:
+            squared = (r**2 - grown) / r**2  # radial stretch squared, of an incompressible tube
+            return mu * (1.0 / squared - squared) / r
+
+        return quad(density, inner, np.sqrt(b**2 + grown))[0]
+
+    p = 0.5 * mu
+    expected = brentq(lambda inner: pressure(inner) - p, a, 3 * a)
+    mesh = sector(np.linspace(a, b, 11), 12)
+    problem = Problem(
+        mesh, dict.fromkeys(mesh.region_names, law), NONE, np.zeros((0, 4), int), None, STILL,
+        supports=held(mesh), pressures=(Pressure(mesh.face_sets["inside"], [0.0, 1.0], [0.0, p]),),
+    )  # fmt: skip
+    found = solve(problem, StepControl(times=(0.25, 0.5, 0.75, 1.0), tolerance=1e-7), store="all")
+    assert found.completed, found.reason
+    inner = np.unique(mesh.face_sets["inside"])
+    radius = np.linalg.norm((mesh.points + found.states[-1].u)[inner, :2], axis=1)
+    assert expected > 1.2 * a
+    np.testing.assert_allclose(radius - a, expected - a, rtol=0.005)
+
+
+def test_a_pressed_block_turned_is_the_same():
+    problem = punch("tet10", 3, 1, indenter=None, history=STILL)
+    pressures = (Pressure(problem.contact_faces[:20], [0.0, 1.0], [0.0, 0.003]),)
+    plain = replace(problem, pressures=pressures)
+    turn = Rotation.from_rotvec([0.4, -0.8, 1.1])
+    turned = replace(plain, mesh=replace(plain.mesh, points=turn.apply(plain.mesh.points)))
+    steps = StepControl(times=(0.5, 1.0), tolerance=1e-8)
+    first, second = (solve(one, steps, store="all") for one in (plain, turned))
+    assert first.completed, first.reason
+    size = np.abs(first.states[-1].u).max()
+    assert size > 0.3
+    np.testing.assert_allclose(second.states[-1].u, turn.apply(first.states[-1].u), atol=1e-5 * size)
+
+
+def test_derivatives_of_the_force_beside_a_pressure_with_a_free_rim():
+    """An indenter on a half-pressed surface: its force by sensitivities and by central differences."""
+    problem = punch("tet10", 4, 1, history=History(np.array([0.0, 2.0]), np.array([0.0, 2.0])))
+    middle = problem.mesh.points[problem.contact_faces].mean(axis=1)
+    pressed = problem.contact_faces[middle[:, 0] > 0.0]
+    problem = replace(problem, pressures=(Pressure(pressed, [0.0, 2.0], [0.0, 0.004]),))
+    control = StepControl(times=(0.5, 1.0, 1.5, 2.0), tolerance=1e-9, penalty=200.0, hold_penalty=True)
+    centre = solve(problem, control, sensitivities=True, store="all")
+    assert centre.completed, centre.reason
+    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
+
+    def force(sign: int) -> np.ndarray:
+        values = (problem.parameters + sign * change).reshape(2, 4)
+        changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
+        return solve(problem.with_materials(changed), control, warm_start=centre).force
+
+    difference = 0.5 * (force(1) - force(-1))
+    np.testing.assert_allclose(
+        centre.force_sensitivity @ change, difference, atol=1e-3 * np.abs(difference).max()
+    )
+
+
+def test_a_pressure_that_cannot_be_is_refused():
+    with pytest.raises(ProblemError, match="as many values"):
+        Pressure(np.zeros((1, 6), int), [0.0, 1.0], [1.0])
+    with pytest.raises(ProblemError, match="do not grow from 0"):
+        Pressure(np.zeros((1, 6), int), [0.5, 1.0], [1.0, 1.0])
+    flat = punch("tet10", 2, 1, pressures=(Pressure(np.zeros((1, 3), int), [0.0, 1.0], [0.0, 1.0]),))
+    with pytest.raises(ProblemError, match="pressed faces have shape"):
+        System(flat)
