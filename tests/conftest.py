@@ -11,6 +11,7 @@ import pyvista as pv
 
 from acquiring import ready
 from browsing import launch, open_page, playwright, serve
+from limbfit.cli import main
 
 __all__ = ["launch", "open_page", "playwright", "ready", "serve"]
 
@@ -106,3 +107,20 @@ def study(pristine, tmp_path):
 def coarse_settings() -> str:
     """``COARSE`` for tests in folders with a conftest of their own."""
     return COARSE
+
+
+@pytest.fixture
+def limbfit(monkeypatch, capsys):
+    """Run a command; returns (exit code, standard output, standard error)."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["limbfit", *map(str, words)])
+        try:
+            main()
+            code = 0
+        except SystemExit as end:
+            code = int(end.code or 0)
+        shown = capsys.readouterr()
+        return code, shown.out, shown.err
+
+    return call

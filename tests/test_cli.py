@@ -11,29 +11,11 @@ import pyvista as pv
 import typer
 
 from limbfit import __version__
-from limbfit.cli import main
 from limbfit.cli.app import app
 from limbfit.cli.commands import show_summary
 from limbfit.cli.groups import GROUPS
 
 HEADER = "time_s,displacement_mm,force_N"
-
-
-@pytest.fixture
-def limbfit(monkeypatch, capsys):
-    """Run a command; returns (exit code, standard output, standard error)."""
-
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["limbfit", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as end:
-            code = int(end.code or 0)
-        shown = capsys.readouterr()
-        return code, shown.out, shown.err
-
-    return call
 
 
 def edit(study, old: str, new: str) -> None:

@@ -10,8 +10,7 @@ import pytest
 from limbfit import run_experiment
 from limbfit.errors import InputError
 from limbfit.pipeline import Progress, study_status
-from limbfit.pipeline.experiments import catalogue
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment
+from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment, register_experiment
 from limbfit.pipeline.shared.store import write_json
 from limbfit.pipeline.verbs.run import keys
 from limbfit.study import load_study
@@ -41,8 +40,8 @@ PEAKS = Experiment("peaks", run_peaks, needs=("traces",), tables=("material",), 
 
 
 @pytest.fixture(autouse=True)
-def peaks(monkeypatch):
-    monkeypatch.setattr(catalogue, "EXPERIMENTS", (PEAKS,))
+def peaks():
+    register_experiment(PEAKS)
 
 
 def state(study, name: str = "peaks") -> str:
@@ -112,7 +111,7 @@ def test_an_experiment_changes_when_its_code_does(study, monkeypatch, tmp_path):
     (tmp_path / "other_code.py").write_text(OTHER_CODE)
     monkeypatch.syspath_prepend(tmp_path)
     other = import_module("other_code").run_peaks
-    monkeypatch.setattr(catalogue, "EXPERIMENTS", (replace(PEAKS, run=other),))
+    register_experiment(replace(PEAKS, run=other))
     assert state(study) == "stale"
     (row,) = [row for row in study_status(load_study(study)) if row["stage"] == "peaks"]
     assert "code of" in " ".join(row["why"])
@@ -127,6 +126,6 @@ def test_what_there_is_not_is_refused(study):
 
 def test_names_are_folders_that_do_not_shadow_each_other():
     """Unfinished work lies in .work-<name>-<key>: no name may begin with another one and a dash."""
-    names = [experiment.name for experiment in EXPERIMENTS]
+    names = EXPERIMENTS.names
     assert len(set(names)) == len(names)
     assert not [(a, b) for a in names for b in names if b.startswith(f"{a}-")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import sys
 from dataclasses import replace
@@ -11,34 +10,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import store_blocks
+from guide import from_the_guide, identified
 from limbfit import History, OgdenQLV, Problem, load_study
 from limbfit.errors import InputError
-from limbfit.execution import Limits, make_executor
 from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.system import Increment
 from limbfit.laws import LAWS, Parameter, TissueLaw, register_law
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.verbs.run import keys
 
 sys.path.insert(0, str(Path(__file__).parent / "fe"))
 from blocks import block, punch
 from samples import point
 
-GUIDE = Path(__file__).parents[1] / "docs" / "extending.md"
 TRUTH = {"a_kPa": 9.0, "b": 1.6, "gamma": 2.0, "tau_s": 0.5}
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory) -> Path:
     """The law's file as the guide shows it."""
-    (code,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
-    file = tmp_path_factory.mktemp("extension") / "fung.py"
-    file.write_text(code, encoding="utf-8")
-    return file
+    return from_the_guide("Fung(", tmp_path_factory.mktemp("extension") / "fung.py")
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +127,7 @@ def test_every_parameter_of_a_simulation_has_its_sensitivity(tissue):
 
 
 def test_impossible_laws_are_refused():
-    with pytest.raises(InputError, match="already is a tissue law 'ogden'"):
+    with pytest.raises(InputError, match="tissue law 'ogden' exists already"):
         register_law(LAWS["ogden"])
     soft = Parameter("a", start=1.0, lower=2.0, upper=3.0, unit="kPa")
     with pytest.raises(InputError, match="parameter a needs"):
@@ -181,7 +173,7 @@ def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
     assert study.material.upper["b"] == 10.0
     before = keys(study)
     (tmp_path / "fung.py").write_text((tmp_path / "fung.py").read_text() + "# another thought\n")
-    with pytest.raises(InputError, match="already is a tissue law 'fung'"):
+    with pytest.raises(InputError, match="tissue law 'fung' exists already"):
         load_study(tmp_path)  # one that is known here from another file
     assert keys(study) != before
     wrong = GIVEN.replace("b = 2.0", "c_kPa = 2.0")
@@ -199,61 +191,16 @@ def test_what_an_extension_raises_names_it(tmp_path):
         load_extensions([tmp_path / "missing.py"])
 
 
-BLOCKS = {"a": ((3.0, 5.0), 2.2, True), "b": ((3.0, 21.0), 6.0, True)}  # thicknesses, depth
-TEXT = """
-[study]
-name = "blocks"
-extensions = ["fung.py"]
-[surfaces]
-skin = "skin.stl"
+STATED = """
 [indenter]
 edge_radius_mm = 2.0
-[solver]
-load_steps = 4
-unload_steps = 3
-penalty_per_mm = 100.0
-[mesh]
-element = "tet10"
-[mesh.coarse]
-edge_near_mm = 6.0
-[calibration]
-tied = [
-    ["skin.a_kPa", "muscle.a_kPa"], ["skin.b", "muscle.b"], ["skin.gamma", "muscle.gamma"],
-    ["skin.tau_s", "muscle.tau_s"],
-]
 [material]
 law = "fung"
-"""
-SITE = """
-[[sites]]
-name = "{name}"
-fitted = true
-trace = "{name}.csv"
-position = [0.0, 0.0, 0.0]
 """
 
 
 @pytest.mark.slow
 def test_a_study_identifies_it(tmp_path, file, law):
-    """Of records with known truth and noise, simulated by worker processes that load the study's file."""
-    shutil.copy(file, tmp_path / "fung.py")
-    for name in ("skin.stl", "a.csv", "b.csv"):
-        (tmp_path / name).touch()
-    (tmp_path / "study.toml").write_text(TEXT + "".join(SITE.format(name=name) for name in BLOCKS))
-    study = load_study(tmp_path)
-    truth = dict.fromkeys(study.tissues, TRUTH)
-    store = store_blocks(study, BLOCKS, truth, 4, coarse=4)
-    store["calibrate"].mkdir()
-    with make_executor(2, Limits(0.0, 0.0)) as executor:
-        run_calibrate(Context(study, store, executor, lambda event: None), store["calibrate"])
-    found = store.read("calibrate", "calibration.json")
-    last, known = found["stages"][-1], found["uncertainty"]["intervals_95"]
-    assert last["converged"], last["reason"]
-    assert last["iterations"][-1]["error_percent"] < 1.0
-    for tissue, values in truth.items():
-        assert last["parameters"][tissue] == pytest.approx(values, rel=0.02)
-        for key, value in values.items():
-            low, high = known[tissue][key]
-            assert low < value < high, (tissue, key)
+    found = identified(tmp_path, file, STATED, TRUTH, within=0.02)
     assert found["law"]["name"] == "fung"
     assert found["law"]["parameters"][1]["words"] == "stiffening"

@@ -7,7 +7,7 @@ digest counts wherever it can change an answer.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -38,7 +38,7 @@ class Registry(Generic[T]):
         source = _running[-1] if _running else None
         known = self._added[name][1] if name in self._added else None
         if name in self._own or (known is not None and source is not None and known != source):
-            raise InputError(f"there already is a {self._kind} {name!r}", remedy="give yours another name")
+            raise InputError(f"the {self._kind} {name!r} exists already", remedy="give yours another name")
         self._added[name] = what, source
 
     def __getitem__(self, name: str) -> T:
@@ -57,6 +57,10 @@ class Registry(Generic[T]):
             f"no {self._kind} is named {name!r}",
             remedy=f"use {', '.join(self.names)}, or name the file that registers it in study.extensions",
         )
+
+    def __iter__(self) -> Iterator[T]:
+        """What is registered, limbfit's own first."""
+        return (self[name] for name in self.names)
 
     @property
     def names(self) -> tuple[str, ...]:

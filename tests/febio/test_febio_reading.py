@@ -202,4 +202,4 @@ def test_edges_are_no_rounder_than_the_tissue_is_thick(tmp_path, thin):
     problem = replace(problem, mesh=problem.mesh.with_points(points), indenter=tool)
     write_feb(problem, tmp_path / "model.feb", FebSettings())
     found = to_problem(read_feb(tmp_path / "model.feb")).indenter
-    assert found.kernel[2] == pytest.approx(min(1.5, 3.0 * thin))
+    assert found.body.radius == pytest.approx(min(1.5, 3.0 * thin))

@@ -106,7 +106,7 @@ def test_the_indenter_is_where_it_touches(tmp_path, shape):
     assert found is not None
     np.testing.assert_allclose(found.axis, start.frame[2], atol=1e-14)
     surface = start.signed_distance(tool.points[np.unique(tool.front)])
-    rounding = start.kernel[2] if shape == "stl" else 1e-9  # an stl is written with its sharp edges
+    rounding = start.body.radius if shape == "stl" else 1e-9  # an stl is written with its sharp edges
     assert np.abs(surface).max() <= rounding
     ahead = np.random.default_rng(1).uniform([-7, -7, 0.1], [7, 7, 3], (200, 3)) @ start.frame
     ahead += np.asarray(start.centre)

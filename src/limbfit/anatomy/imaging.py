@@ -12,11 +12,9 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from ..errors import ImageError, LabelError
-from .bounds import check_voxels
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
 from .images.dicom import Series, describe_series, list_series, read_series
-from .images.dicom_pixels import muted
-from .images.nifti import check_nifti
+from .images.formats import format_of, read_image
 from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
 from .labels.labelcheck import cleaned
 from .labels.labelfiles import (
@@ -47,7 +45,6 @@ __all__ = [
 ]
 
 _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
-SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 
 
 def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
@@ -55,7 +52,7 @@ def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
 
     Parameters
     ----------
-    path : a DICOM folder, or one file: .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd.
+    path : a DICOM folder, or one file of a format in `images.formats`.
     series_uid : which DICOM series, where the folder holds several.
 
     Raises
@@ -67,7 +64,7 @@ def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
     if path.is_dir():
         volume = read_series(path, series_uid)
     else:
-        volume = _as_volume(_read_image(path), path)
+        volume = _as_volume(read_image(path), path)
     if not np.all(np.isfinite(volume.array)):
         bad = int((~np.isfinite(volume.array)).sum())
         raise ImageError(f"{bad} voxels are not numbers", file=path, remedy="export the image again")
@@ -76,7 +73,7 @@ def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
 
 def write_volume(path: str | Path, volume: Volume) -> None:
     """Write .nii(.gz), .nrrd, .mha or .mhd by the suffix, compressed where the format can."""
-    _check_suffix(Path(path))
+    format_of(Path(path), written=True)
     sitk.WriteImage(volume.to_sitk(), str(path), useCompression=True)
 
 
@@ -131,72 +128,17 @@ def write_labels(path: str | Path, labels: LabelMap) -> None:
     if is_seg_nrrd(path):
         write_seg_nrrd(path, labels)
         return
-    _check_suffix(path)
+    format_of(path, written=True)
     sitk.WriteImage(labels.to_sitk(), str(path), useCompression=True)
     write_sidecar(path, labels.names)
 
 
 def _read_label_file(path: Path) -> LabelMap:
     try:
-        image = _read_image(path)
+        image = read_image(path)
         return read_label_image(path, image)
     except ImageError as error:
         raise wrong_file(error, path) from None
-
-
-def _check_suffix(path: Path) -> None:
-    if not path.name.lower().endswith(SUFFIXES):
-        raise ImageError(
-            f"unknown kind of image {path.suffix!r}", file=path, remedy="use one of " + " ".join(SUFFIXES)
-        )
-
-
-def _read_image(path: Path) -> sitk.Image:
-    if not path.is_file():
-        raise ImageError("no such image", file=path, remedy="give a DICOM folder or an image file")
-    _check_suffix(path)
-    if path.name.lower().endswith((".nii", ".nii.gz")):
-        check_nifti(path)
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    try:
-        with muted():
-            reader.ReadImageInformation()
-            check_voxels(reader.GetSize(), path)
-            image = reader.Execute()
-    except RuntimeError as error:
-        raise _unreadable(path, str(error)) from None
-    _check_stated_geometry(reader, path)
-    return image
-
-
-def _unreadable(path: Path, text: str) -> ImageError:
-    if "orthonormal" in text or "Bad direction" in text:
-        return ImageError(
-            "the image axes are not orthonormal",
-            file=path,
-            remedy="resample the image to a rectangular grid",
-        )
-    return ImageError("the image cannot be read", file=path, remedy="check that the file is whole")
-
-
-def _check_stated_geometry(reader: sitk.ImageFileReader, path: Path) -> None:
-    """Refuse a file that leaves its place in the patient to be guessed."""
-    keys = set(reader.GetMetaDataKeys())
-    name = path.name.lower()
-    if name.endswith((".nii", ".nii.gz")):
-        codes = [reader.GetMetaData(key).strip() for key in ("qform_code", "sform_code") if key in keys]
-        stated = any(code not in ("", "0") for code in codes)
-    elif name.endswith((".nrrd", ".nhdr")):
-        stated = "NRRD_space" in keys
-    else:
-        stated = True
-    if not stated:
-        raise ImageError(
-            "the file does not say how it lies in the patient",
-            file=path,
-            remedy="export it with its orientation",
-        )
 
 
 def _as_volume(image: sitk.Image, path: Path) -> Volume:

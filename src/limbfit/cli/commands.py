@@ -32,15 +32,8 @@ class SolverName(StrEnum):
     febio = "febio"
 
 
-class StageName(StrEnum):
-    segment = "segment"
-    surfaces = "surfaces"
-    sites = "sites"
-    traces = "traces"
-    mesh = "mesh"
-    calibrate = "calibrate"
-    predict = "predict"
-    report = "report"
+def stage_names() -> list[str]:
+    return list(limbfit.STAGE_NAMES)
 
 
 def demo(
@@ -112,12 +105,18 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
 
 def run(
     study: StudyPath,
-    until: Annotated[StageName | None, typer.Option(help="stop after this stage")] = None,
+    until: Annotated[
+        str | None, typer.Option(help="stop after this stage of limbfit status", autocompletion=stage_names)
+    ] = None,
     start: Annotated[
-        StageName | None, typer.Option("--from", help="do this stage and all after it anew")
+        str | None,
+        typer.Option("--from", help="do this stage and all after it anew", autocompletion=stage_names),
     ] = None,
     force: Annotated[
-        list[StageName] | None, typer.Option(help="do this stage anew, repeatable; kept simulations count")
+        list[str] | None,
+        typer.Option(
+            help="do this stage anew, repeatable; kept simulations count", autocompletion=stage_names
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -126,9 +125,9 @@ def run(
     with listening() as listener:
         summary = limbfit.run_study(
             limbfit.load_study(study),
-            until=until.value if until else None,
-            start=start.value if start else None,
-            force=[stage.value for stage in force or ()],
+            until=until,
+            start=start,
+            force=force or (),
             listener=listener,
         )
     summary["seconds"] = round(perf_counter() - began, 1)
@@ -227,10 +226,11 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(summary)
         return
-    if "parameters" not in summary:
+    if "parameters" in summary:
+        show_parameters(summary)
+    elif "until" in summary:
         STDOUT.print(f"done until {summary['until']}; results in {summary['results']}")
         return
-    show_parameters(summary)
     if "sites" in summary:  # as the report, not before its stage
         show_sites(summary)
         show_warnings(summary["sites"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -185,4 +186,30 @@ def show_sensitivity(name: str, found: dict[str, Any]) -> None:
     STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
 
 
-VERBS = (cube, regions, sensitivity, uncertainty)
+def experiment(
+    study: StudyPath,
+    name: Annotated[str, typer.Argument(help="of an experiment, such as one of the study's own files")],
+    option: Annotated[
+        list[str] | None, typer.Option(help="NAME=VALUE, the value in JSON or plain text, repeatable")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment that has no verb of its own."""
+    run_verb(study, name, print_json, as_json=as_json, **parse_options(option or ()))
+
+
+def parse_options(words: Iterable[str]) -> dict[str, Any]:
+    """``--option``: what an experiment is run with, by name."""
+    found = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise InputError(f"{word!r} says no value", place="--option", remedy="write NAME=VALUE")
+        try:
+            found[name] = json.loads(value)
+        except ValueError:
+            found[name] = value
+    return found
+
+
+VERBS = (cube, regions, sensitivity, uncertainty, experiment)

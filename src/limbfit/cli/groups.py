@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "Patient": ("demo", "phantom", "series", "check", "segment", "surfaces", "sites", "mesh"),
     "Identify": ("run", "status", "report", "simulate", "batch", "reproduce"),
-    "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube"),
+    "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
     "Experiment": ("design", "acquire", "recording", "virtual-fitsocket"),
     "Exchange": ("export", "febio", "compare"),
     "Machine": ("studio", "doctor", "bench"),

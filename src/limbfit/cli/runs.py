@@ -14,7 +14,7 @@ from rich.table import Table
 import limbfit
 
 from ..execution import QUEUES, Placement, placed
-from .commands import StageName
+from .commands import stage_names
 from .console import STDERR, STDOUT, AsJson, listening, print_json
 
 _OPTIONS = {
@@ -52,14 +52,15 @@ def where(verb: Callable[..., None]) -> Callable[..., None]:
 
 def batch(
     studies: Annotated[list[Path], typer.Argument(help="study files or their folders", show_default=False)],
-    until: Annotated[StageName | None, typer.Option(help="stop each after this stage")] = None,
+    until: Annotated[
+        str | None, typer.Option(help="stop each after this stage", autocompletion=stage_names)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run many studies on the same workers; one that fails does not stop the others."""
     rows = []
     with listening() as listener:
-        stage = until.value if until else None
-        for row in limbfit.run_batch(studies, until=stage, listener=listener):
+        for row in limbfit.run_batch(studies, until=until, listener=listener):
             rows.append(row)
             if row["error"] and not as_json:
                 STDERR.print(f"failed: {row['study']}: {row['error']}", soft_wrap=True)

@@ -22,9 +22,9 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 
 from __future__ import annotations
 
+from ..shapes import RigidSurface
 from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
-from .contact.rigid_surface import RigidSurface
 from .doubts import Doubt
 from .kernel.elements import ELEMENTS
 from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV

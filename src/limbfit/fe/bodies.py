@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
 from .contact.grip import Grip
 from .contact.pose import Pose
-from .contact.shape import Shape
+from .contact.rigid import RigidShape
 from .contact.tool import Distances, Tool
 from .kernel.elements import Element
 from .motion import Drives, RigidBody
@@ -61,7 +61,7 @@ class Loads:
 class _Body:
     """One body: its surface, where it starts, and which of all contact points and unknowns are its own."""
 
-    def __init__(self, stated: RigidBody, surface: ContactSurface, start: Shape, row: int) -> None:
+    def __init__(self, stated: RigidBody, surface: ContactSurface, start: RigidShape, row: int) -> None:
         self.stated, self.surface, self.start = stated, surface, start
         self.free = np.flatnonzero(stated.motion.free)
         self.row = row
@@ -312,7 +312,7 @@ def _mixed(moved: Array, free: NDArray[np.intp]) -> Array:
     return cross + cross.T
 
 
-def _start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> Shape:
+def _start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> RigidShape:
     """Where a body starts: the indenter just in touch, if the problem says so."""
     if stated.shape is not problem.indenter or problem.start != "touching":
         return stated.shape

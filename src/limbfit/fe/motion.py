@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from .contact.shape import Shape
+from .contact.rigid import RigidShape
 
 Array = NDArray[np.float64]
 # A body's coordinates: its move along the axes of its frame at the start, mm, and its rotation vector about
@@ -139,7 +139,7 @@ class RigidBody:
     name : for messages and results.
     """
 
-    shape: Shape
+    shape: RigidShape
     faces: NDArray[np.int64]
     motion: Motion
     friction: str | float = "frictionless"

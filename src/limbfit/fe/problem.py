@@ -18,8 +18,6 @@ from .materials import Material
 from .motion import Drives, Motion, RigidBody
 from .pressure import Pressure
 
-FACE_NODES = {"tet4": 3, "tet10": 6, "hex8": 4}
-
 
 @dataclass(frozen=True)
 class History:
@@ -277,7 +275,8 @@ def _check_cells(problem: Problem) -> None:
         raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
     _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
     upright = (weights > 0).all(axis=1)
-    if mesh.cell_type == "tet10":  # a quadratic map may be upright at its points and its corners not
+    # A quadratic map may be upright at its points and its corners not.
+    if mesh.kind.is_tetrahedron and len(mesh.kind.nodes) > mesh.kind.corners:
         corners = mesh.points[mesh.corners]
         upright &= np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
     bad = np.flatnonzero(~upright)
@@ -290,7 +289,7 @@ def _check_cells(problem: Problem) -> None:
 
 
 def _check_bodies(problem: Problem) -> None:
-    width, bodies = FACE_NODES[problem.mesh.cell_type], problem.rigid_bodies
+    width, bodies = problem.mesh.kind.faces.shape[1], problem.rigid_bodies
     for i, body in enumerate(bodies):
         faces, of = np.asarray(body.faces), f" of {body.name or f'body {i}'}" if len(bodies) > 1 else ""
         if faces.ndim != 2 or faces.shape[1] != width or not len(faces):

@@ -49,7 +49,7 @@ def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSet
     assert system.indenter is not None
     tool = tool_mesh(system.indenter)
     if tool.cell_type != "hex8":
-        raise ProblemError("indenters of shape 'stl' are written for FEBio only")
+        raise ProblemError(f"indenters of shape {system.indenter.shape!r} are written for FEBio only")
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
             stream.writelines(f"{line}\n" for line in _lines(problem, system, tool, program, settings))

@@ -172,7 +172,7 @@ def _covered(problem: Problem) -> Indices:
 
 def _cells_behind(mesh: Mesh, faces: Indices) -> Indices:
     """The cell (f,) that each face belongs to."""
-    corners = faces[:, : 4 if mesh.cell_type == "hex8" else 3]
+    corners = faces[:, : mesh.kind.face_corners]
     touched = np.flatnonzero(np.isin(mesh.cells, corners).sum(axis=1) >= corners.shape[1])
     owner = {int(cell): set(mesh.cells[cell].tolist()) for cell in touched}
     by_node: dict[int, list[int]] = {}

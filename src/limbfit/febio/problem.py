@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, Problem, RigidSurface, StepControl, Support
-from ..fe.contact.indenter import SHARP_EDGE
 from ..fe.kernel.elements import reference_gradients
 from ..mesh import Mesh
+from ..shapes import SHARP_EDGE
 from .controls import step_times
 from .geometry import boundary, refuse_part, triangles
 from .model import FebModel, Motion

@@ -84,6 +84,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     Only skin near the indenter enters the contact: what it cannot reach costs time for nothing. Where the
     model goes no farther than ``within_mm``, so is the cut below the indenter.
     """
+    load_extensions(model.extensions)
     cut = np.empty(0, dtype=np.int64)
     if model.within_mm is not None:
         centre, axis = np.array(model.position), np.array(model.axis)
@@ -134,6 +135,7 @@ def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Ve
         axis=np.array(axis),
         edge=None if edge is None else np.array(edge),
         surface=surface,
+        measures=table.measures,
     )
 
 

@@ -1,12 +1,8 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
+from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
 from .measures import MeshQuality, dihedral_angles, quality
 from .volume import (
-    CELL_NODES,
-    TET10_EDGES,
-    TET_FACES,
-    TRI6_EDGES,
-    VTK_CELL,
     Mesh,
     boundary_faces,
     cell_volumes,
@@ -17,11 +13,11 @@ from .volume import (
 from .vtu import read_grid, read_vtu, silent_vtk, write_pvd, write_vtu
 
 __all__ = [
-    "CELL_NODES",
+    "CELLS",
     "TET10_EDGES",
     "TET_FACES",
     "TRI6_EDGES",
-    "VTK_CELL",
+    "CellType",
     "Mesh",
     "MeshQuality",
     "boundary_faces",

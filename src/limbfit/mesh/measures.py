@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .volume import TET_FACES, Mesh, cell_volumes, node_jacobians
+from .cells import TET_FACES
+from .volume import Mesh, cell_volumes, node_jacobians
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def quality(mesh: Mesh) -> MeshQuality:
     scaled = jacobians.min(axis=1) / np.abs(jacobians.mean(axis=1))
     angles = (
         dihedral_angles(mesh.points, mesh.cells[:, :4])
-        if mesh.cell_type != "hex8"
+        if mesh.kind.is_tetrahedron
         else np.full((1, 6), np.nan)
     )
     smallest = angles.min(axis=1)

@@ -19,12 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
-
-CELL_NODES = {"tet4": 4, "tet10": 10, "hex8": 8}
-VTK_CELL = {"tet4": 10, "tet10": 24, "hex8": 12}
-TET10_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
-TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # outward for positive volume
-TRI6_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
+from .cells import CELLS, TET10_EDGES, TRI6_EDGES, CellType
 
 
 @dataclass(frozen=True)
@@ -40,19 +35,24 @@ class Mesh:
     face_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.cell_type not in CELL_NODES:
-            raise ProblemError(f"unknown cell type {self.cell_type!r}; use one of {sorted(CELL_NODES)}")
+        if self.cell_type not in CELLS:
+            raise ProblemError(f"unknown cell type {self.cell_type!r}; use one of {sorted(CELLS)}")
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ProblemError(f"mesh points have shape {self.points.shape}, not (n, 3)")
-        if self.cells.ndim != 2 or self.cells.shape[1] != CELL_NODES[self.cell_type]:
+        if self.cells.ndim != 2 or self.cells.shape[1] != len(self.kind.nodes):
             raise ProblemError(f"{self.cell_type} cells have shape {self.cells.shape}")
         if len(self.regions) != len(self.cells):
             raise ProblemError(f"{len(self.regions)} region indices for {len(self.cells)} cells")
 
     @property
+    def kind(self) -> CellType:
+        """What is known of its cells."""
+        return CELLS[self.cell_type]
+
+    @property
     def corners(self) -> NDArray[np.int64]:
         """Corner nodes of each cell: (m, 4) for tetrahedra, (m, 8) for hexahedra."""
-        return self.cells[:, : 4 if self.cell_type.startswith("tet") else 8]
+        return self.cells[:, : self.kind.corners]
 
     def with_points(self, points: NDArray[np.float64]) -> Mesh:
         return replace(self, points=points)
@@ -92,7 +92,7 @@ class Mesh:
         tissues = _cell_array(grid.cell_data, region) if region else None
         kind, cells = _one_kind(blocks)
         if tissues is not None:
-            tissues = np.asarray(tissues)[np.asarray(grid.celltypes) == VTK_CELL[kind]]
+            tissues = np.asarray(tissues)[np.asarray(grid.celltypes) == CELLS[kind].vtk]
         return cls.from_arrays(grid.points, cells, tissues)
 
     @classmethod
@@ -128,64 +128,18 @@ class Mesh:
 
 def node_jacobians(mesh: Mesh) -> NDArray[np.float64]:
     """Jacobian determinant (m, k) of each cell at its own nodes, for unit reference cells, in mm3."""
-    gradients = _shape_gradients(mesh.cell_type, _REFERENCE_NODES[mesh.cell_type])
-    return _determinants(mesh, gradients)
+    return _determinants(mesh, mesh.kind.nodes) * mesh.kind.side**3
 
 
 def cell_volumes(mesh: Mesh) -> NDArray[np.float64]:
     """Volumes (m,) of the cells, curved edges included, in mm3."""
-    where, weights = _QUADRATURE[mesh.cell_type]
-    return _determinants(mesh, _shape_gradients(mesh.cell_type, where)) @ weights
+    return _determinants(mesh, mesh.kind.points) @ mesh.kind.weights
 
 
-def _determinants(mesh: Mesh, gradients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """det(dx/dxi) (m, q) for shape gradients (q, k, 3)."""
+def _determinants(mesh: Mesh, where: NDArray[np.float64]) -> NDArray[np.float64]:
+    """det(dx/dxi) (m, q) at local coordinates (q, 3)."""
+    _, gradients = mesh.kind.shape(where)
     return np.linalg.det(np.einsum("mki,qkj->mqij", mesh.points[mesh.cells], gradients))
-
-
-def _shape_gradients(cell_type: str, where: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gradients (q, k, 3) of the shape functions at reference coordinates (q, 3)."""
-    if cell_type == "hex8":
-        signs = 2.0 * _REFERENCE_NODES["hex8"] - 1.0
-        terms = 0.5 + signs * (where[:, None, :] - 0.5)
-        return np.stack(
-            [signs[:, i] * terms[..., (i + 1) % 3] * terms[..., (i + 2) % 3] for i in range(3)], axis=-1
-        )
-    slope = np.array([[-1.0, -1.0, -1.0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    if cell_type == "tet4":
-        return np.broadcast_to(slope, (len(where), 4, 3))
-    L = np.column_stack([1.0 - where.sum(axis=1), where])
-    corner = (4.0 * L - 1.0)[:, :, None] * slope
-    a, b = TET10_EDGES.T
-    edge = 4.0 * (L[:, a, None] * slope[b] + L[:, b, None] * slope[a])
-    return np.concatenate([corner, edge], axis=1)
-
-
-_TET_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-_REFERENCE_NODES = {
-    "tet4": _TET_NODES,
-    "tet10": np.vstack([_TET_NODES, _TET_NODES[TET10_EDGES].mean(axis=1)]),
-    "hex8": np.array(
-        [[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
-    ),
-}
-
-
-def _quadrature() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Rules that integrate the Jacobian of each cell exactly (tet10: cubic; Keast's 5 points)."""
-    keast = np.full((5, 3), 1 / 6)
-    keast[0] = 0.25
-    keast[1:4] += np.eye(3) / 3
-    gauss = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-    grid = np.stack(np.meshgrid(gauss, gauss, gauss), axis=-1).reshape(-1, 3)
-    return {
-        "tet4": (np.full((1, 3), 0.25), np.array([1 / 6])),
-        "tet10": (keast, np.array([-0.8, 0.45, 0.45, 0.45, 0.45]) / 6),
-        "hex8": (grid, np.full(8, 1 / 8)),
-    }
-
-
-_QUADRATURE = _quadrature()
 
 
 def check(mesh: Mesh) -> None:
@@ -215,21 +169,15 @@ def boundary_faces(mesh: Mesh) -> NDArray[np.int64]:
     ProblemError
         When a face belongs to more than two cells.
     """
-    faces = mesh.cells[:, _CELL_FACES[mesh.cell_type]]
+    faces = mesh.cells[:, mesh.kind.faces]
     faces = faces.reshape(-1, faces.shape[2])
     # Three of its corners tell a face of a conforming mesh, quadrilaterals included.
-    low, middle, high = np.sort(faces[:, : _FACE_CORNERS[mesh.cell_type]], axis=1)[:, :3].T
+    low, middle, high = np.sort(faces[:, : mesh.kind.face_corners], axis=1)[:, :3].T
     count = len(mesh.points)
     _, first, counts = np.unique((low * count + middle) * count + high, return_index=True, return_counts=True)
     if counts.max() > 2:
         raise ProblemError("a face of the mesh belongs to more than two cells")
     return faces[np.sort(first[counts == 1])]
-
-
-_TET10_FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
-_HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
-_CELL_FACES = {"tet4": TET_FACES, "tet10": _TET10_FACES, "hex8": _HEX_FACES}
-_FACE_CORNERS = {"tet4": 3, "tet10": 3, "hex8": 4}
 
 
 def to_tet10(mesh: Mesh) -> Mesh:
@@ -265,20 +213,14 @@ def _promoted_set(nodes: NDArray[np.int64], boundary: NDArray[np.int64]) -> NDAr
     return np.union1d(nodes, boundary[inside, 3:].ravel()).astype(np.int64)
 
 
-_VTK_NAMES = {number: name for name, number in VTK_CELL.items()} | {
+_VTK_NAMES = {cell.vtk: cell.name for cell in CELLS.values()} | {
     1: "", 2: "", 3: "", 4: "", 5: "", 6: "", 7: "", 8: "", 9: "", 21: "", 22: "", 23: "", 28: "",
     11: "voxels", 13: "wedges", 14: "pyramids", 25: "quadratic hexahedra", 29: "quadratic hexahedra",
 }  # fmt: skip
-_MESHIO_NAMES = {"tetra": "tet4", "tetra10": "tet10", "hexahedron": "hex8"} | dict.fromkeys(
+_MESHIO_NAMES = {cell.meshio: cell.name for cell in CELLS.values()} | dict.fromkeys(
     ("vertex", "line", "line3", "triangle", "triangle6", "quad", "quad8", "quad9"), ""
 )
 _MESHIO_REGIONS = ("gmsh:physical", "medit:ref", "region")
-# The same cell with its corners the other way round.
-_TURNED = {
-    "tet4": [0, 2, 1, 3],
-    "tet10": [0, 2, 1, 3, 6, 5, 4, 7, 9, 8],
-    "hex8": [4, 5, 6, 7, 0, 1, 2, 3],
-}
 
 
 def _one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]]:
@@ -289,7 +231,7 @@ def _one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]
             solid.setdefault(name, []).append(np.asarray(cells))
     if not solid:
         raise ProblemError("the mesh has no volume cells", remedy="mesh the inside, not the surface alone")
-    if len(solid) > 1 or not solid.keys() <= CELL_NODES.keys():
+    if len(solid) > 1 or not solid.keys() <= CELLS.keys():
         raise ProblemError(
             f"the mesh has {' and '.join(sorted(solid))}, not one kind of tetrahedra or linear hexahedra",
             remedy="make tetrahedra of it, in pyvista by grid.triangulate()",
@@ -312,10 +254,11 @@ def _from_arrays(
     names: Mapping[int, str] | None,
 ) -> Mesh:
     width = cells.shape[1] if cells.ndim == 2 else 0
-    kinds = {n: kind for kind, n in CELL_NODES.items()}
+    kinds = {len(cell.nodes): cell.name for cell in CELLS.values()}
     if width not in kinds or not len(cells):
+        *some, last = (f"(m, {n})" for n in kinds)
         raise ProblemError(
-            f"cells have shape {cells.shape}, not (m, 4), (m, 10) or (m, 8)",
+            f"cells have shape {cells.shape}, not {', '.join(some)} or {last}",
             remedy="give tetrahedra or linear hexahedra",
         )
     if cells.min() < 0 or cells.max() >= len(points):
@@ -324,7 +267,7 @@ def _from_arrays(
     used, inverse = np.unique(cells, return_inverse=True)
     mesh = Mesh(points[used], inverse.reshape(cells.shape), kinds[width], numbers, tissues)
     turned = cell_volumes(mesh) < 0.0
-    mesh.cells[turned] = mesh.cells[turned][:, _TURNED[mesh.cell_type]]
+    mesh.cells[turned] = mesh.cells[turned][:, mesh.kind.turned]
     check(mesh)
     return mesh
 

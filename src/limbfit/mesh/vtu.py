@@ -16,7 +16,8 @@ from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkFieldData, vtkUnstruc
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
 
 from ..errors import ProblemError
-from .volume import CELL_NODES, VTK_CELL, Mesh
+from .cells import CELLS
+from .volume import Mesh
 
 
 def write_vtu(
@@ -38,7 +39,7 @@ def write_vtu(
     offsets = np.arange(len(mesh.cells) + 1) * mesh.cells.shape[1]
     cells = vtkCellArray()
     cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), connectivity)
-    grid.SetCells(VTK_CELL[mesh.cell_type], cells)
+    grid.SetCells(mesh.kind.vtk, cells)
     _add_arrays(grid.GetCellData(), {"region": mesh.regions, **(cell_data or {})})
     _add_arrays(grid.GetPointData(), _set_masks(mesh) | dict(point_data or {}))
     _add_arrays(grid.GetFieldData(), {f"{_NODE_SET}{name}": nodes for name, nodes in mesh.node_sets.items()})
@@ -99,12 +100,12 @@ def read_vtu(path: str | Path) -> Mesh:
     """
     grid = read_grid(Path(path))
     kinds = np.unique(vtk_to_numpy(grid.GetCellTypesArray()))
-    named = {number: name for name, number in VTK_CELL.items()}
+    named = {cell.vtk: cell.name for cell in CELLS.values()}
     if len(kinds) != 1 or int(kinds[0]) not in named:
         raise ProblemError(f"cells of VTK types {kinds.tolist()}, not of one supported type", file=path)
     cell_type = named[int(kinds[0])]
     connectivity = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).astype(np.int64)
-    cells = connectivity.reshape(-1, CELL_NODES[cell_type])
+    cells = connectivity.reshape(-1, len(CELLS[cell_type].nodes))
     region = grid.GetCellData().GetArray("region")
     names = grid.GetFieldData().GetAbstractArray("region_names")
     return Mesh(

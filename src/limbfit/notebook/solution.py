@@ -16,7 +16,6 @@ from ..fe import Problem, Result, State, Step, StepControl, System
 from ..fe import solve as simulate
 from ..fe.kernel.assembly import is_compiled
 from ..fields import rest, state_fields
-from ..mesh import VTK_CELL
 
 COMPILING = "limbfit compiles its kernels: half a minute, once on this machine"
 
@@ -46,7 +45,7 @@ class Solution(Result):
             has = f"there are {len(self.frames)}" if self.frames else "it was solved without frames"
             raise ProblemError(f"no step {step}: {has}", remedy="count from 0, which is rest")
         mesh = self.problem.mesh
-        grid = pv.UnstructuredGrid({VTK_CELL[mesh.cell_type]: mesh.cells}, mesh.points)
+        grid = pv.UnstructuredGrid({mesh.kind.vtk: mesh.cells}, mesh.points)
         system = self.system or System(self.problem)
         point_data, cell_data = state_fields(system, self.problem, frame)
         for data, arrays in ((grid.point_data, point_data), (grid.cell_data, cell_data)):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -13,27 +15,15 @@ from starlette.exceptions import HTTPException
 
 from ..errors import InputError, LimbfitError
 from ..web.assets import STATIC as SHARED
-from . import (
-    identification_routes,
-    image_routes,
-    live_routes,
-    model_routes,
-    results_routes,
-    study_routes,
-    traces_routes,
-)
 from .folder import StudyFolder
 from .guard import Door, Guard, TooLargeError
 
 STATIC = Path(__file__).parent / "static"
-ROUTES = (
-    study_routes,
-    image_routes,
-    model_routes,
-    traces_routes,
-    live_routes,
-    identification_routes,
-    results_routes,
+# Of every view: the modules beside this one whose names end in _routes.
+ROUTES = tuple(
+    import_module(f".{module.name}", __package__)
+    for module in iter_modules([str(Path(__file__).parent)])
+    if module.name.endswith("_routes")
 )
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails
 
+from ..errors import InputError
+from ..shapes import SHAPES, Size
 from .friction import Friction
 
 Vector = tuple[float, float, float]
@@ -162,20 +165,60 @@ class GeometryTable(TomlTable):
 
 
 class IndenterTable(TomlTable):
-    """The rigid indenter; the paper's is a square of 20 mm.  ``file`` is the surface of shape ``stl``."""
+    """The rigid indenter; the paper's is a square of 20 mm.  ``file`` is the surface of shape ``stl``.
 
-    shape: Literal["square", "sphere", "cylinder", "stl"] = "square"
+    Other keys are measures of the shape.
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, float] = Field(init=False)
+
+    shape: str = "square"
     file: Path | None = None
     width_mm: Positive = 20.0
     edge_radius_mm: Annotated[float, Field(ge=0)] = 0.0
     friction: Friction = "frictionless"
 
+    @property
+    def measures(self) -> dict[str, float]:
+        """The shape's own numbers, by key."""
+        return self.__pydantic_extra__
+
+    @field_validator("shape")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        try:
+            return SHAPES[name].name
+        except InputError as error:
+            raise ValueError(str(error)) from None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _measured(cls, content: Any) -> Any:
+        """With the measures that are left out; a key that is none of the shape's is refused."""
+        name = content.get("shape", cls.model_fields["shape"].default) if isinstance(content, dict) else None
+        if name not in SHAPES.names:
+            return content
+        usual = {measure.key: measure.value for measure in SHAPES[name].measures}
+        unknown = [key for key in content if key not in usual and key not in cls.model_fields]
+        if unknown:
+            errors = [InitErrorDetails(type="extra_forbidden", loc=(key,), input=0) for key in unknown]
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        return usual | content
+
     @model_validator(mode="after")
     def _edge_fits(self) -> IndenterTable:
-        if (self.file is not None) != (self.shape == "stl"):
-            raise ValueError('shape = "stl" needs a file, and only that shape has one')
+        shape = SHAPES[self.shape]
+        if (self.file is not None) != shape.needs_file:
+            those = " or ".join(f'"{one.name}"' for one in SHAPES if one.needs_file)
+            raise ValueError(f"shape = {those} needs a file, and no other shape has one")
         if self.edge_radius_mm >= self.width_mm / 2:
             raise ValueError("edge_radius_mm must be smaller than half of width_mm")
+        if self.file is None:
+            try:
+                shape.of(Size(self.width_mm, self.edge_radius_mm, self.measures))
+            except InputError as error:
+                raise ValueError(str(error)) from None
         return self
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StudyError
+from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
 from .tables import Site
 from .whole import Study
@@ -100,7 +101,9 @@ VAIN: tuple[Vain, ...] = (
         "edge_far_mm is shorter, and no edge longer",
     ),
     Vain(
-        ("indenter.edge_radius_mm",), lambda s: s.indenter.shape == "sphere", "a sphere has no edge to round"
+        ("indenter.edge_radius_mm",),
+        lambda s: not SHAPES[s.indenter.shape].has_edge,
+        "the indenter has no edge to round",
     ),
     Vain(
         ("traces",),
@@ -137,7 +140,7 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("uncertainty.edge_radius_mm",),
-        lambda s: s.indenter.shape != "square",
+        lambda s: not SHAPES[s.indenter.shape].is_edge_doubted,
         "it is that of a square indenter",
     ),
     Vain(
@@ -157,7 +160,7 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
     ),
     VainOfSite(
         "edge",
-        lambda s, site: s.indenter.shape in ("sphere", "cylinder"),
+        lambda s, site: SHAPES[s.indenter.shape].is_round,
         "the indenter is round",
     ),
 )

@@ -84,6 +84,12 @@ class Study(TomlTable):
         return tuple(self.path(file) for file in self.study.extensions)
 
     @property
+    def indenter_here(self) -> IndenterTable:
+        """The indenter, its file as a path of this machine."""
+        file = self.indenter.file
+        return self.indenter.model_copy(update={"file": None if file is None else self.path(file)})
+
+    @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """(tissue, parameter) in the order of every flat vector."""
         return flat_names(self.tissues, self.material.law)

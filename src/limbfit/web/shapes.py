@@ -93,7 +93,7 @@ def volume_of(mesh: Mesh) -> VolumeShape:
     ProblemError
         For hexahedra, or a face of more than two cells.
     """
-    if mesh.cell_type == "hex8":
+    if not mesh.kind.is_tetrahedron:
         raise ProblemError("only meshes of tetrahedra are drawn, not of hexahedra")
     nodes, cells = np.unique(mesh.cells[:, :4], return_inverse=True)
     cells = cells.reshape(-1, 4)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ..kernel.elements import Element, face_quadrature
-from .shape import Shape
+from .rigid import RigidShape
 
 Array = NDArray[np.float64]
 START_MM = 0.02  # inside the tissue is a start that is deeper; other quadratures touch a little sooner
@@ -49,7 +49,7 @@ class ContactSurface:
         """The quadrature points (f, q, 3) of the undeformed surface, mm."""
         return self.at(self.points)
 
-    def gaps_at_rest(self, indenter: Shape) -> Array:
+    def gaps_at_rest(self, indenter: RigidShape) -> Array:
         """Signed distances (f, q) of the undeformed surface, mm."""
         points = self.points_at_rest
         return indenter.signed_distance(points.reshape(-1, 3)).reshape(points.shape[:2])
@@ -111,7 +111,7 @@ class Touch:
         return self.stick + pushing * closed[:, None, None], forces
 
 
-def touching_offset(surface: ContactSurface, indenter: Shape, tolerance: float = 1e-9) -> float:
+def touching_offset(surface: ContactSurface, indenter: RigidShape, tolerance: float = 1e-9) -> float:
     """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface.
 
     From far outside it advances by the smallest distance, which cannot jump over the first touch, or by a
@@ -133,7 +133,7 @@ def touching_offset(surface: ContactSurface, indenter: Shape, tolerance: float =
     return low
 
 
-def check_clear(surface: ContactSurface, indenter: Shape, name: str = "indenter") -> None:
+def check_clear(surface: ContactSurface, indenter: RigidShape, name: str = "indenter") -> None:
     """Raise `ProblemError` where the body starts inside the undeformed tissue."""
     gaps = surface.gaps_at_rest(indenter)
     at = np.unravel_index(gaps.argmin(), gaps.shape)

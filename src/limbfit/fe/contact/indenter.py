@@ -1,27 +1,19 @@
-"""Rigid indenters as signed distances with gradient and curvature.
+"""Rigid indenters: a shape, where it stands and where it goes.
 
 The indenter's frame: origin at the middle of its foremost face (``centre``), coordinates ``(x, y, z)`` along
-``edge``, ``axis x edge`` and ``axis``; the body lies at ``z <= 0``.  Square, sphere and cylinder have no far
-end (a sphere is the end of a round rod); a triangle surface is the body that it encloses.
+``edge``, ``axis x edge`` and ``axis``; the body lies at ``z <= 0``.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from .rigid_surface import NO_BODY, Body, RigidSurface, surface_distance
-
-SHAPES = {"square": 0, "sphere": 1, "cylinder": 2, "stl": 3}
-Kernel = tuple[int, float, float, Body]
-# No mesh resolves the singularity of a sharp edge; this rounding over the width stands for it.
-SHARP_EDGE = 0.01
+from ...shapes import SHAPES, SHARP_EDGE, RigidSurface, Shape, Size
 
 
 @dataclass(frozen=True)
@@ -30,7 +22,8 @@ class Indenter:
 
     Parameters
     ----------
-    shape : ``square`` (prism), ``sphere``, ``cylinder`` (flat end) or ``stl`` (the ``surface``).
+    shape : ``square`` (prism), ``sphere``, ``cylinder`` (flat end), ``stl`` (the ``surface``) or the name of
+        one that was registered by `limbfit.register_shape`.
     width : edge length or diameter, mm, rounding included; with a surface it is measured.
     edge_radius : rounding of the edges, mm.  Less than 1 % of the width (also 0, a sharp edge) is taken as
         1 % of the width, with a surface as much of it as its details allow; a sphere has none.
@@ -39,6 +32,14 @@ class Indenter:
     edge : (3,) direction of one edge of the square; by default the cross product of ``axis`` and z.
     surface : triangles in the indenter's frame, for ``stl`` only.
     sharp : the rounding over the width that stands for a sharp edge, where 1 % is too coarse for the tissue.
+    measures : further numbers of a shape that has them, by their keys.
+
+    Raises
+    ------
+    ProblemError
+        For a size, a place or a direction that is impossible.
+    InputError
+        For a shape that nobody registered.
     """
 
     shape: str = "square"
@@ -49,24 +50,14 @@ class Indenter:
     edge: Sequence[float] | NDArray[np.float64] | None = None
     surface: RigidSurface | None = None
     sharp: float = SHARP_EDGE
+    measures: Mapping[str, float] = field(default_factory=dict)
+    body: Shape = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.shape not in SHAPES:
-            raise ProblemError(f"unknown indenter shape {self.shape!r}; use one of {sorted(SHAPES)}")
-        if (self.surface is not None) != (self.shape == "stl"):
-            raise ProblemError("an indenter of shape 'stl' needs a surface, and only such a one has it")
         if self.surface is not None:
             object.__setattr__(self, "width", self.surface.width)
-        if not (math.isfinite(self.width) and self.width > 0):
-            raise ProblemError(f"indenter width {self.width} mm is not positive")
-        if not 0 < self.sharp <= SHARP_EDGE:
-            raise ProblemError(
-                f"a sharp edge of {self.sharp} of the width is not above 0 and up to {SHARP_EDGE}"
-            )
-        if not 0 <= self.edge_radius <= self.width / 2:
-            raise ProblemError(f"edge radius {self.edge_radius} mm does not fit a width of {self.width} mm")
-        if self.surface is not None:
-            self.surface.rounded(*self._rounding)  # refuses a radius that does not fit
+        size = Size(self.width, self.edge_radius, self.measures, self.surface, self.sharp)
+        object.__setattr__(self, "body", SHAPES[self.shape].of(size))
         for name in ("centre", "axis"):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (3,) or not np.isfinite(value).all():
@@ -94,23 +85,9 @@ class Indenter:
         return np.array([edge, np.cross(axis, edge), axis])
 
     @property
-    def _rounding(self) -> tuple[float, bool]:
-        """Edge radius, mm, and whether it was asked for."""
-        least = self.sharp * self.width
-        return max(self.edge_radius, least), self.edge_radius >= least
-
-    @property
-    def kernel(self) -> Kernel:
-        """Code, half width, effective edge radius and triangles, as the compiled kernels read them."""
-        radius, body = self._rounding[0], NO_BODY
-        if self.surface is not None:
-            radius, body = self.surface.rounded(*self._rounding)
-        return SHAPES[self.shape], self.width / 2, radius, body
-
-    @property
     def length(self) -> float:
         """From the foremost point to the far end of a surface; the width for shapes without one, mm."""
-        return self.width if self.surface is None else -float(self.surface.points[:, 2].min())
+        return self.body.length
 
     def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Indenter:
         """The indenter, advanced along its axis by ``distance`` mm and ``across`` it, along x and y of its
@@ -131,10 +108,9 @@ class Indenter:
 
     def near(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which points (n, 3) of its frame it may touch; the distance of others is not looked for."""
-        half = self.width / 2
-        reach = 1.8 * half
         x, y, z = points.T
-        return np.asarray((z <= half) & (np.abs(x) <= reach) & (np.abs(y) <= reach))
+        reach = self.body.reach
+        return np.asarray((z <= self.width / 2) & (np.abs(x) <= reach) & (np.abs(y) <= reach))
 
     def local_distance(
         self, points: NDArray[np.float64]
@@ -142,78 +118,5 @@ class Indenter:
         """Distance (...), mm, gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
         shape = points.shape[:-1]
         x = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
-        values, slopes, bends = signed_distances(x, self.kernel)
+        values, slopes, bends = self.body.distance(x)
         return values.reshape(shape), slopes.reshape(*shape, 3), bends.reshape(*shape, 3, 3)
-
-
-@njit(cache=True)
-def signed_distance(kernel, x, gradient, hessian):  # type: ignore[no-untyped-def]
-    """Distance of the local point ``x (3,)``; fills its gradient (3,) and hessian (3, 3).
-
-    The prism is a box shrunk by its rounding, grown again (Quilez' rounded box).  Deeper than the rounding
-    the way out is always through the foremost face: a point that a large step left inside must go back to
-    where it came from, not sideways through the nearest wall.
-    """
-    shape, half, radius, body = kernel
-    if shape == 3:
-        return surface_distance(body, radius, x, gradient, hessian)
-    gradient[:] = 0.0
-    hessian[:, :] = 0.0
-    if shape == 1:
-        z = max(x[2] + half, 0.0)
-        r = max(np.sqrt(x[0] * x[0] + x[1] * x[1] + z * z), 1e-300)
-        gradient[0], gradient[1], gradient[2] = x[0] / r, x[1] / r, z / r
-        for i in range(3):
-            for j in range(3):
-                identity = 1.0 if i == j and (i < 2 or z > 0.0) else 0.0
-                hessian[i, j] = (identity - gradient[i] * gradient[j]) / r
-        return r - half
-    inner, z = half - radius, x[2] + radius
-    if shape == 0:
-        p, q = max(abs(x[0]) - inner, 0.0), max(abs(x[1]) - inner, 0.0)
-    else:
-        rho = np.sqrt(x[0] * x[0] + x[1] * x[1])
-        p, q = max(rho - inner, 0.0), 0.0
-    up = max(z, 0.0)
-    r = np.sqrt(p * p + q * q + up * up)
-    if r <= 1e-12 * half:
-        gradient[2] = 1.0
-        return z - radius
-    if shape == 0:
-        gradient[0], gradient[1], gradient[2] = np.sign(x[0]) * p / r, np.sign(x[1]) * q / r, up / r
-        for i in range(3):
-            active = (p if i == 0 else (q if i == 1 else up)) > 0.0
-            for j in range(3):
-                hessian[i, j] = ((1.0 if i == j and active else 0.0) - gradient[i] * gradient[j]) / r
-        return r - radius
-    _cylinder(x, p, up, r, gradient, hessian)
-    return r - radius
-
-
-@njit(cache=True)
-def _cylinder(x, p, up, r, gradient, hessian):  # type: ignore[no-untyped-def]
-    """Chain rule from the half plane (rho, z) to space."""
-    gradient[2] = up / r
-    if p > 0.0:
-        rho = np.sqrt(x[0] * x[0] + x[1] * x[1])
-        c, s = x[0] / rho, x[1] / rho
-        gradient[0], gradient[1] = c * p / r, s * p / r
-        hessian[0, 0] = c * c / r + s * s / rho * p / r
-        hessian[1, 1] = s * s / r + c * c / rho * p / r
-        hessian[0, 1] = c * s / r - c * s / rho * p / r
-        hessian[1, 0] = hessian[0, 1]
-    if up > 0.0:
-        hessian[2, 2] = 1.0 / r
-    for i in range(3):
-        for j in range(3):
-            hessian[i, j] -= gradient[i] * gradient[j] / r
-
-
-@njit(cache=True)
-def signed_distances(local, kernel):  # type: ignore[no-untyped-def]
-    """`signed_distance` of many local points (n, 3) with its derivatives."""
-    n = len(local)
-    values, slopes, bends = np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3))
-    for i in range(n):
-        values[i] = signed_distance(kernel, local[i], slopes[i], bends[i])
-    return values, slopes, bends

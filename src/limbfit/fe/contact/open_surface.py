@@ -15,8 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from .closest_point import INSIDE, Tree, build_tree, closest_point
-from .triangles import beyond_edges, normal_spread, triangle_normals
+from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point
+from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
 
 Array = NDArray[np.float64]
 # What lies beyond the brim by less than this share of the triangle beside it is still met.

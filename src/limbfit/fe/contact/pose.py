@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from .shape import Shape
+from .rigid import RigidShape
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class Pose:
     """A body that started as ``start`` and is moved by ``coordinates (6,)``: mm along the axes of its frame,
     and the rotation vector in its frame, rad, about the ``pivot (3,)``."""
 
-    start: Shape
+    start: RigidShape
     pivot: Array
     coordinates: Array
 
@@ -66,7 +66,7 @@ class Pose:
         return np.asarray(expm(matrix)[:3, -3:])
 
     @cached_property
-    def body(self) -> Shape:
+    def body(self) -> RigidShape:
         """The body where it is."""
         frame, centre = self.start.frame, np.asarray(self.start.centre, dtype=float)
         shift = self.coordinates[:3] @ frame

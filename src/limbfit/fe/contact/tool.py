@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .contact import ContactSurface
 from .pose import Pose
-from .shape import Shape
+from .rigid import RigidShape
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -42,7 +42,7 @@ class Tool:
     unit: float
 
     @property
-    def body(self) -> Shape:
+    def body(self) -> RigidShape:
         return self.pose.body
 
     @cached_property

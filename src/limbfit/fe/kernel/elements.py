@@ -1,22 +1,27 @@
 """The element table: shape functions, quadrature and formulation of every element, as data.
 
-Local coordinates: tetrahedra and triangles on the unit simplex, hexahedra and quadrilaterals on [-1, 1]^d,
-nodes in VTK order.  An element of a known cell type is a row of
-`ELEMENTS`; what a new cell type needs beside it: docs/mechanics.md.
+An element of a known cell type is a row of `ELEMENTS`; a cell type is a row of `limbfit.mesh.CELLS`, where
+its local coordinates are said.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...mesh import TET10_EDGES, TRI6_EDGES
+from ...mesh.cells import (
+    QUAD_CORNERS,
+    ShapeFunctions,
+    linear_hexahedron,
+    linear_quadrilateral,
+    linear_simplex,
+    quadratic_simplex,
+)
 
 Array = NDArray[np.float64]
-Shape = Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -31,61 +36,12 @@ class Element:
 
     name: str
     cell_type: str
-    shape: Shape
+    shape: ShapeFunctions
     points: Array
     weights: Array
     mean_dilatation: bool
-    face_shape: Shape
+    face_shape: ShapeFunctions
     face_rules: Mapping[str, tuple[Array, Array]]
-
-
-def _simplex_gradients(d: int) -> Array:
-    return np.vstack([-np.ones(d), np.eye(d)])
-
-
-def _barycentric(x: Array) -> Array:
-    return np.column_stack([1.0 - x.sum(axis=1), x])
-
-
-def linear_simplex(x: Array) -> tuple[Array, Array]:
-    """Linear triangle (d = 2) or tetrahedron (d = 3)."""
-    L = _barycentric(x)
-    return L, np.broadcast_to(_simplex_gradients(x.shape[1]), (*L.shape, x.shape[1])).copy()
-
-
-def quadratic_simplex(x: Array) -> tuple[Array, Array]:
-    """Quadratic triangle (6 nodes) or tetrahedron (10 nodes)."""
-    L, dL = _barycentric(x), _simplex_gradients(x.shape[1])
-    edges = TRI6_EDGES if x.shape[1] == 2 else TET10_EDGES
-    i, j = edges[:, 0], edges[:, 1]
-    values = np.hstack([L * (2.0 * L - 1.0), 4.0 * L[:, i] * L[:, j]])
-    corner = (4.0 * L - 1.0)[:, :, None] * dL[None]
-    middle = 4.0 * (L[:, i, None] * dL[j][None] + L[:, j, None] * dL[i][None])
-    return values, np.concatenate([corner, middle], axis=1)
-
-
-def _tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
-    d = x.shape[1]
-    factors = 0.5 * (1.0 + x[:, None, :] * corners[None])
-    gradients = np.empty((len(x), len(corners), d))
-    for i in range(d):
-        others = np.delete(factors, i, axis=2).prod(axis=2)
-        gradients[:, :, i] = 0.5 * corners[None, :, i] * others
-    return factors.prod(axis=2), gradients
-
-
-QUAD_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
-HEX_CORNERS = np.vstack([np.column_stack([QUAD_CORNERS, np.full(4, z)]) for z in (-1.0, 1.0)])
-
-
-def linear_quadrilateral(x: Array) -> tuple[Array, Array]:
-    """Bilinear quadrilateral, 4 nodes."""
-    return _tensor_linear(x, QUAD_CORNERS)
-
-
-def linear_hexahedron(x: Array) -> tuple[Array, Array]:
-    """Trilinear hexahedron, 8 nodes."""
-    return _tensor_linear(x, HEX_CORNERS)
 
 
 def _orbit(*orbits: tuple[float, float], d: int) -> tuple[Array, Array]:

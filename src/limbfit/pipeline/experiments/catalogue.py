@@ -8,12 +8,15 @@ stages and of other experiments, so that a killed one goes on and nothing is sim
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
+from ...extensions import Registry
+from ...report.sections.experiments import SECTIONS, Maker
 from ...study import Study
 from ..shared.context import Context
 from ..shared.keys import Keys, Stage
@@ -52,7 +55,7 @@ def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) 
     )
 
 
-EXPERIMENTS: tuple[Experiment, ...] = (
+_OWN: tuple[Experiment, ...] = (
     Experiment(
         "cube",
         run_cube,
@@ -99,19 +102,28 @@ EXPERIMENTS: tuple[Experiment, ...] = (
 )
 
 
-def find_experiment(name: str) -> Experiment:
-    """The experiment of that name.
+EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment in _OWN})
+
+
+def register_experiment(experiment: Experiment, section: Maker | None = None) -> None:
+    """Make an experiment known by its name, in the file that a study names in ``study.extensions``.
+
+    Parameters
+    ----------
+    experiment : its ``run`` writes ``<name>.json`` into the folder that it is given.
+    section : makes its section of the report of what is stored and of that file's content.
 
     Raises
     ------
     InputError
-        Where there is none.
+        Where the name is taken, or cannot be that of a folder beside the others.
     """
-    for experiment in EXPERIMENTS:
-        if experiment.name == name:
-            return experiment
-    known = ", ".join(experiment.name for experiment in EXPERIMENTS)
-    raise InputError(f"no experiment is named {name!r}", remedy=f"experiments are {known}")
+    name, others = experiment.name, {*EXPERIMENTS.names} - {experiment.name}
+    if not re.fullmatch("[a-z][a-z0-9_]*", name) or any(other.startswith(f"{name}-") for other in others):
+        raise InputError(f"no experiment can be named {name!r}", remedy="use small letters and digits")
+    EXPERIMENTS.add(name, experiment)
+    if section is not None:
+        SECTIONS.add(name, section)
 
 
 def options_of(experiment: Experiment, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...indentation import Parameters
+from ...shapes import OWN, SHAPES
 from ...study import IndenterTable
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
@@ -183,18 +184,14 @@ def other_indenters(own: IndenterTable, placed: IndenterTable) -> list[tuple[str
     ``placed`` is the study's with its file's whole path.
     """
     width = own.width_mm
-    rounded = {"shape": "square", "edge_radius_mm": 0.1 * width}
-    others = {
-        "square": {"shape": "square"},
-        "square, rounded edge": rounded,
-        "sphere": {"shape": "sphere"},
-        "cylinder": {"shape": "cylinder"},
-    }
     found = [(f"{own.shape} of the study", placed, True)]
-    for label, change in others.items():
-        table = IndenterTable(width_mm=width, friction=own.friction, **change)  # type: ignore[arg-type]
-        if table != own:
-            found.append((label, table, False))
+    for shape in dict.fromkeys((*OWN, SHAPES[own.shape])):
+        for label, rounding in shape.variants.items():
+            table = IndenterTable(
+                shape=shape.name, width_mm=width, edge_radius_mm=rounding * width, friction=own.friction
+            )
+            if table != own:
+                found.append((label, table, False))
     return found
 
 

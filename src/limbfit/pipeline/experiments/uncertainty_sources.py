@@ -19,6 +19,7 @@ from ...anatomy.sites.sites import indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...fe import ORDER_IN_TIME
 from ...indentation import SimulationJob, SiteModel
+from ...shapes import SHAPES
 from ...study import SolverTable, Study, Vector
 from ..shared.context import Context
 from ..shared.extrapolation import MESH_ORDERS, error_of_coarser
@@ -97,7 +98,7 @@ def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[V
     """Edge radius, friction and bulk modulus; the last two are alternatives, no spreads."""
     radius = study.uncertainty.edge_radius_mm
     indenter, found = study.indenter, []
-    if indenter.shape == "square" and radius > 0:
+    if SHAPES[indenter.shape].is_edge_doubted and radius > 0:
         rounded = [_with_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius) for m in models]
         found.append(vary("indenter edge", f"radius {radius:g} mm larger", rounded, True, True))
     other = "sticky" if indenter.friction == "frictionless" else "frictionless"

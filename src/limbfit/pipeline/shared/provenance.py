@@ -12,7 +12,7 @@ from typing import Any
 from ...anatomy.labels.labelfiles import sidecar
 from ...fe import StepControl
 from ...study import Study
-from .corrections import hand_labels
+from .hand_labels import hand_labels
 from .store import digest, file_digest
 
 LIBRARIES = (

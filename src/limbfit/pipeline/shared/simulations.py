@@ -144,7 +144,7 @@ def site_model(
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
     folder = COARSE if searched and study.mesh.coarse is not None else ""
     mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
-    file = None if study.indenter.file is None else study.path(study.indenter.file)
+    indenter = study.indenter_here
     return SiteModel(
         name=site.name,
         mesh=mesh,
@@ -154,8 +154,8 @@ def site_model(
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
         edge=site.edge,
-        indenter=study.indenter.model_copy(update={"file": file}),
-        indenter_digest="" if file is None else file_digest(file),
+        indenter=indenter,
+        indenter_digest="" if indenter.file is None else file_digest(indenter.file),
         kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
         element=study.mesh.element,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from ...study import Study
-from ..shared.corrections import hand_labels
+from ..shared.hand_labels import hand_labels
 
 THICKNESS = "fat-depth.vtp"
 MARKED_SKIN = "skin-markers.stl"

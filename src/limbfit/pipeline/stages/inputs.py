@@ -12,7 +12,7 @@ from ...anatomy.labels.placement import on_grid_of
 from ...anatomy.segmentation.one_limb import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...study import Study
-from ..shared.corrections import hand_labels
+from ..shared.hand_labels import hand_labels
 from .files import naming
 
 

@@ -18,9 +18,6 @@ from .traces import read_curves
 
 Placed = Mapping[str, Mapping[str, Any]]
 
-# Radius of a circle with the section of each shape of indenter, over its width.
-SECTION_RADIUS = {"square": np.pi**-0.5, "stl": np.pi**-0.5, "cylinder": 0.5, "sphere": 0.5}
-
 
 def stored_flags(context: Context) -> tuple[Flag, ...]:
     """Flags on all recorded sites from the stages ``surfaces``, ``sites`` and ``traces``."""
@@ -66,11 +63,8 @@ def _flag(site: str, remark: Mapping[str, Any]) -> Flag:
 
 def _radius(study: Study) -> float:
     """Of a circle with the indenter's section, mm; a sphere touches with less."""
-    table = study.indenter
-    file = None if table.file is None else study.path(table.file)
-    shape = table.model_copy(update={"file": file})
-    width = read_indenter(shape, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
-    return float(SECTION_RADIUS[table.shape] * width)
+    tool = read_indenter(study.indenter_here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
+    return float(np.sqrt(tool.body.section / np.pi))
 
 
 def _facts(

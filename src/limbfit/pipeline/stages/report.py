@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import report
+from ...extensions import load_extensions
 from ..shared.context import Context
 
 
@@ -19,9 +20,11 @@ def run_report(context: Context, folder: Path) -> dict[str, Any]:
     truth = context.study.folder / "truth.json"
     if truth.is_file():
         shutil.copyfile(truth, context.store.folder / "truth.json")
-    list(context.executor.map(_draw, [(context.store.folder, folder)]))
+    list(context.executor.map(_draw, [(context.store.folder, folder, context.study.extensions)]))
     return {}
 
 
-def _draw(folders: tuple[Path, Path]) -> None:
-    report.build_report(*folders)
+def _draw(job: tuple[Path, Path, tuple[Path, ...]]) -> None:
+    results, out, extensions = job
+    load_extensions(extensions)  # they may have sections and words of their own
+    report.build_report(results, out)

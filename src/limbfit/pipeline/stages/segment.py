@@ -12,7 +12,7 @@ from ...anatomy.labels.contours import write_contours
 from ...anatomy.labels.quality import assess
 from ...report.drawing.sheet import draw_sheet
 from ..shared.context import Context
-from ..shared.corrections import DIGEST, LABELS
+from ..shared.hand_labels import DIGEST, LABELS
 from ..shared.store import file_digest, write_json
 from .inputs import automatic_labels, study_image, study_labels
 from .marked_images import second_skin, without_own_markers

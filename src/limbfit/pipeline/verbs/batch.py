@@ -7,11 +7,11 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from ...errors import LimbfitError
+from ...errors import InputError, LimbfitError
 from ...execution import make_executor, sharing
 from ...study import load_study
 from ..shared.context import Listener, Progress
-from .run import run_study
+from .run import STAGE_NAMES, run_study
 
 _FIGURES = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
 
@@ -33,7 +33,14 @@ def run_batch(
     dict
         For each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
         ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
+
+    Raises
+    ------
+    InputError
+        For a stage that there is not.
     """
+    if until is not None and until not in STAGE_NAMES:
+        raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
     with make_executor(workers) as executor, sharing(executor):
         for i, path in enumerate(paths):
             start = perf_counter()

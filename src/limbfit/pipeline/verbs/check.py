@@ -39,8 +39,7 @@ def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
     given, notes = given_anatomy(study) if study.surfaces is not None else (None, ())
     facts += _image_facts(study) if given is None else [*notes, *_surface_facts(study, given)]
     if study.indenter.file is not None:
-        table = study.indenter.model_copy(update={"file": study.path(study.indenter.file)})
-        width = read_indenter(table, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+        width = read_indenter(study.indenter_here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
         facts.append(f"indenter: {study.indenter.file}, {width:.1f} mm wide")
     listener(Progress("check", 1, 2, "records"))
     read = {site.name: read_site_trace(study, site) for site in study.sites if site.trace is not None}

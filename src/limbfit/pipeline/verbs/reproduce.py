@@ -14,7 +14,7 @@ from ..._version import __version__
 from ...errors import InputError
 from ...study import Study, load_study
 from ..shared.context import Listener
-from ..shared.corrections import hand_labels
+from ..shared.hand_labels import hand_labels
 from ..shared.provenance import input_digests, settings_record, versions
 from ..shared.store import Store, read_json
 from ..stages.traces import read_curves

@@ -9,15 +9,15 @@ from ..._version import __version__
 from ...errors import InputError
 from ...study import Study
 from ..experiments.catalogue import (
+    EXPERIMENTS,
     do_experiment,
     experiment_key,
     experiment_rows,
-    find_experiment,
     options_of,
 )
 from ..shared.causes import causes, parts_of
 from ..shared.context import Context, Listener, executor_of
-from ..shared.corrections import keep_corrections
+from ..shared.hand_labels import keep_hand_labels
 from ..shared.keys import Keys, Stage
 from ..shared.provenance import input_digests, machine, settings_record, versions
 from ..shared.store import Store, lock, write_json
@@ -50,6 +50,7 @@ STAGES = (
     Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge")),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
+_FOLDERS = frozenset(("compare", "export", "simulate", *(stage.name for stage in STAGES)))  # of results
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 
@@ -107,7 +108,7 @@ def study_status(study: Study) -> list[dict[str, Any]]:
     columns = ("state", "seconds", "finished")
     for row in experiment_rows(study, known, wanted):
         if row["state"] != "missing":
-            why = _why(known, find_experiment(row["experiment"]), wanted) if row["state"] == "stale" else []
+            why = _why(known, EXPERIMENTS[row["experiment"]], wanted) if row["state"] == "stale" else []
             rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}, "why": why})
     return rows
 
@@ -156,7 +157,7 @@ def run_study(
         executor_of(study) as executor,
     ):
         context = Context(study, store, executor, listener)
-        kept = keep_corrections(study)
+        kept = keep_hand_labels(study)
         if kept is not None:
             context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
         known = Keys(study)
@@ -209,7 +210,9 @@ def run_experiment(study: Study, name: str, *, listener: Listener, **options: An
     RunError
         When another run holds the study, or the disk is full.
     """
-    experiment = find_experiment(name)
+    experiment = EXPERIMENTS[name]
+    if name in _FOLDERS:
+        raise InputError(f"results/{name} is not for an experiment", remedy="give it another name")
     chosen = options_of(experiment, options)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:

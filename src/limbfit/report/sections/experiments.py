@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from ...extensions import Registry
 from ..page import Note, Section
 from ..store import Json, Results
 from .cube import cube_section
@@ -15,7 +16,7 @@ from .validation import validation_section
 
 Maker = Callable[[Results, Json], Section]
 # By the name of the experiment; a maker is given the store and what ``<name>.json`` holds.
-MAKERS: dict[str, Maker] = {
+_OWN: dict[str, Maker] = {
     "uncertainty": uncertainty_section,
     "regions": regions_section,
     "cube": cube_section,
@@ -23,12 +24,13 @@ MAKERS: dict[str, Maker] = {
     "crossvalidate": validation_section,
     "design": design_section,
 }
+SECTIONS = Registry("report section", _OWN)
 
 
 def experiment_sections(store: Results) -> tuple[Section, ...]:
     """A section for each finished experiment, then one that names those that are stale."""
     done = store.experiments
-    sections = [make(store, done[name]) for name, make in MAKERS.items() if name in done]
+    sections = [SECTIONS[name](store, done[name]) for name in SECTIONS.names if name in done]
     if store.outdated:
         sections.append(Section("outdated", "Left out", tuple(map(_outdated, store.outdated))))
     return tuple(sections)

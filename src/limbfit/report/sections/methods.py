@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from ...laws import OGDEN
+from ...shapes import SHAPES
 from ..formats import fixed, friction, number, symbol, unit_of
 from ..page import Prose, Section
 from ..store import Json, Results
@@ -210,10 +211,9 @@ def _contact(store: Results) -> str:
     return _said(
         (
             "Nodes on bones and on the proximal cut are fixed. A rigid "
-            f"{indenter.get('shape')} indenter of {indenter.get('width_mm')} mm (edge radius "
-            f"{indenter.get('edge_radius_mm')} mm) starts where it just touches the skin and follows the "
-            f"recorded displacement along its axis; contact is {friction(indenter.get('friction'))}, by a "
-            f"penalty at the skin's quadrature points with {stiff}.",
+            f"{SHAPES[indenter['shape']].said(indenter)} starts where it just touches the skin and follows "
+            f"the recorded displacement along its axis; contact is {friction(indenter.get('friction'))}, by "
+            f"a penalty at the skin's quadrature points with {stiff}.",
             f"The largest penetration was {fixed(max(deepest), 3)} mm." if deepest else "",
         )
     )

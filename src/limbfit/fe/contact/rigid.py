@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Shape(Protocol):
+class RigidShape(Protocol):
     """A rigid shape with a frame of its own, in which it is asked for distances; mm."""
 
     @property
@@ -39,8 +39,8 @@ class Shape(Protocol):
     def signed_distance(self, points: Array) -> Array:
         """Distance (n,) of points (n, 3) of space; negative inside."""
 
-    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Shape:
+    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> RigidShape:
         """The shape, advanced along its axis by ``distance`` and ``across`` it."""
 
-    def placed(self, centre: Array, axis: Array, edge: Array) -> Shape:
+    def placed(self, centre: Array, axis: Array, edge: Array) -> RigidShape:
         """The shape with another frame."""

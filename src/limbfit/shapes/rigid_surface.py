@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...errors import ProblemError
+from ..errors import ProblemError
 from .closest_point import INSIDE, Tree, build_tree, closest_point
 from .triangles import beyond_edges, normal_spread, triangle_normals
 

@@ -26,7 +26,7 @@ def hand_labels(study: Study) -> Path | None:
     return _BY_HAND if study.path(_BY_HAND).is_file() else None
 
 
-def keep_corrections(study: Study) -> Path | None:
+def keep_hand_labels(study: Study) -> Path | None:
     """Copy a label map that was edited in place to where no stage writes; where to, if there was one."""
     if not _is_edited(study):
         return None

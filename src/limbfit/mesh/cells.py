@@ -1,0 +1,129 @@
+"""Cell types: nodes, shape functions, faces and quadrature of each, and its names elsewhere, as data.
+
+Local coordinates: tetrahedra and triangles on the unit simplex, hexahedra and quadrilaterals on [-1, 1]^d,
+nodes in VTK order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ShapeFunctions = Callable[[Array], tuple[Array, Array]]
+
+TET10_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
+TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # outward for positive volume
+TRI6_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
+
+
+@dataclass(frozen=True)
+class CellType:
+    """A kind of cell.
+
+    Parameters
+    ----------
+    name, vtk, meshio : limbfit's name, VTK's number, meshio's name.
+    nodes : (k, 3) local coordinates.
+    corners, face_corners : how many of a cell's, and of a face's, first nodes are corners.
+    faces : (f, j) nodes of each face, outward, corners first.
+    turned : (k,) the same cell with its corners the other way round.
+    shape : values (q, k) and derivatives (q, k, 3) at local coordinates (q, 3).
+    points, weights : (q, 3) and (q,), a rule that integrates the Jacobian exactly.
+    side : length of the local axes.
+    """
+
+    name: str
+    vtk: int
+    meshio: str
+    nodes: Array
+    corners: int
+    face_corners: int
+    faces: NDArray[np.int64]
+    turned: tuple[int, ...]
+    shape: ShapeFunctions
+    points: Array
+    weights: Array
+    side: float = 1.0
+
+    @property
+    def is_tetrahedron(self) -> bool:
+        return self.corners == 4
+
+
+def _simplex_gradients(d: int) -> Array:
+    return np.vstack([-np.ones(d), np.eye(d)])
+
+
+def _barycentric(x: Array) -> Array:
+    return np.column_stack([1.0 - x.sum(axis=1), x])
+
+
+def linear_simplex(x: Array) -> tuple[Array, Array]:
+    """Linear triangle (d = 2) or tetrahedron (d = 3)."""
+    L = _barycentric(x)
+    return L, np.broadcast_to(_simplex_gradients(x.shape[1]), (*L.shape, x.shape[1])).copy()
+
+
+def quadratic_simplex(x: Array) -> tuple[Array, Array]:
+    """Quadratic triangle (6 nodes) or tetrahedron (10 nodes)."""
+    L, dL = _barycentric(x), _simplex_gradients(x.shape[1])
+    edges = TRI6_EDGES if x.shape[1] == 2 else TET10_EDGES
+    i, j = edges[:, 0], edges[:, 1]
+    values = np.hstack([L * (2.0 * L - 1.0), 4.0 * L[:, i] * L[:, j]])
+    corner = (4.0 * L - 1.0)[:, :, None] * dL[None]
+    middle = 4.0 * (L[:, i, None] * dL[j][None] + L[:, j, None] * dL[i][None])
+    return values, np.concatenate([corner, middle], axis=1)
+
+
+def _tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
+    d = x.shape[1]
+    factors = 0.5 * (1.0 + x[:, None, :] * corners[None])
+    gradients = np.empty((len(x), len(corners), d))
+    for i in range(d):
+        others = np.delete(factors, i, axis=2).prod(axis=2)
+        gradients[:, :, i] = 0.5 * corners[None, :, i] * others
+    return factors.prod(axis=2), gradients
+
+
+QUAD_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
+HEX_CORNERS = np.vstack([np.column_stack([QUAD_CORNERS, np.full(4, z)]) for z in (-1.0, 1.0)])
+
+
+def linear_quadrilateral(x: Array) -> tuple[Array, Array]:
+    """Bilinear quadrilateral, 4 nodes."""
+    return _tensor_linear(x, QUAD_CORNERS)
+
+
+def linear_hexahedron(x: Array) -> tuple[Array, Array]:
+    """Trilinear hexahedron, 8 nodes."""
+    return _tensor_linear(x, HEX_CORNERS)
+
+
+_TET_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+_TET10_FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
+_HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+# Keast's five points; the Jacobian of a quadratic tetrahedron is cubic.
+_KEAST = np.vstack([np.full(3, 0.25), np.full((3, 3), 1 / 6) + np.eye(3) / 3, np.full(3, 1 / 6)])
+
+CELLS: dict[str, CellType] = {
+    cell.name: cell
+    for cell in (
+        CellType(
+            "tet4", 10, "tetra", _TET_NODES, 4, 3, TET_FACES, (0, 2, 1, 3),
+            linear_simplex, np.full((1, 3), 0.25), np.array([1 / 6]),
+        ),
+        CellType(
+            "tet10", 24, "tetra10", np.vstack([_TET_NODES, _TET_NODES[TET10_EDGES].mean(axis=1)]), 4, 3,
+            _TET10_FACES, (0, 2, 1, 3, 6, 5, 4, 7, 9, 8),
+            quadratic_simplex, _KEAST, np.array([-0.8, 0.45, 0.45, 0.45, 0.45]) / 6,
+        ),
+        CellType(
+            "hex8", 12, "hexahedron", HEX_CORNERS, 8, 4, _HEX_FACES, (4, 5, 6, 7, 0, 1, 2, 3),
+            linear_hexahedron, HEX_CORNERS / np.sqrt(3.0), np.ones(8), side=2.0,
+        ),
+    )
+}  # fmt: skip

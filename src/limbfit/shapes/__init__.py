@@ -1,0 +1,55 @@
+"""Indenter shapes by name: what a study may ask for in ``indenter.shape``.
+
+One class says everything of a shape.  One of one's own is registered by `register_shape`; see
+docs/extending.md.
+"""
+
+from __future__ import annotations
+
+from ..errors import InputError
+from ..extensions import Registry
+from .cylinder import Cylinder
+from .facets import Facets, revolved, steps
+from .revolution import Revolution
+from .rigid_surface import RigidSurface
+from .shape import SHARP_EDGE, Measure, Shape, Size
+from .sphere import Sphere
+from .square import Square
+from .stl import Stl
+
+OWN: tuple[type[Shape], ...] = (Square, Sphere, Cylinder, Stl)
+SHAPES: Registry[type[Shape]] = Registry("indenter shape", {shape.name: shape for shape in OWN})
+# Keys of a study's [indenter], which measures cannot have.
+TAKEN = ("shape", "file", "width_mm", "edge_radius_mm", "friction")
+
+__all__ = [
+    "OWN",
+    "SHAPES",
+    "SHARP_EDGE",
+    "TAKEN",
+    "Facets",
+    "Measure",
+    "Revolution",
+    "RigidSurface",
+    "Shape",
+    "Size",
+    "register_shape",
+    "revolved",
+    "steps",
+]
+
+
+def register_shape(shape: type[Shape]) -> None:
+    """Make a shape known by its name, in the file that a study names in ``study.extensions``.
+
+    Raises
+    ------
+    InputError
+        Where the name is taken, or a measure is not within its bounds or has the name of another key.
+    """
+    for measure in shape.measures:
+        if measure.key in TAKEN:
+            raise InputError(f"{measure.key} is a key of every shape", place=shape.name, remedy="rename it")
+        if not measure.lower <= measure.value <= measure.upper:
+            raise InputError(f"{measure.key} needs lower <= value <= upper", place=shape.name)
+    SHAPES.add(shape.name, shape)

@@ -1,0 +1,174 @@
+"""What an indenter's shape says of itself: its distance, its facets, its section and its words.
+
+The frame of a shape: origin at the middle of its foremost face, z along the axis into the tissue, x along the
+edge; the body lies at ``z <= 0``.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from .facets import Facets
+from .rigid_surface import RigidSurface
+
+Array = NDArray[np.float64]
+Distance = tuple[Array, Array, Array]
+
+# No mesh resolves the singularity of a sharp edge; this rounding over the width stands for it.
+SHARP_EDGE = 0.01
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number that a shape has beside its width and the rounding of its edges.
+
+    Parameters
+    ----------
+    key : its name with its unit, such as ``taper_deg``: a field of the shape and a key of a study's
+        ``[indenter]``.
+    value, lower, upper : what it is where nothing is given, and its bounds.
+    words : what reports call it.
+    """
+
+    key: str
+    value: float
+    lower: float
+    upper: float
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Size:
+    """What is asked of a shape: ``width`` and ``edge_radius`` in mm, its measures by key, its surface, and
+    the rounding over the width that stands for a ``sharp`` edge."""
+
+    width: float
+    edge_radius: float = 0.0
+    measures: Mapping[str, float] | None = None
+    surface: RigidSurface | None = None
+    sharp: float = SHARP_EDGE
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.width) and self.width > 0):
+            raise ProblemError(f"indenter width {self.width} mm is not positive")
+        if not 0 < self.sharp <= SHARP_EDGE:
+            raise ProblemError(
+                f"a sharp edge of {self.sharp} of the width is not above 0 and up to {SHARP_EDGE}"
+            )
+        if not 0 <= self.edge_radius <= self.width / 2:
+            raise ProblemError(f"edge radius {self.edge_radius} mm does not fit a width of {self.width} mm")
+
+    @property
+    def least_radius(self) -> float:
+        """The rounding of an edge that is called sharp, mm."""
+        return self.sharp * self.width
+
+    @property
+    def radius(self) -> float:
+        """The rounding that edges get, mm."""
+        return max(self.edge_radius, self.least_radius)
+
+
+@dataclass(frozen=True)
+class Shape(ABC):
+    """A body of one size; its class is what `limbfit.register_shape` takes.
+
+    Fields beyond the two below are the shape's measures (`Measure`), by their keys.
+
+    Parameters
+    ----------
+    width : edge length or diameter, mm, rounding included.
+    radius : rounding of its edges, mm.
+    """
+
+    width: float
+    radius: float
+
+    name: ClassVar[str]  # what a study says in ``indenter.shape``
+    words: ClassVar[str]  # what it is called in prose, such as "square indenter"
+    measures: ClassVar[tuple[Measure, ...]] = ()
+    has_edge: ClassVar[bool] = True  # an edge radius can be given
+    is_edge_doubted: ClassVar[bool] = False  # how round the edges are is a source of uncertainty
+    is_round: ClassVar[bool] = False  # a turn about the axis changes nothing
+    needs_file: ClassVar[bool] = False  # its surface is a file
+    variants: ClassVar[Mapping[str, float]] = {}  # edge radius over width of those that studies compare with
+
+    @classmethod
+    def of(cls, size: Size) -> Self:
+        """The shape of a size.
+
+        Raises
+        ------
+        ProblemError
+            Where it cannot be of that size.
+        """
+        if size.surface is not None:
+            raise ProblemError(f"an indenter of shape {cls.name!r} has no surface")
+        return cls(size.width, size.radius, **cls.measured(size.measures or {}))
+
+    @classmethod
+    def measured(cls, given: Mapping[str, float]) -> dict[str, float]:
+        """Its measures by key; what is not given has its usual value.
+
+        Raises
+        ------
+        ProblemError
+            For one that it does not have, or beyond its bounds.
+        """
+        unknown = sorted(given.keys() - {measure.key for measure in cls.measures})
+        if unknown:
+            known = ", ".join(measure.key for measure in cls.measures) or "none"
+            raise ProblemError(
+                f"an indenter of shape {cls.name!r} has no {unknown[0]}", remedy=f"its own measures: {known}"
+            )
+        values = {measure.key: float(given.get(measure.key, measure.value)) for measure in cls.measures}
+        for measure in cls.measures:
+            if not measure.lower <= values[measure.key] <= measure.upper:
+                raise ProblemError(
+                    f"{measure.key} = {values[measure.key]:g} of an indenter of shape {cls.name!r} is not "
+                    f"between {measure.lower:g} and {measure.upper:g}"
+                )
+        return values
+
+    @classmethod
+    def said(cls, settings: Mapping[str, Any]) -> str:
+        """The ``[indenter]`` of a study in words."""
+        edge = f"edge radius {settings.get('edge_radius_mm')} mm"
+        own = [f"{measure.words or measure.key} {settings.get(measure.key)}" for measure in cls.measures]
+        inside = ", ".join([edge] * cls.has_edge + own)
+        return f"{cls.words} of {settings.get('width_mm')} mm" + (f" ({inside})" if inside else "")
+
+    @abstractmethod
+    def distance(self, points: Array) -> Distance:
+        """Signed distance (n,), mm, gradient (n, 3) and hessian (n, 3, 3) at points (n, 3) of its frame.
+
+        Negative inside.  Deeper than the rounding the way out should be through the foremost face: a point
+        that a large step left inside must go back to where it came from, not sideways.
+        """
+
+    @abstractmethod
+    def facets(self) -> Facets:
+        """Its front, or all of it, as a mesh: what other programs are given."""
+
+    @property
+    def reach(self) -> float:
+        """How far from the axis, along x or y, tissue may touch it, mm."""
+        return 0.9 * self.width
+
+    @property
+    def length(self) -> float:
+        """From the foremost point to the far end, mm; the width for shapes without one."""
+        return self.width
+
+    @property
+    def section(self) -> float:
+        """Area of the section that pushes, mm^2."""
+        return np.pi / 4.0 * self.width**2 if self.is_round else self.width**2
