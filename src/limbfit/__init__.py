@@ -47,6 +47,7 @@ _HOME = {
     "Progress": "pipeline",
     "Mesh": "mesh",
     "read_vtu": "mesh",
+    "to_tet10": "mesh",
     "write_vtu": "mesh",
     "History": "fe",
     "Indenter": "fe",

@@ -27,7 +27,7 @@ TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # outward fo
 TRI6_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mesh:
     """An immutable volume mesh; see the module docstring for the arrays."""
 
@@ -48,6 +48,11 @@ class Mesh:
             raise ProblemError(f"{self.cell_type} cells have shape {self.cells.shape}")
         if len(self.regions) != len(self.cells):
             raise ProblemError(f"{len(self.regions)} region indices for {len(self.cells)} cells")
+
+    def __repr__(self) -> str:
+        numbers = np.bincount(self.regions, minlength=len(self.region_names))
+        tissues = ", ".join(f"{name} {count}" for name, count in zip(self.region_names, numbers))
+        return f"<Mesh: {self.cell_type} ({tissues}), {len(self.points)} nodes, {_extent(self.points)}>"
 
     @property
     def corners(self) -> NDArray[np.int64]:
