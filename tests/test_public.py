@@ -27,8 +27,11 @@ def test_unknown_name_is_an_attribute_error():
 
 
 def test_version_is_that_of_the_project():
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text())
     assert limbfit.__version__ == project["project"]["version"]
+    assert f"\nversion: {limbfit.__version__}\n" in (root / "CITATION.cff").read_text()
+    assert f"\n## [{limbfit.__version__}] - " in (root / "CHANGELOG.md").read_text()
 
 
 def test_the_solver_loads_without_images_and_pictures():
