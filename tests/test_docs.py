@@ -22,7 +22,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "CHANGELOG.md",
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
 ]
 
 
@@ -103,9 +103,18 @@ def test_the_page_of_commands_is_what_they_say() -> None:
 
 
 def test_every_page_is_in_the_site() -> None:
-    parts = ("index", "tutorials", "howto", "explanation", "reference")
-    listed = [line for part in parts for line in (ROOT / "docs" / f"{part}.md").read_text().splitlines()]
-    assert {page.stem for page in (ROOT / "docs").glob("*.md")} - {"index"} <= set(listed)
+    docs, parts = ROOT / "docs", ("index", "tutorials", "howto", "explanation", "reference")
+    listed = [line for part in parts for line in (docs / f"{part}.md").read_text().splitlines()]
+    pages = {str(page.relative_to(docs).with_suffix("")) for page in docs.rglob("*.md")}
+    assert pages - {"index"} <= set(listed)
+
+
+@pytest.mark.parametrize("part", ["tutorials", "howto", "explanation", "reference"])
+def test_a_part_says_what_each_of_its_pages_is_for(part: str) -> None:
+    text = (ROOT / "docs" / f"{part}.md").read_text(encoding="utf-8")
+    landing, _, listed = text.partition("```{toctree}")
+    for page in re.findall(r"^[\w/-]+$", listed, re.MULTILINE):
+        assert re.search(rf"\]\({page}\.md\)(:| \| | and |.*\|)", landing), page
 
 
 def test_every_public_name_is_in_the_reference() -> None:

@@ -21,14 +21,24 @@ def test_all_public_names_exist():
     assert set(limbfit.__all__) <= set(dir(limbfit))
 
 
+def test_type_checkers_see_every_public_name_at_its_home():
+    """A home that finds its names lazily has no types; `Any` would pass every check of a user."""
+    for name, home in limbfit._HOME.items():
+        source = find_spec(f"limbfit.{home}").origin
+        assert "__getattr__" not in Path(source).read_text(encoding="utf-8"), f"{name} from {home}"
+
+
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         limbfit.nonsense  # noqa: B018
 
 
 def test_version_is_that_of_the_project():
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text())
     assert limbfit.__version__ == project["project"]["version"]
+    assert f"\nversion: {limbfit.__version__}\n" in (root / "CITATION.cff").read_text()
+    assert f"\n## [{limbfit.__version__}] - " in (root / "CHANGELOG.md").read_text()
 
 
 def test_the_solver_loads_without_images_and_pictures():

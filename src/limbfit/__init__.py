@@ -29,79 +29,22 @@ Everything the command line does is one call away:
 ========================  =========================================================
 
 Names are loaded when first used, so that a worker process that only solves does not load images and graphics.
+`__init__.pyi` says where they live.
 """
 
+import ast
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from ._version import __version__
 
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
 _HOME = {
-    "LimbfitError": "errors",
-    "InputError": "errors",
-    "Parameter": "laws",
-    "TissueLaw": "laws",
-    "register_law": "laws",
-    "Measure": "shapes",
-    "Shape": "shapes",
-    "register_shape": "shapes",
-    "register_image_format": "anatomy.images.formats",
-    "STAGE_NAMES": "pipeline",
-    "Experiment": "pipeline.experiments.catalogue",
-    "register_experiment": "pipeline.experiments.catalogue",
-    "Study": "study",
-    "load_study": "study",
-    "Progress": "pipeline",
-    "Mesh": "mesh",
-    "read_vtu": "mesh",
-    "write_vtu": "mesh",
-    "History": "fe",
-    "Indenter": "fe",
-    "MooneyRivlin": "fe",
-    "Motion": "fe",
-    "NeoHookean": "fe",
-    "Ogden": "fe",
-    "OgdenQLV": "fe",
-    "OpenSurface": "fe",
-    "Pressure": "fe",
-    "Problem": "fe",
-    "RigidBody": "fe",
-    "RigidSurface": "fe",
-    "StepControl": "fe",
-    "Support": "fe",
-    "Fit": "notebook",
-    "Solution": "notebook",
-    "calibrate": "notebook",
-    "solve": "notebook",
-    "acquire_site": "pipeline",
-    "judge_recording": "pipeline",
-    "serve_fitsocket": "pipeline",
-    "virtual_fitsocket": "pipeline",
-    "waiting_sites": "pipeline",
-    "bench_calibrate": "pipeline",
-    "bench_febio_parity": "bench",
-    "bench_forward": "bench",
-    "bench_meshing": "bench",
-    "bench_scaling": "bench",
-    "check_study": "pipeline",
-    "describe_series": "anatomy.imaging",
-    "compare_site": "pipeline",
-    "compress_cube": "pipeline",
-    "design_study": "pipeline",
-    "diagnose": "pipeline",
-    "export_study": "pipeline",
-    "make_phantom_study": "pipeline",
-    "report_study": "pipeline",
-    "reproduce_study": "pipeline",
-    "run_batch": "pipeline",
-    "run_demo": "pipeline",
-    "run_experiment": "pipeline",
-    "run_study": "pipeline",
-    "serve_studio": "studio",
-    "show_stage": "pipeline",
-    "simulate_feb": "pipeline",
-    "simulate_site": "pipeline",
-    "study_status": "pipeline",
+    name.name: node.module
+    for node in _STUB.body
+    if isinstance(node, ast.ImportFrom) and node.module != "_version"
+    for name in node.names
 }
 __all__ = ["__version__", *_HOME]
 

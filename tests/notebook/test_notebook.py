@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,6 +17,7 @@ import limbfit
 from limbfit import History, Indenter, Mesh, OgdenQLV, Problem, StepControl
 from limbfit.errors import ProblemError
 from limbfit.fe import solve
+from limbfit.febio import write_feb
 from limbfit.mesh import cell_volumes, to_tet10
 
 TISSUE = OgdenQLV(c=0.005, m=4.0, gamma=1.0, tau=0.6)
@@ -53,6 +55,8 @@ def test_a_pyvista_grid_becomes_a_mesh_with_its_tissues():
     assert mesh.region_names == ("muscle", "skin")
     assert cell_volumes(mesh).sum() == pytest.approx(30 * 30 * 12)
     assert cell_volumes(mesh)[mesh.regions == 1].sum() == pytest.approx(30 * 30 * 4)
+    extent = "x -15 to 15 mm, y -15 to 15 mm, z -12 to 0 mm"
+    assert repr(mesh) == f"<Mesh: hex8 (muscle 32, skin 16), 100 nodes, {extent}>"
 
 
 def test_surfaces_beside_the_cells_and_points_of_no_cell_are_left_out():
@@ -189,6 +193,25 @@ def test_creep_under_a_force_tells_the_tissue(solution):
 def test_a_fit_that_cannot_be_meant_is_refused(solution, start, bounds, times, text):
     with pytest.raises(ProblemError, match=text):
         limbfit.calibrate(solution.problem, (times, [0.0, 1.0]), start, bounds)
+
+
+def test_a_tissue_without_material_is_named_before_anything_is_solved(solution):
+    bare = replace(solution.problem, materials={"skin": TISSUE})
+    for refused in (lambda: limbfit.solve(bare), lambda: limbfit.calibrate(bare, ([0, 1], [0, 1]), {})):
+        with pytest.raises(
+            ProblemError, match="'muscle' has no material; name it in materials; there are: skin"
+        ):
+            refused()
+
+
+def test_verbs_are_quiet_unless_told_otherwise(tmp_path, capsys):
+    """And ``listener=print`` shows lines that read."""
+    file = tmp_path / "block.feb"
+    write_feb(problem_of(Mesh.from_pyvista(block().triangulate())), file)
+    limbfit.simulate_feb(file, tmp_path)
+    assert capsys.readouterr().out == ""
+    limbfit.simulate_feb(str(file), tmp_path, listener=print)
+    assert re.search(r"^febio [\d.]+ of 4: block.feb: [\d.e-]+ N$", capsys.readouterr().out, re.MULTILINE)
 
 
 @pytest.mark.parametrize("warm", [False, True])

@@ -247,7 +247,10 @@ def _check_choices(problem: Problem) -> None:
         raise ProblemError(f"no element {name!r} for {mesh.cell_type} cells", remedy=f"use one of {fitting}")
     missing = [region for region in mesh.region_names if region not in problem.materials]
     if missing:
-        raise ProblemError(f"region {missing[0]!r} has no material")
+        given = ", ".join(problem.materials) or "none"
+        raise ProblemError(
+            f"region {missing[0]!r} has no material", remedy=f"name it in materials; there are: {given}"
+        )
     if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
         raise ProblemError("the mesh has region indices without a name")
     if problem.contact_rule not in ELEMENTS[name].face_rules:

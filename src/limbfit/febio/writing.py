@@ -50,7 +50,7 @@ class FebSettings:
     title: str = ""
 
 
-def write_feb(problem: Problem, path: str | Path, settings: FebSettings) -> Tool:
+def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> Tool:
     """Write an indentation as FEBio input; returns the indenter's rigid mesh.
 
     Raises
@@ -62,6 +62,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings) -> Tool
         Where the file cannot be written.
     """
     check_exportable(problem, "FEBio")
+    settings = settings or FebSettings()
     system = System(problem)
     assert system.indenter is not None
     tool = tool_mesh(system.indenter)

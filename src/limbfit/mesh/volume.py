@@ -22,7 +22,7 @@ from ..errors import ProblemError
 from .cells import CELLS, TET10_EDGES, TRI6_EDGES, CellType
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mesh:
     """An immutable volume mesh; see the module docstring for the arrays."""
 
@@ -43,6 +43,11 @@ class Mesh:
             raise ProblemError(f"{self.cell_type} cells have shape {self.cells.shape}")
         if len(self.regions) != len(self.cells):
             raise ProblemError(f"{len(self.regions)} region indices for {len(self.cells)} cells")
+
+    def __repr__(self) -> str:
+        numbers = np.bincount(self.regions, minlength=len(self.region_names))
+        tissues = ", ".join(f"{name} {count}" for name, count in zip(self.region_names, numbers))
+        return f"<Mesh: {self.cell_type} ({tissues}), {len(self.points)} nodes, {_extent(self.points)}>"
 
     @property
     def kind(self) -> CellType:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ProblemError
 from ..fe import Material, Problem, StepControl, System
 from ..fe import solve as simulate
+from ..fe.problem import check
 from ..identify import (
     CalibrationSettings,
     Measured,
@@ -218,6 +219,8 @@ def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple
 def _unknowns(
     problems: Sequence[Problem], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> Unknowns:
+    for problem in problems:
+        check(problem)
     known = {f"{r}.{p}": one.materials[r] for one in problems for r, p in one.parameter_names}
     for name in (*start, *bounds):
         if name not in known:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import pyvista as pv
+from matplotlib import pyplot
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..errors import ProblemError
 from ..fe import Problem, Result, State, Step, StepControl, System
@@ -105,8 +105,9 @@ def solve(
 
 
 def new_axes() -> Axes:
-    """Axes on a figure of their own, which no window shows by itself."""
-    return Figure(figsize=(5, 4), layout="constrained").subplots()
+    """Axes on a new figure of pyplot: a notebook shows it, ``pyplot.show()`` does so in a script."""
+    _, axes = pyplot.subplots(figsize=(5, 4), layout="constrained")
+    return axes
 
 
 def announce_compilation() -> None:

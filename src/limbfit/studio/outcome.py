@@ -176,5 +176,5 @@ def write_feb_of(folder: StudyFolder, site: str) -> dict[str, str]:
     states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
     if states.get("mesh") != "done":
         raise RunError("the meshes are not up to date; run the study until mesh first")
-    export_study(study, "feb", site=name, listener=lambda event: None)
+    export_study(study, "feb", site=name)
     return {"path": f"export/{name}.feb"}

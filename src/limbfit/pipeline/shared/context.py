@@ -25,8 +25,17 @@ class Progress:
     fit: bool = False
     facts: Mapping[str, Any] | None = None
 
+    def __str__(self) -> str:
+        """One line, as ``listener=print`` shows it."""
+        count = f" {self.done:g} of {self.total:g}" if self.total else ""
+        return f"{self.stage}{count}: {self.text}" if self.text else f"{self.stage}{count}"
+
 
 Listener = Callable[[Progress], None]
+
+
+def quiet(progress: Progress) -> None:
+    """The listener of a call that names none: progress is not shown."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...bench.forward import FEBIO_SECONDS
 from ...study import Study, load_study
-from ..shared.context import Listener
+from ..shared.context import Listener, quiet
 from ..shared.simulations import SimulationCache
 from ..shared.store import Store
 from .demo import make_phantom_study
@@ -19,7 +19,7 @@ FEBIO_CASE, FEBIO_ITERATIONS = "residuum/posterior_tet10", 10
 _AFRESH = ("calibrate", "predict", "report")
 
 
-def bench_calibrate(folder: Path | None = None, *, listener: Listener) -> dict[str, Any]:
+def bench_calibrate(folder: Path | None = None, *, listener: Listener = quiet) -> dict[str, Any]:
     """Identify a study afresh, in a copy of it, and time the stages after meshing.
 
     Parameters

@@ -10,7 +10,7 @@ from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...indentation import read_indenter
 from ...study import Study
-from ..shared.context import Listener, Progress
+from ..shared.context import Listener, Progress, quiet
 from ..shared.store import Store
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
@@ -20,7 +20,7 @@ from ..stages.traces import read_site_trace
 from .run import keys
 
 
-def check_study(study: Study, *, listener: Listener) -> dict[str, Any]:
+def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     """Facts about a study's inputs; raises at the first that cannot be used.
 
     Returns

@@ -27,7 +27,7 @@ from ...febio import (
 )
 from ...indentation import Parameters, first_steps
 from ...study import Study
-from ..shared.context import Listener
+from ..shared.context import Listener, quiet
 from ..shared.store import write_json
 from ..stages.traces import write_curves
 from .simulate import Indentation, feb_settings, prepare_site, run_febio_site, site_problem
@@ -42,7 +42,7 @@ def compare_site(
     *,
     parameters: Parameters | None = None,
     febio_log: str | Path | None = None,
-    listener: Listener,
+    listener: Listener = quiet,
 ) -> dict[str, Any]:
     """Solve a site by limbfit and by FEBio; JSON, CSV and a picture go to ``results/compare``.
 

@@ -9,18 +9,24 @@ from ...errors import InputError
 from ...execution import make_executor
 from ...phantom.build import make_phantom
 from ...study import load_study
-from ..shared.context import Listener, Progress
+from ..shared.context import Listener, Progress, quiet
 from ..shared.store import read_json
 from .run import run_study
 
 
 def make_phantom_study(
-    folder: Path, *, detail: str, seed: int, fat: bool = False, listener: Listener, workers: int = 0
+    folder: str | Path,
+    *,
+    detail: str = "coarse",
+    seed: int = 0,
+    fat: bool = False,
+    listener: Listener = quiet,
+    workers: int = 0,
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
     with make_executor(workers) as executor:
         return make_phantom(
-            folder,
+            Path(folder),
             detail=detail,
             seed=seed,
             fat=fat,
@@ -29,7 +35,7 @@ def make_phantom_study(
         )
 
 
-def run_demo(folder: Path, *, seed: int, listener: Listener) -> dict[str, Any]:
+def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = quiet) -> dict[str, Any]:
     """A coarse synthetic patient identified from its DICOM images and records; goes on where it was stopped.
 
     Returns
@@ -42,6 +48,7 @@ def run_demo(folder: Path, *, seed: int, listener: Listener) -> dict[str, Any]:
     InputError
         When ``folder`` holds something else, or the demo of another seed.
     """
+    folder = Path(folder)
     truth_file = folder / "truth.json"
     if not truth_file.is_file():
         make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)

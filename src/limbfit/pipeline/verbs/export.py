@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...febio import Range, differences, in_indenter_frame, write_feb, write_inp, write_optimisation
 from ...indentation import Parameters
 from ...study import Site, Study
-from ..shared.context import Listener
+from ..shared.context import Listener, quiet
 from ..stages.traces import site_record
 from .simulate import Indentation, feb_settings, prepare_site, site_problem
 
@@ -25,7 +25,7 @@ def export_study(
     site: str | None = None,
     output: str | Path | None = None,
     parameters: Parameters | None = None,
-    listener: Listener,
+    listener: Listener = quiet,
 ) -> dict[str, Any]:
     """Write one site, or all of them, for another solver; meshes are made where missing.
 

@@ -8,11 +8,11 @@ from typing import Any
 from ...fe import Step
 from ...febio import run_feb
 from ...fields import write_fields
-from ..shared.context import Listener, Progress
+from ..shared.context import Listener, Progress, quiet
 
 
 def simulate_feb(
-    file: str | Path, output: str | Path | None = None, *, threads: int = 1, listener: Listener
+    file: str | Path, output: str | Path | None = None, *, threads: int = 1, listener: Listener = quiet
 ) -> dict[str, Any]:
     """Solve a FEBio 3 or 4 input; the tables that it asks for go to ``output``, by default beside it.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...indentation import Parameters
 from ...study import Study
-from ..shared.context import Listener
+from ..shared.context import Listener, quiet
 from ..shared.store import Store
 from .run import run_experiment
 from .simulate import known_parameters
@@ -24,7 +24,7 @@ def design_study(
     sites: int = 0,
     depths_mm: Sequence[float] = (),
     parameters: Parameters | None = None,
-    listener: Listener,
+    listener: Listener = quiet,
 ) -> dict[str, Any]:
     """The best choice of sites and depths at known parameters, beside the study's own choice.
 

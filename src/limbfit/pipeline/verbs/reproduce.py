@@ -13,7 +13,7 @@ import numpy as np
 from ..._version import __version__
 from ...errors import InputError
 from ...study import Study, load_study
-from ..shared.context import Listener
+from ..shared.context import Listener, quiet
 from ..shared.hand_labels import hand_labels
 from ..shared.provenance import input_digests, settings_record, versions
 from ..shared.store import Store, read_json
@@ -25,7 +25,7 @@ RECORD = "run.json"
 
 
 def reproduce_study(
-    record: Path, folder: Path, *, tolerance: float = TOLERANCE, listener: Listener
+    record: str | Path, folder: str | Path, *, tolerance: float = TOLERANCE, listener: Listener = quiet
 ) -> dict[str, Any]:
     """Copy the inputs of a study to a new folder, run it there, and compare.
 
@@ -47,6 +47,7 @@ def reproduce_study(
     InputError
         Where the record is not one, or the study's inputs or settings are no longer those of the record.
     """
+    record, folder = Path(record), Path(folder)
     file = record if record.name == RECORD else load_study(record).results / RECORD
     known = _read(file)
     study = load_study(file.parent.parent)

@@ -16,7 +16,7 @@ from ..experiments.catalogue import (
     options_of,
 )
 from ..shared.causes import causes, parts_of
-from ..shared.context import Context, Listener, executor_of
+from ..shared.context import Context, Listener, executor_of, quiet
 from ..shared.hand_labels import keep_hand_labels
 from ..shared.keys import Keys, Stage
 from ..shared.provenance import input_digests, machine, settings_record, versions
@@ -130,7 +130,7 @@ def run_study(
     until: str | None = None,
     start: str | None = None,
     force: Sequence[str] = (),
-    listener: Listener,
+    listener: Listener = quiet,
 ) -> dict[str, Any]:
     """Do every stage that is not done, in order; return the summary of the study.
 
@@ -186,7 +186,7 @@ def _anew(study: Study, until: str | None, start: str | None, force: Sequence[st
     return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
-def run_experiment(study: Study, name: str, *, listener: Listener, **options: Any) -> dict[str, Any]:
+def run_experiment(study: Study, name: str, *, listener: Listener = quiet, **options: Any) -> dict[str, Any]:
     """Do an experiment of a study, and before it every stage that it needs and that is not done.
 
     Its results lie in ``results/<name>``; ``limbfit report`` shows them.
@@ -267,7 +267,7 @@ def run_record(study: Study) -> dict[str, Any]:
     }
 
 
-def report_study(study: Study, *, listener: Listener) -> dict[str, Any]:
+def report_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     """Make the report anew from what is stored, stale or not; nothing is solved."""
     store = Store(study.results)
     with lock(study.results), executor_of(study) as executor:

@@ -13,14 +13,14 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...errors import InputError
 from ...report.drawing.stage_pictures import draw_stage
 from ...study import Study
-from ..shared.context import Listener, Progress, executor_of
+from ..shared.context import Listener, Progress, executor_of, quiet
 from ..shared.store import Store, lock
 from .run import run_study
 
 SHOWN = ("segment", "surfaces", "sites", "mesh")
 
 
-def show_stage(study: Study, stage: str, *, listener: Listener) -> dict[str, Any]:
+def show_stage(study: Study, stage: str, *, listener: Listener = quiet) -> dict[str, Any]:
     """Run a study until a stage of the geometry, and say what came of it.
 
     Parameters

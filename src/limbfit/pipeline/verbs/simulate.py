@@ -13,7 +13,7 @@ from ...febio import FebSettings, find_febio, result_of_log, run_febio, write_fe
 from ...indentation import Parameters, SiteModel, build_problem, first_steps, simulate_fields
 from ...mesh import read_vtu
 from ...study import Site, Study
-from ..shared.context import Context, Listener
+from ..shared.context import Context, Listener, quiet
 from ..shared.simulations import CURVE_POINTS, planned_model, recorded_model
 from ..shared.store import Store, write_json
 from ..stages.traces import write_curves
@@ -34,7 +34,7 @@ class Indentation:
 
 
 def prepare_site(
-    study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener
+    study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = quiet
 ) -> Indentation:
     """A site as recorded, or as the study plans it; meshes are made where missing.
 
@@ -64,7 +64,7 @@ def simulate_site(
     parameters: Parameters | None = None,
     animation: bool = False,
     solver: str | None = None,
-    listener: Listener,
+    listener: Listener = quiet,
 ) -> dict[str, Any]:
     """Simulate one indentation (see `prepare_site`).
 

@@ -1,0 +1,91 @@
+"""The public names and where they live: `__init__.py` finds them by this file, type checkers their types."""
+
+from ._version import __version__ as __version__
+from .anatomy.imaging import describe_series as describe_series
+from .anatomy.images.formats import register_image_format as register_image_format
+from .bench.forward import bench_forward as bench_forward
+from .bench.meshing import bench_meshing as bench_meshing
+from .bench.parity import bench_febio_parity as bench_febio_parity
+from .bench.scaling import bench_scaling as bench_scaling
+from .errors import (
+    InputError as InputError,
+    LimbfitError as LimbfitError,
+)
+from .fe import (
+    History as History,
+    Indenter as Indenter,
+    MooneyRivlin as MooneyRivlin,
+    Motion as Motion,
+    NeoHookean as NeoHookean,
+    Ogden as Ogden,
+    OgdenQLV as OgdenQLV,
+    OpenSurface as OpenSurface,
+    Pressure as Pressure,
+    Problem as Problem,
+    RigidBody as RigidBody,
+    RigidSurface as RigidSurface,
+    StepControl as StepControl,
+    Support as Support,
+)
+from .laws import (
+    Parameter as Parameter,
+    TissueLaw as TissueLaw,
+    register_law as register_law,
+)
+from .mesh import (
+    Mesh as Mesh,
+    read_vtu as read_vtu,
+    to_tet10 as to_tet10,
+    write_vtu as write_vtu,
+)
+from .notebook import (
+    Fit as Fit,
+    Solution as Solution,
+    calibrate as calibrate,
+    solve as solve,
+)
+from .pipeline.experiments.catalogue import (
+    Experiment as Experiment,
+    register_experiment as register_experiment,
+)
+from .pipeline.experiments.cube import compress_cube as compress_cube
+from .pipeline.shared.context import Progress as Progress
+from .pipeline.verbs.acquire import (
+    acquire_site as acquire_site,
+    judge_recording as judge_recording,
+    serve_fitsocket as serve_fitsocket,
+    virtual_fitsocket as virtual_fitsocket,
+    waiting_sites as waiting_sites,
+)
+from .pipeline.verbs.batch import run_batch as run_batch
+from .pipeline.verbs.calibration_bench import bench_calibrate as bench_calibrate
+from .pipeline.verbs.check import check_study as check_study
+from .pipeline.verbs.compare import compare_site as compare_site
+from .pipeline.verbs.demo import (
+    make_phantom_study as make_phantom_study,
+    run_demo as run_demo,
+)
+from .pipeline.verbs.doctor import diagnose as diagnose
+from .pipeline.verbs.export import export_study as export_study
+from .pipeline.verbs.febfile import simulate_feb as simulate_feb
+from .pipeline.verbs.planning import design_study as design_study
+from .pipeline.verbs.reproduce import reproduce_study as reproduce_study
+from .pipeline.verbs.run import (
+    STAGE_NAMES as STAGE_NAMES,
+    report_study as report_study,
+    run_experiment as run_experiment,
+    run_study as run_study,
+    study_status as study_status,
+)
+from .pipeline.verbs.show import show_stage as show_stage
+from .pipeline.verbs.simulate import simulate_site as simulate_site
+from .shapes import (
+    Measure as Measure,
+    Shape as Shape,
+    register_shape as register_shape,
+)
+from .studio import serve_studio as serve_studio
+from .study import (
+    Study as Study,
+    load_study as load_study,
+)
