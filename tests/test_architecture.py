@@ -21,7 +21,7 @@ FLOORS = [
     {"indentation", "notebook"},
     {"study", "febio", "fields", "acquire"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
-    {"mesh", "phases", "autoregressive", "laws"},
+    {"mesh", "phases", "autoregressive", "laws", "priors"},
     {"extensions"},
     {"errors", "_version"},
 ]
