@@ -21,7 +21,7 @@ FLOORS = [
     {"indentation", "notebook"},
     {"study", "febio", "fields", "acquire"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
-    {"mesh", "phases", "autoregressive", "laws", "shapes"},
+    {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},
     {"extensions"},
     {"errors", "_version"},
 ]

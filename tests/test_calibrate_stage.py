@@ -12,13 +12,14 @@ import pytest
 
 from layered import store_blocks
 from limbfit.errors import StudyError
-from limbfit.execution import SerialExecutor
+from limbfit.execution import Limits, SerialExecutor, make_executor
 from limbfit.indentation import to_vector
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import groupings
 from limbfit.pipeline.stages.predict import run_predict
+from limbfit.priors import SOURCE
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "muscle")
@@ -186,6 +187,29 @@ def test_several_starts_constraints_and_weights_of_a_study(blocks, tmp_path):
     assert values["skin"]["m"] == 3.0
     assert values["skin"]["tau_s"] == values["muscle"]["tau_s"]
     assert values["skin"]["c_kPa"] == pytest.approx(9.0, rel=0.4)
+
+
+@pytest.mark.slow
+def test_priors_of_people_count_and_are_stored_with_their_shares(blocks, tmp_path):
+    """By processes as in this one: priors act where simulations are asked for, not where they are made."""
+    _, store, plain = blocks
+    study = write_study(tmp_path, COARSE_MESHES + '[calibration]\npriors = "population"\n')
+    for name in BLOCKS:
+        (tmp_path / f"{name}.csv").write_bytes((store.folder.parent / f"{name}.csv").read_bytes())
+    with make_executor(2, Limits()) as executor:
+        found = calibrated(study, moved(study, store, tmp_path / "r"), executor)
+    assert plain["uncertainty"]["priors"] is None
+    told = found["uncertainty"]["priors"]
+    assert set(told["stated"]) == {"skin.c_kPa", "skin.m", "muscle.c_kPa", "muscle.m"}
+    assert {one["source"] for one in told["stated"].values()} == {SOURCE}
+    assert all(0 <= share < 1 for share in told["share"].values())
+    assert all(wider >= 1 for wider in told["wider_without"].values())
+    for name, verdict in plain["uncertainty"]["verdict"].items():
+        if verdict == "determined":
+            tissue, key = name.split(".")
+            low, high = found["uncertainty"]["intervals_95"][tissue][key]
+            assert low < plain["stages"][-1]["parameters"][tissue][key] < high
+            assert told["share"][name] < 0.2
 
 
 def test_groups_of_a_study(tmp_path):

@@ -126,6 +126,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "calibration.tied": ("calibrate", [["skin.tau_s", "muscle.tau_s"]]),
     "calibration.prior.skin.c_kPa.median": ("calibrate", 6.0),
     "calibration.prior.skin.c_kPa.factor": ("calibrate", 1.5),
+    "calibration.priors": ("calibrate", "population"),
     "calibration.force_error_percent": ("calibrate", 2.0),
     "calibration.starts": ("calibrate", 3),
     "calibration.seed": ("calibrate", 1),
@@ -236,6 +237,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         "calibration.relative_tolerance",
     ),
     (GIVEN, {"calibration.force_error_percent": 2.0}, "calibration.force_error_percent"),
+    (GIVEN, {"calibration.prior_tissues": {"skin": "none"}}, "calibration.prior_tissues"),
     (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
     *[
         (

@@ -282,6 +282,8 @@ class CalibrationTable(TomlTable):
     """How the parameters are found; ``paper`` is equation 8, ``pointwise`` the force residuals.
 
     ``fixed``, ``tied`` and ``prior`` name parameters as ``skin.c_kPa``; ``starts`` after one are random.
+    ``priors`` are those of people, where ``prior`` names none; ``prior_tissues`` says what tissue of people
+    one of the model is.
     Parameters are searched on what of each mesh is within ``search_radius_mm`` of its site (0: on all of it),
     and on coarse meshes where the study has them (``mesh.coarse``); forces of the whole meshes correct that,
     at most ``corrections`` times per stage.
@@ -294,6 +296,8 @@ class CalibrationTable(TomlTable):
     fixed: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
     prior: dict[str, PriorTable] = {}
+    priors: Literal["population"] | None = None
+    prior_tissues: dict[str, str] = {}
     force_error_percent: Positive = 1.0
     starts: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
@@ -310,7 +314,7 @@ class CalibrationTable(TomlTable):
         for group in self.tied:
             if len(group) < 2 or len({name.rpartition(".")[2] for name in group}) > 1:
                 raise ValueError(f"tied = {list(group)}: tie two or more parameters of one kind")
-        if self.prior and self.objective == "paper":
+        if (self.prior or self.priors) and self.objective == "paper":
             raise ValueError('objective = "paper" has no place for priors; use "pointwise"')
         return self
 

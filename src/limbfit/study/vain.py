@@ -118,8 +118,14 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("calibration.force_error_percent",),
-        lambda s: not s.calibration.prior,
+        lambda s: not s.priors,
         "it sets forces against priors, and there is none",
+    ),
+    Vain(
+        ("calibration.prior_tissues",),
+        lambda s: s.calibration.priors is None,
+        "it belongs to the priors of people",
+        'give calibration.priors = "population", or leave it out',
     ),
     Vain(
         ("calibration.seed",),

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from ..errors import StudyError
-from ..laws import LAWS, Parameters, TissueLaw, flat_names, to_parameters, to_vector
+from ..errors import InputError, StudyError
+from ..laws import LAWS, OGDEN, Parameters, TissueLaw, flat_names, to_parameters, to_vector
+from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .material import MaterialTable
 from .meshing import MeshTable
@@ -22,6 +23,7 @@ from .tables import (
     ImageTable,
     IndenterTable,
     MarkupsTable,
+    PriorTable,
     SegmentationTable,
     Site,
     SolverTable,
@@ -101,6 +103,19 @@ class Study(TomlTable):
     def vector(self, parameters: Parameters) -> NDArray[np.float64]:
         """The flat vector of ``{tissue: {name: value}}``."""
         return to_vector(parameters, self.tissues, self.material.law)
+
+    @property
+    def priors(self) -> dict[str, PriorTable]:
+        """What is known of parameters beforehand, by name: what is stated, else what people are like."""
+        table, people = self.calibration, {}
+        if table.priors is not None:
+            known = of_tissues(self.tissues, table.prior_tissues)
+            people = {
+                name: PriorTable(median=median, factor=factor)
+                for name, (median, factor) in known.items()
+                if name not in table.fixed
+            }
+        return people | table.prior
 
     @property
     def within_mm(self) -> float | None:
@@ -186,6 +201,21 @@ class Study(TomlTable):
         for name in self.calibration.named:
             if name not in known:
                 raise ValueError(f"calibration: no parameter is named {name!r}; they are {', '.join(known)}")
+        return self
+
+    @model_validator(mode="after")
+    def _priors_of_people(self) -> Study:
+        if self.calibration.priors is None:
+            return self
+        if self.material.law != OGDEN:
+            raise ValueError(
+                f'calibration.priors: people are described by the law "{OGDEN}", the study has '
+                f'"{self.material.law}"; leave it out, or state calibration.prior'
+            )
+        try:
+            of_tissues(self.tissues, self.calibration.prior_tissues)
+        except InputError as error:
+            raise ValueError(f"calibration.prior_tissues: {error}") from None
         return self
 
     @model_validator(mode="after")

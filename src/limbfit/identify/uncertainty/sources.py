@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..fit.objective import SiteResponse
 from ..fit.parameters import Space, Unknowns
+from .beliefs import Beliefs
 from .discrepancy import ResidualModel
-from .uncertainty import Beliefs
 
 Array = NDArray[np.float64]
 

@@ -23,6 +23,7 @@ from scipy.special import stdtrit  # Student quantiles; scipy.stats would take h
 from ..fit.objective import Measured, SiteResponse
 from ..fit.parameters import Grouping, Space, Unknowns, search_space, separate
 from ..fit.state import CalibrationSettings
+from .beliefs import Beliefs
 from .discrepancy import ResidualModel, estimate_discrepancy
 from .estimator import Estimator
 from .noise import SiteNoise, curve_noise
@@ -65,7 +66,7 @@ class Uncertainty:
     it that records cause, the scatter of answers to other records with the same priors. ``correlation``
     (p, p) is of the logarithms, ``intervals_95`` (p, 2) are of the parameters and lie between the bounds;
     ``degrees_of_freedom`` (p,) belong to the linearised ones. ``combinations`` are the principal axes, the
-    best known first.
+    best known first. ``prior_share`` and ``wider_without`` (p,): see `Beliefs.shares`.
     """
 
     names: tuple[str, ...]
@@ -80,6 +81,8 @@ class Uncertainty:
     combinations: tuple[Combination, ...]
     residual_model: ResidualModel
     degrees_of_freedom: Array
+    prior_share: Array
+    wider_without: Array
     method: str = LINEARISED
 
     @property
@@ -153,45 +156,18 @@ def estimate_uncertainty(
 
 
 @dataclass(frozen=True)
-class Beliefs:
-    """What is known before the data, in the search space: ``bounds`` (k, k) is the precision of theirs.
-
-    ``sd`` (k,) are the deviations of a uniform distribution between them; ``rows @ z - target`` are the
-    deviations from stated priors in their standard deviations.
-    """
-
-    sd: Array
-    rows: Array
-    target: Array
-
-    @classmethod
-    def of(cls, unknowns: Unknowns, space: Space) -> Beliefs:
-        sd = (space.upper - space.lower) / np.sqrt(12.0)
-        rows, target = unknowns.prior_rows()
-        own = rows @ space.tie
-        return cls(sd, own, target - rows @ space.fixed)
-
-    @property
-    def bounds(self) -> Array:
-        return np.diag(self.sd**-2)
-
-    @property
-    def precision(self) -> Array:
-        """Of bounds and priors together (k, k)."""
-        return self.bounds + self.rows.T @ self.rows
-
-
-@dataclass(frozen=True)
 class _Linear:
     """Covariance about the calibrated ``z`` (k,), and the parts of it that records and that misfit cause.
 
-    ``centre`` (k,) is where generalised least squares by noise and misfit would go, which the calibration's
-    own weights are not. Where the two are farther apart than noise and misfit explain, the rest counts
-    as one more deviation: intervals must not say more than two readings of the same residuals agree on.
+    ``centre`` (k,) is where generalised least squares by noise and misfit would go, with covariance ``best``
+    (k, k); the calibration's own weights are not those. Where the two are farther apart than noise and misfit
+    explain, the rest counts as one more deviation: intervals must not say more than two readings of the same
+    residuals agree on.
     """
 
     z: Array
     centre: Array
+    best: Array
     covariance: Array
     by_records: Array
     by_misfit: Array
@@ -225,6 +201,7 @@ class _Linear:
         return cls(
             z=z,
             centre=centre,
+            best=best,
             covariance=_symmetric(covariance + apart),
             by_records=_symmetric(by_records),
             by_misfit=by_misfit + apart,
@@ -285,6 +262,7 @@ def _told(
         verdict_of(float(np.exp(h)), share) if free else GIVEN for h, share, free in zip(half, shares, moved)
     ]
     covariance = space.tie @ linear.covariance @ space.tie.T
+    share, wider = prior.shares(linear.best, space.tie)
     sd = np.sqrt(np.where(moved, np.diag(covariance), 1.0))
     return Uncertainty(
         names=unknowns.names,
@@ -301,6 +279,8 @@ def _told(
         degrees_of_freedom=np.array(
             [linear.freedom(row) if row.any() else _MOST_FREEDOM for row in space.tie]
         ),
+        prior_share=share,
+        wider_without=wider,
     )
 
 

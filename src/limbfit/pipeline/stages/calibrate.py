@@ -15,6 +15,7 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.fit.state import Calibration
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters
+from ...priors import SOURCE
 from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
@@ -171,5 +172,21 @@ def _uncertainty_record(known: Uncertainty, study: Study) -> dict[str, Any]:
         "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
         "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],
         "most_probable": study.by_tissue(known.centre),
+        "priors": _priors_record(known, study),
         "residuals": known.residual_model.to_dict(),
+    }
+
+
+def _priors_record(known: Uncertainty, study: Study) -> dict[str, Any] | None:
+    """The priors that counted, and how much of each interval comes from them; none where none were stated."""
+    if not study.priors:
+        return None
+    stated = study.calibration.prior
+    return {
+        "stated": {
+            name: {**prior.model_dump(), "source": "the study" if name in stated else SOURCE}
+            for name, prior in study.priors.items()
+        },
+        "share": dict(zip(known.names, known.prior_share.tolist(), strict=True)),
+        "wider_without": dict(zip(known.names, known.wider_without.tolist(), strict=True)),
     }

@@ -323,7 +323,7 @@ def unknowns(study: Study) -> Unknowns:
         return study.vector({tissue: study.material.of(tissue, which) for tissue in study.tissues})
 
     names = tuple(f"{tissue}.{name}" for tissue, name in study.parameters)
-    priors = tuple(Prior(name, p.median, p.factor) for name, p in study.calibration.prior.items())
+    priors = tuple(Prior(name, p.median, p.factor) for name, p in study.priors.items())
     return Unknowns(names, flat("start"), flat("lower"), flat("upper"), priors)
 
 

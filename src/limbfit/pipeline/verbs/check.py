@@ -52,6 +52,9 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
             + ("" if record["speed_unload_mm_s"] is not None else "; loading only, no unloading")
         )
     facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
+    if study.priors:
+        known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
+        facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
     placed, anatomy = _places(study, given)
     if sites and not placed:

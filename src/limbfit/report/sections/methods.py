@@ -13,6 +13,7 @@ from ..formats import fixed, friction, number, symbol, unit_of
 from ..page import Prose, Section
 from ..store import Json, Results
 from ..tables import NOTHING, flatten, mean_and_deviation
+from .priors import constraints
 
 Part = tuple[str, str]  # a heading and its paragraph
 
@@ -251,7 +252,7 @@ def _identification(store: Results) -> str:
             f"Start: {_values(first.get('start') or {})}.",
             f"Bounds: {_bounds(found.get('bounds') or {})}.",
             _stopping(table),
-            _constraints(table),
+            constraints(table),
             f"{table['starts']} starts were tried, all but the first at random (seed {table.get('seed')})."
             if (table.get("starts") or 1) > 1
             else "",
@@ -291,17 +292,6 @@ def _stopping(table: Json) -> str:
         "four "
         f"steps gain less than that each, or after {table.get('max_iterations')} accepted steps."
     )
-
-
-def _constraints(table: Json) -> str:
-    fixed_names, tied, prior = (table.get(key) or () for key in ("fixed", "tied", "prior"))
-    words = [f"{', '.join(fixed_names)} stayed at the start" if fixed_names else ""]
-    words += [f"{' and '.join(group)} were kept equal" for group in tied]
-    if prior:
-        known = (f"{name}: median {p['median']}, factor {p['factor']}" for name, p in dict(prior).items())
-        words.append(f"lognormal priors were put on {'; '.join(known)}")
-    text = "; ".join(word for word in words if word)
-    return text[:1].upper() + text[1:] + "." if text else ""
 
 
 def _values(tissues: Json) -> str:

@@ -16,6 +16,7 @@ from .doubted import search_doubts
 from .doubts import doubts
 from .experiments import experiment_sections
 from .methods import method_section
+from .priors import prior_shares
 from .records import record_figure, trace_table
 from .summary import _combinations, key_numbers, summary
 
@@ -158,7 +159,7 @@ def parameters(store: Results) -> Section:
     blocks = _blocks(*found, otherwise="No parameters have been identified yet.")
     if store.stages and not store.calibration.get("uncertainty"):
         blocks = (*blocks, Note("No uncertainty is stored, so the table has no intervals."))
-    blocks = (*blocks, *_combinations(store))
+    blocks = (*blocks, *prior_shares(store), *_combinations(store))
     residuals = _residuals(store)
     if residuals:
         blocks = (*blocks, Prose(residuals))

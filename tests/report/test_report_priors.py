@@ -1,0 +1,64 @@
+"""The report says what was known beforehand, and how much of each interval comes from it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from stored_results import NAMES, write_results
+
+from limbfit.priors import SOURCE
+from limbfit.report.page import Prose, Table
+from limbfit.report.sections.priors import constraints, prior_shares
+from limbfit.report.sections.sections import parameters
+from limbfit.report.store import load_store
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    return write_results(tmp_path / "results")
+
+
+def add_priors(results: Path) -> None:
+    file = results / "calibrate" / "calibration.json"
+    content = json.loads(file.read_text())
+    content["uncertainty"]["priors"] = {
+        "stated": {
+            "skin.c_kPa": {"median": 7.37, "factor": 2.18, "source": SOURCE},
+            "muscle.m": {"median": 3.0, "factor": 1.25, "source": "the study"},
+        },
+        "share": {name: 0.625 if name == "skin.c_kPa" else 0.031 for name in NAMES},
+        "wider_without": {name: 1.84 if name == "skin.c_kPa" else 1.02 for name in NAMES},
+    }
+    file.write_text(json.dumps(content))
+
+
+def test_each_interval_s_share_of_the_priors_is_shown_with_its_source(results: Path) -> None:
+    add_priors(results)
+    words, table = prior_shares(load_store(results))
+    assert isinstance(words, Prose)
+    assert SOURCE in words.text
+    assert "the study" in words.text
+    assert isinstance(table, Table)
+    rows = [[cell.text for cell in row.cells] for row in table.rows]
+    assert len(rows) == len(NAMES)
+    assert rows[0][3:] == ["7.37", "2.18", "62", "1.84 times"]
+    assert rows[1][3:] == ["–", "–", "3", "1.02 times"]
+
+
+def test_the_section_of_parameters_has_the_table_where_there_are_priors(results: Path) -> None:
+    def tables() -> list[str]:
+        return [block.name for block in parameters(load_store(results)).blocks if isinstance(block, Table)]
+
+    assert "priors" not in tables()
+    add_priors(results)
+    assert "priors" in tables()
+
+
+def test_the_methods_say_that_people_were_asked() -> None:
+    told = constraints({"priors": "population", "prior": {"muscle.m": {"median": 3.0, "factor": 1.25}}})
+    assert told == (
+        "Lognormal priors of c and m were those of people; "
+        "lognormal priors were put on muscle.m: median 3.0, factor 1.25."
+    )

@@ -1,0 +1,121 @@
+"""The priors of people in a study: which tissue has which, what is refused, what is stored and shown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from limbfit.errors import InputError, StudyError
+from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.verbs.check import check_study
+from limbfit.pipeline.verbs.run import keys
+from limbfit.priors import LITERATURE, PRIORS, of_tissues
+from limbfit.study import Study, load_study
+
+PEOPLE = '[calibration]\npriors = "population"\n'
+THREE = '[geometry]\nlayers = [{ name = "skin", thickness_mm = 2.0 }, { name = "fat", thickness_mm = 5.0 }]\n'
+HIDE = '[geometry]\nlayers = [{ name = "hide", thickness_mm = 3.0 }]\n'
+
+
+def with_settings(folder: Path, more: str) -> Study:
+    file = folder / "study.toml"
+    file.write_text(file.read_text(encoding="utf-8") + more, encoding="utf-8")
+    return load_study(folder)
+
+
+def names(study: Study) -> set[str]:
+    return {prior.name for prior in unknowns(study).priors}
+
+
+def test_a_study_has_no_priors_of_its_own(study: Path) -> None:
+    assert unknowns(load_study(study)).priors == ()
+
+
+def test_a_skin_without_fat_below_it_is_skin_with_its_fat(study: Path) -> None:
+    found = {prior.name: prior for prior in unknowns(with_settings(study, PEOPLE)).priors}
+    assert set(found) == {"skin.c_kPa", "skin.m", "muscle.c_kPa", "muscle.m"}
+    known = PRIORS["skin_fat"]["c_kPa"]
+    assert (found["skin.c_kPa"].median, found["skin.c_kPa"].factor) == (known["median"], known["factor"])
+
+
+def test_over_fat_a_skin_has_no_c(study: Path) -> None:
+    assert names(with_settings(study, THREE + PEOPLE)) == {
+        *("skin.m", "fat.c_kPa", "fat.m", "muscle.c_kPa", "muscle.m")
+    }
+
+
+def test_the_study_says_what_another_name_means(study: Path) -> None:
+    found = with_settings(study, HIDE + PEOPLE + 'prior_tissues = { hide = "skin_fat", muscle = "none" }\n')
+    assert names(found) == {"hide.c_kPa", "hide.m"}
+
+
+def test_what_is_stated_or_fixed_is_not_people_s(study: Path) -> None:
+    more = "fixed = ['skin.m']\nprior = { 'muscle.c_kPa' = { median = 9.0, factor = 1.1 } }\n"
+    found = {prior.name: prior for prior in unknowns(with_settings(study, PEOPLE + more)).priors}
+    assert set(found) == {"skin.c_kPa", "muscle.c_kPa", "muscle.m"}
+    assert (found["muscle.c_kPa"].median, found["muscle.c_kPa"].factor) == (9.0, 1.1)
+
+
+def test_what_a_tissue_is_decides_the_calibration_alone(study: Path) -> None:
+    plain = keys(with_settings(study, PEOPLE))
+    other = keys(with_settings(study, 'prior_tissues = { skin = "none" }\n'))
+    assert {stage for stage in plain if plain[stage] != other[stage]} == {"calibrate", "predict", "report"}
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (HIDE + PEOPLE, "which tissue of people is 'hide'"),
+        (PEOPLE + 'prior_tissues = { bark = "skin" }\n', "the model has no tissue 'bark'"),
+        (PEOPLE + 'prior_tissues = { skin = "bark" }\n', "'bark' is no tissue of people"),
+        (PEOPLE + 'objective = "paper"\n', "no place for priors"),
+        ('[calibration]\npriors = "animals"\n', "population"),
+        (PEOPLE + '[material]\nlaw = "of_another_kind"\n', 'described by the law "ogden"'),
+    ],
+)
+def test_what_people_cannot_say_is_refused_in_one_line(study: Path, more: str, words: str) -> None:
+    (study / "law.py").write_text(
+        "from dataclasses import replace\nfrom limbfit.laws import LAWS, register_law\n"
+        'register_law(replace(LAWS["ogden"], name="of_another_kind"))\n'
+    )
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace("[study]\n", '[study]\nextensions = ["law.py"]\n'))
+    with pytest.raises(StudyError, match=words) as caught:
+        with_settings(study, more)
+    assert "\n" not in str(caught.value)
+
+
+def test_check_tells_the_priors(study: Path) -> None:
+    facts = check_study(with_settings(study, PEOPLE), listener=lambda event: None)["facts"]
+    (told,) = (fact for fact in facts if "priors" in fact)
+    known = PRIORS["muscle"]["c_kPa"]
+    assert f"muscle.c_kPa {known['median']:g}, factor {known['factor']:g}" in told
+
+
+def test_a_tissue_that_is_not_known_names_the_remedy() -> None:
+    with pytest.raises(InputError) as caught:
+        of_tissues(("skin", "tendon"))
+    assert '"skin_fat"' in str(caught.value.remedy)
+
+
+def test_literature_is_cited_and_read_where_it_says() -> None:
+    for one in LITERATURE:
+        assert {"tissue", "citation", "who", "site", "method", "read"} <= set(one)
+        assert one["tissue"] in PRIORS
+        assert any(key in one for key in ("c_kPa", "m", "gamma", "tau_s"))
+        if "doi" in one:
+            assert one["doi"].startswith("10.")
+
+
+def test_the_page_lists_every_literature_value_and_every_prior() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "priors.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    for one in LITERATURE:
+        values = [f" {one[key]:g} " for key in ("c_kPa", "m", "gamma", "tau_s") if key in one]
+        cited = [row for row in rows if one["citation"] in row and f"| `{one['tissue']}` " in row]
+        assert any(one["site"] in row and all(value in row for value in values) for row in cited), one
+    for tissue, parameters in PRIORS.items():
+        for key, prior in parameters.items():
+            told = f"{prior['median']:g} ×÷ {prior['factor']:g}"
+            assert any(f"| `{tissue}` " in row and told in row for row in rows), (tissue, key)
