@@ -19,7 +19,7 @@ from limbfit.anatomy.meshing.columns import columns
 from limbfit.anatomy.meshing.curving import with_diagonals
 from limbfit.anatomy.meshing.layers import LayerSpec, limb_fields, signed_distance
 from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces, quality, to_tet10
 
@@ -67,6 +67,19 @@ def test_volume_layer_and_quality(meshed: tuple) -> None:
     assert report.interface_error_mm["mean"] < 0.1
     assert report.warnings == ()
     assert sum(report.region_cells.values()) == report.cells == len(mesh.cells)
+
+
+def test_nodes_of_the_skin_stay_on_a_rough_one(oblique: Anatomy) -> None:
+    """Long flat elements are improved along the skin: along a plane their nodes went 6 mm out of this one."""
+    noise = np.random.default_rng(7).normal(0.0, 0.3, oblique.skin.points.shape)
+    rough = replace(oblique, skin=Surface(oblique.skin.points + noise, oblique.skin.faces))
+    position, axis = site_of(rough, np.array([1.0, 0.2, 0.1]), -35.0)
+    settings = replace(COARSE, edge_far_mm=30.0, growth=0.9, flatness=1.6, element="tet4")
+    mesh, report = mesh_site(rough, position, axis, settings)
+    heads = mesh.points[np.unique(mesh.face_sets["skin"])]
+    below = heads[(heads - rough.cut_point) @ rough.cut_normal < -10.0]
+    assert np.abs(signed_distance(rough.skin, below)[0]).max() < 1e-3
+    assert report.min_dihedral_deg > 6.0
 
 
 def test_mesh_conforms(meshed: tuple) -> None:

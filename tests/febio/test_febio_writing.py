@@ -95,6 +95,20 @@ def test_it_is_read_back_as_it_was(tmp_path, element):
     assert set(np.round(schedule(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
 
 
+@pytest.mark.parametrize("shape", ["square", "cylinder", "sphere"])
+def test_the_front_is_read_back_without_valleys(tmp_path, shape):
+    """Faces of four corners that are warped bulge: in a valley contact has no smooth energy."""
+    file, _ = exported(block("tet4", shape), tmp_path)
+    surface = to_problem(read_feb(file)).indenter.surface
+    corners = surface.points[surface.faces]
+    front = corners[corners[..., 2].min(axis=1) > -2.0]
+    normals = np.cross(front[:, 1] - front[:, 0], front[:, 2] - front[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = front.reshape(-1, 3)
+    beyond = points @ normals.T - np.einsum("fi,fi->f", normals, front[:, 0])
+    assert beyond.max() < 1e-6
+
+
 @pytest.mark.parametrize("shape", INDENTERS)
 def test_the_indenter_is_where_it_touches(tmp_path, shape):
     """The faceted body has the distance of limbfit's own in front of it, to the sagitta of the facets."""

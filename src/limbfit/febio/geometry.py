@@ -294,6 +294,23 @@ def triangles(faces: Iterable[Indices]) -> Indices:
     return np.array(out, dtype=np.int64).reshape(-1, 3)
 
 
+def bulging(points: Array, faces: Iterable[Indices]) -> Indices:
+    """Faces around a body as triangles (m, 3), those of four corners parted where they bulge.
+
+    A warped face parted along its other diagonal has a valley: there the way out of the body jumps from one
+    side to the other, and contact has no smooth energy.  The faces run all one way round, seen from outside.
+    """
+    faces = list(faces)
+    corners = points[triangles(faces)]
+    outward = np.sign(np.linalg.det(corners - corners.mean(axis=(0, 1))).sum())
+    parted = []
+    for face in faces:
+        a, b, c, d = points[face[[0, 1, 2, -1]]]
+        valley = outward * float(np.cross(b - a, c - a) @ (d - a)) > 0.0
+        parted.append(np.roll(face, -1) if valley else face)
+    return triangles(parted)
+
+
 def refuse_part(part: Part, name: str, what: str) -> ProblemError:
     """The error that names a part and its line."""
     ids = f"elements {part.ids.min()} to {part.ids.max()}"

@@ -15,7 +15,7 @@ from ..fe.kernel.elements import reference_gradients
 from ..mesh import Mesh
 from ..shapes import SHARP_EDGE
 from .controls import step_times
-from .geometry import boundary, refuse_part, triangles
+from .geometry import boundary, bulging, refuse_part, triangles
 from .model import FebModel, Motion
 from .penalty import mean_penalty, thinnest
 
@@ -261,7 +261,7 @@ def _tool(model: FebModel, driven: Drive, name: str, depth: float) -> Indenter:
     Its sharp edges are rounded by no more than the elements that it touches are deep (``depth``, mm).
     """
     axis = _along(driven, name)
-    faces = triangles(boundary(model.parts_of({name: None}).values()))
+    faces = bulging(model.geometry.points, boundary(model.parts_of({name: None}).values()))
     used, faces = np.unique(faces, return_inverse=True)
     frame = Indenter("sphere", axis=axis).frame
     points = model.geometry.points[used] @ frame.T

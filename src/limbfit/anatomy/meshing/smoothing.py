@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +25,43 @@ DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1,
 DIRECTIONS = DIRECTIONS[np.any(DIRECTIONS != 0, axis=1)]
 
 
+@dataclass(frozen=True)
+class Ways:
+    """Where nodes may go: along a plane, freely, or in the layers along the skin at the depth that they have.
+
+    A plane would lead a node of the layers far out of a bent or rough skin, from where no cell lets it back.
+
+    Attributes
+    ----------
+    normals : (n, 3) of the planes; zero where a node moves freely.
+    depth : (n,) below the skin, mm; nan outside the layers.
+    skin : points (k, 3), triangles (f, 3), and a tree of these.
+    """
+
+    normals: Array
+    depth: Array
+    skin: tuple[Array, Ints, igl.AABB]
+
+    @classmethod
+    def of(cls, points: Array, normals: Array, in_layers: NDArray[np.bool_], fields: LimbFields) -> Ways:
+        skin, tree = (fields.skin.points, fields.skin.faces), igl.AABB()
+        tree.init(*skin)
+        depth = np.full(len(points), np.nan)
+        depth[in_layers] = np.sqrt(tree.squared_distance(*skin, points[in_layers])[0])
+        return cls(normals, depth, (*skin, tree))
+
+    def places(self, node: int, here: Array, moves: Array) -> Array:
+        """Places (k, 3) of a node after ``moves`` (k, 3) from ``here``."""
+        normal, depth = self.normals[node], self.depth[node]
+        places = here + moves - (moves @ normal)[:, None] * normal
+        if np.isnan(depth):
+            return np.asarray(places)
+        points, faces, tree = self.skin
+        squared, _, nearest = tree.squared_distance(points, faces, places)
+        share = depth / np.maximum(np.sqrt(squared), 1e-12)
+        return np.asarray(nearest + share[:, None] * (places - nearest))
+
+
 def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     """A tet4 mesh with its poor elements improved and its boundary nodes put back on the smooth surfaces.
 
@@ -29,7 +69,8 @@ def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
     normals, movable = held(mesh, fields, stack)
-    points = improved(mesh.points, mesh.cells, WORKED_BELOW_DEG, normals, movable)
+    ways = Ways.of(mesh.points, normals, _places(mesh, stack)[1], fields)
+    points = improved(mesh.points, mesh.cells, WORKED_BELOW_DEG, ways, movable)
     return mesh.with_points(put_back(points, mesh, fields, stack))
 
 
@@ -62,14 +103,14 @@ def _places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
     return np.stack([on_plane, in_layers, on_bone])
 
 
-def improved(points: Array, tets: Ints, goal_deg: float, normals: Array, movable: NDArray[np.bool_]) -> Array:
+def improved(points: Array, tets: Ints, goal_deg: float, ways: Ways, movable: NDArray[np.bool_]) -> Array:
     """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
 
     Parameters
     ----------
     points, tets : the mesh.
     goal_deg : tetrahedra below it are worked on.
-    normals : (n, 3) unit normals of the surface that a node moves on; zero where it moves freely.
+    ways : where nodes may go.
     movable : (n,) nodes that may move.
     """
     points = points.copy()
@@ -81,19 +122,19 @@ def improved(points: Array, tets: Ints, goal_deg: float, normals: Array, movable
         nodes = np.unique(tets[worst < goal_deg])
         for node in nodes[movable[nodes]]:
             star = order[starts[node] : starts[node + 1]] // 4
-            points[node] = _best_place(points, tets[star], node, normals[node])
+            points[node] = _best_place(points, tets[star], node, ways)
             worst[star] = _worst_angle(points[tets[star]])
         if np.array_equal(before, points):
             break
     return points
 
 
-def _best_place(points: Array, star: Ints, node: int, normal: Array) -> Array:
+def _best_place(points: Array, star: Ints, node: int, ways: Ways) -> Array:
     """Where the smallest angle of the star about a node is greatest, among a pattern of places."""
     here, corners, mine = points[node], points[star], star == node
     reach = np.linalg.norm(corners - here, axis=2)[~mine].min()
-    moves = np.concatenate([np.zeros((1, 3)), *(step * reach * DIRECTIONS for step in STEPS)])
-    places = here + moves - (moves @ normal)[:, None] * normal
+    moves = np.concatenate([step * reach * DIRECTIONS for step in STEPS])
+    places = np.vstack([here, ways.places(node, here, moves)])
     trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
     angle = _worst_angle(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
     return np.asarray(places[int(np.argmax(angle))])
