@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 # Stiffness that holds a coordinate while a displacement drives it which a force drives at other times, over
 # that of all its contact faces: it stays unknown, so that nothing is numbered anew.
 HOLDING = 100.0
+# Stiffness of a coordinate whose body touches nothing, over that of the tissue against a body of its width.
+GROUNDING = 0.1
 
 
 @dataclass(frozen=True)
@@ -79,15 +81,15 @@ class _Body:
         return self.stated.origin + np.asarray(self.start.centre) - np.asarray(self.stated.shape.centre)
 
     @property
-    def units(self) -> Array:
-        """(k,) mm in ``u`` per unit of the free coordinates."""
-        return np.where(self.free > 2, self.unit, 1.0)
+    def scale(self) -> Array:
+        """(6,) mm in ``u`` per mm or radian of the coordinates."""
+        return np.repeat([1.0, self.unit], 3)
 
     def tool(self, u: Array, drive: Array) -> Tool:
         """Where it is at ``u (r, 3)``; the coordinates that no force ever drives are at ``drive (6,)``."""
         coordinates = drive.copy()
         if len(self.free):
-            found = u[self.row : self.row + 2].ravel() * np.repeat([1.0, 1.0 / self.unit], 3)
+            found = u[self.row : self.row + 2].ravel() / self.scale
             coordinates[self.free] = found[self.free]
         pose = Pose(self.start, self.pivot, coordinates)
         return Tool(self.surface, pose, u, self.free, self.row, self.unit)
@@ -172,12 +174,8 @@ class Bodies:
     ) -> Contacts:  # fmt: skip
         """Energy and forces of all contact at ``u (r, 3)``; what a tangent needs where it is wanted."""
         gaps, weights, size = np.full(self.count, np.inf), np.zeros(self.count), (self.count, 3)
-        forces, normals, blocks, stick = (
-            np.zeros(size),
-            np.zeros(size),
-            np.zeros((*size, 3)),
-            np.zeros((*size, 3)),
-        )
+        forces, normals = np.zeros(size), np.zeros(size)
+        blocks, stick = np.zeros((*size, 3)), np.zeros((*size, 3))
         residual, reactions = np.zeros_like(u), np.zeros((len(self.all), 6))
         turning, bending = np.zeros((*size, self.free)), np.zeros((self.free, self.free))
         energy = deepest = area = 0.0
@@ -208,12 +206,18 @@ class Bodies:
         touch = Touch(gaps, normals, weights, blocks, stick, forces)
         return Contacts(energy, deepest, area, reactions, residual, touch, turning, bending)
 
-    def tangent(self, found: Contacts, drives: Drives, penalty: float, data: Array) -> None:
-        """Add the hessian of the contact energy, and of what holds bodies, to the entries ``data``."""
+    def tangent(self, found: Contacts, drives: Drives, penalty: float, modulus: float, data: Array) -> None:
+        """Add the hessian of the contact energy, and of what holds bodies, to the entries ``data``.
+
+        A body that a force drives and that touches nothing is given some: there must be a way to go.
+        """
         self._add(found.touch.blocks, data)
         if self.free:
-            held = [~forced[body.free] * self._holding(body, penalty)
-                    for body, forced in zip(self.all, drives.forced)]  # fmt: skip
+            held = []
+            for body, forced in zip(self.all, drives.forced):
+                loose = not (found.touch.gaps[body.points] < 0.0).any()
+                ground = GROUNDING * modulus * body.start.width if loose else 0.0
+                held.append(np.where(forced[body.free], ground, self._holding(body, penalty)))
             self._add_border(found.turning, found.bending + np.diag(np.concatenate(held)), data)
 
     def _holding(self, body: _Body, penalty: float) -> float:
@@ -282,8 +286,8 @@ class Bodies:
         for body, value, forced in zip(self.all, drives.values, drives.forced):
             if not len(body.free):
                 continue
-            now, units = u[body.row : body.row + 2].ravel()[body.free], body.units
-            pulls, off = value[body.free] / units, now - value[body.free] * units
+            now, scale = u[body.row : body.row + 2].ravel()[body.free], body.scale[body.free]
+            pulls, off = value[body.free] / scale, now - value[body.free] * scale
             under = forced[body.free]
             stiff = self._holding(body, penalty)
             energy += float(np.where(under, -pulls * now, 0.5 * stiff * off**2).sum())
@@ -301,7 +305,7 @@ def impose_on(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) ->
     if held.any():
         u = u.copy()
         rows = u[body.row : body.row + 2].ravel()
-        rows[held] = value[held] * np.repeat([1.0, body.unit], 3)[held]
+        rows[held] = (value * body.scale)[held]
         u[body.row : body.row + 2] = rows.reshape(2, 3)
     return u
 

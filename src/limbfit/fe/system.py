@@ -209,7 +209,7 @@ class System:
         found = self._contact(u, increment, tangent)
         driving, loads = self.bodies.driven(u, increment.drives, increment.penalty)
         if tangent:
-            self.bodies.tangent(found, increment.drives, increment.penalty, data)
+            self.bodies.tangent(found, increment.drives, increment.penalty, laws.modulus, data)
         return Evaluation(
             energy + found.energy + driving, residual + found.residual + loads.residual,
             data if tangent else None, float(found.reactions[0, 2]), found.penetration, found.area,

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from ..bodies import GROUNDING
 from ..system import System
 from .convexity import body_stiffness, shear_stiffness
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
@@ -31,8 +32,6 @@ FEWEST_MULTIGRID, MOST_CYCLES = 60_000, 150
 # Smallest and largest shear stiffness added to a tangent that is not positive definite, as a share of each
 # tissue's own: tissues differ by up to a hundredfold, and a common one would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 0.1, 1e6
-# Share of `body_stiffness` in every factor.
-GROUNDING = 0.1
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ class Factor:
         data = self.stiffened(data, shift) if shift else data
         if len(self._ground[0]):  # a body that touches nothing yet is held by nothing
             data = data.copy()
-            data[self._ground[0]] += GROUNDING * self._ground[1]
+            data[self._ground[0]] += GROUNDING * self._ground[1]  # as in `Bodies.tangent`
         try:
             self._solver.factorise(data)
         except NotPositiveDefiniteError:

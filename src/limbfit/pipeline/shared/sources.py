@@ -107,9 +107,16 @@ def _read(file: Path) -> _Module:
             place = _base(file, node)
             imports += [] if place is None else [(place, alias.name) for alias in node.names]
         elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == _LAZY:
-            homes = ast.literal_eval(node.value)
+            homes = ast.literal_eval(node.value) if isinstance(node.value, ast.Dict) else _stubbed(file)
             lazy = {name: file.parent.joinpath(*home.split(".")) for name, home in homes.items()}
     return _Module(file, tuple(imports), frozenset(strings), lazy)
+
+
+def _stubbed(file: Path) -> dict[str, str]:
+    """The homes of the names in the stub beside an ``__init__`` that loads them by it."""
+    stub = ast.parse(file.with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom) and node.module]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
 def _base(file: Path, node: ast.ImportFrom) -> Path | None:
