@@ -95,6 +95,16 @@ def test_it_is_read_back_as_it_was(tmp_path, element):
     assert set(np.round(schedule(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
 
 
+def test_friction_is_read_back(tmp_path):
+    file, _ = exported(replace(block(), friction=0.3), tmp_path)
+    text = file.read_text(encoding="utf-8")
+    assert "<symmetric_stiffness>non-symmetric</symmetric_stiffness>" in text
+    assert to_problem(read_feb(file)).friction == 0.3
+    plain, _ = exported(block(), tmp_path)
+    assert "fric_coeff" not in plain.read_text(encoding="utf-8")
+    assert to_problem(read_feb(plain)).friction == "frictionless"
+
+
 @pytest.mark.parametrize("shape", ["square", "cylinder", "sphere"])
 def test_the_front_is_read_back_without_valleys(tmp_path, shape):
     """Faces of four corners that are warped bulge: in a valley contact has no smooth energy."""

@@ -85,7 +85,7 @@ def plain_listener() -> Callable[[limbfit.Progress], None]:
     start = perf_counter()
 
     def listen(event: limbfit.Progress) -> None:
-        share = f" {event.done:g}/{event.total:g}" if event.total else ""
+        share = f" {round(event.done, 1):g}/{event.total:g}" if event.total else ""
         text = f": {event.text}" if event.text else ""
         STDERR.print(f"[{perf_counter() - start:7.1f} s] {event.stage}{share}{text}", soft_wrap=True)
 

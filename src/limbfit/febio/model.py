@@ -26,15 +26,15 @@ from .tree import Node, read_tree
 Array = NDArray[np.float64]
 COMPONENTS = ("x", "y", "z")
 CONTACTS = ("sliding-elastic", "sliding-facet-on-facet", "sliding-node-on-facet")
-_EMPTY = ("Loads", "Initial", "Constraints", "Discrete", "MeshAdaptor", "MeshData", "Include")
+_EMPTY = ("Initial", "Constraints", "Discrete", "MeshAdaptor", "MeshData", "Include")
 _READ = (
     "Module", "Control", "Globals", "Material", "Mesh", "MeshDomains", "Boundary", "Rigid", "Contact",
-    "LoadData", "Step", "Output",
+    "Loads", "LoadData", "Step", "Output",
 )  # fmt: skip
 # Read by `_tied`, and what only shells have.
 _ELSEWHERE = ("rigid", "zero rotation", "zero shell displacement")
 # What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
-_CONTACT_ZERO = ("tension", "fric_coeff", "offset", "node_reloc")
+_CONTACT_ZERO = ("tension", "offset", "node_reloc")
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,25 @@ class Motion:
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact between two surfaces; ``penalty`` is times FEBio's own where ``automatic``."""
+    """Contact between two surfaces; ``penalty`` is times FEBio's own where ``automatic``; ``friction`` is
+    Coulomb's coefficient."""
 
     rule: str
     surfaces: tuple[str, str]
     penalty: float
     automatic: bool
     augmented: bool
+    line: int
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class PressureLoad:
+    """A pressure on a surface: ``factor`` (MPa) times a load curve, positive when pushing inwards."""
+
+    surface: str
+    factor: float
+    curve: int
     line: int
 
 
@@ -77,6 +89,7 @@ class FebModel:
     rigid_motions: tuple[Motion, ...]
     carried: Mapping[str, Indices]
     contact: Contact | None
+    pressures: tuple[PressureLoad, ...]
     curves: Mapping[int, Curve]
     phases: tuple[Phase, ...]
     requests: tuple[Request, ...]
@@ -134,6 +147,7 @@ def _model(root: Node) -> FebModel:
         _rigid_motions(root, rigid, geometry, curves),
         carried_nodes(geometry, materials, rigid, _tied(root.find("Boundary"), rigid)),
         _contact(root.find("Contact"), geometry),
+        tuple(_pressures(root.find("Loads"), geometry, curves)),
         curves,
         read_phases(root, curves),
         requests,
@@ -165,13 +179,35 @@ def _driven(bc: Node, curves: Mapping[int, Curve]) -> tuple[int, float, int]:
         raise bc.refuse(f"degree of freedom {bc.string('dof')!r} is not supported")
     if bc.flag("relative"):
         raise bc.child("relative").refuse("relative displacements are not supported")
-    value = _amount(bc)
+    return COMPONENTS.index(dof), *_curved(_amount(bc), curves)
+
+
+def _curved(value: Node, curves: Mapping[int, Curve]) -> tuple[float, int]:
+    """Factor and load curve of an amount; 0 and no curve where it is nothing."""
     factor, number = value.scalar(), value.attributes.get("lc", "")
     if factor == 0.0:
-        return COMPONENTS.index(dof), 0.0, 0
+        return 0.0, 0
     if not (number.isdecimal() and int(number) in curves):
         raise value.refuse(f"there is no load curve {number!r}" if number else "needs a load curve")
-    return COMPONENTS.index(dof), factor, int(number)
+    return factor, int(number)
+
+
+def _pressures(
+    section: Node | None, geometry: Geometry, curves: Mapping[int, Curve]
+) -> Iterator[PressureLoad]:
+    """Follower pressures; no other load is read."""
+    for load in section or ():
+        kind = load.attribute("type")
+        if load.tag != "surface_load" or kind != "pressure":
+            raise load.refuse(f"the load {kind!r} is not supported", "limbfit reads pressures on surfaces")
+        if load.flag("linear"):
+            raise load.child("linear").refuse("a pressure that does not follow the surface is not supported")
+        name = load.attribute("surface")
+        if name not in geometry.surfaces:
+            raise load.refuse(f"there is no surface {name!r}")
+        factor, curve = _curved(load.child("pressure"), curves)
+        if factor != 0.0:
+            yield PressureLoad(name, factor, curve, load.line)
 
 
 def _amount(bc: Node) -> Node:
@@ -246,4 +282,8 @@ def _contact(section: Node | None, geometry: Geometry) -> Contact | None:
     penalty = node.number("penalty", 1.0)
     if not penalty > 0.0:
         raise node.child("penalty").refuse("is not positive")
-    return Contact(rule, geometry.pairs[pair], penalty, node.flag("auto_penalty"), augmented, node.line)
+    friction = node.number("fric_coeff", 0.0)
+    if friction < 0.0:
+        raise node.child("fric_coeff").refuse("is negative")
+    automatic = node.flag("auto_penalty")
+    return Contact(rule, geometry.pairs[pair], penalty, automatic, augmented, node.line, friction)

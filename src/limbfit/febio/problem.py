@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import ELEMENTS, History, Indenter, Problem, RigidSurface, StepControl, Support
+from ..fe import ELEMENTS, History, Indenter, Pressure, Problem, RigidSurface, StepControl, Support
 from ..fe.kernel.elements import reference_gradients
 from ..mesh import Mesh
 from ..shapes import SHARP_EDGE
@@ -74,6 +74,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         )
     fixed, supports = _supports(model, body.number, driven)
     element = next(iter(model.parts_of(model.materials).values())).element
+    friction = 0.0 if model.contact is None else model.contact.friction
     rule = "gauss7" if body.mesh.cell_type == "tet10" else "gauss"  # FEBio's quadrature
     if model.contact and model.contact.rule == "sliding-node-on-facet":
         rule = "nodes"
@@ -88,6 +89,8 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         history=driven.history,
         supports=supports,
         start="as-given",
+        friction=friction or "frictionless",
+        pressures=_pressures(model, body),
         **{"element": element, "contact_rule": rule, **settings},
     )
 
@@ -167,12 +170,12 @@ def drive(model: FebModel) -> Drive:
     end = sum(phase.seconds for phase in model.phases)
     moving = [m for m in (*model.rigid_motions, *model.motions) if m.factor != 0.0]
     if not moving:
-        raise ProblemError("nothing moves: there is no prescribed displacement")
+        if not model.pressures:
+            raise ProblemError("nothing moves: there is no prescribed displacement, and no pressure")
+        still, nowhere = np.zeros(2), {name: np.zeros(3) for name in model.rigid}
+        return Drive(History(np.array([0.0, end]), still), None, (0.0,) * len(model.motions), nowhere)
     corners = [model.curves[m.curve].corners for m in moving]
-    # FEBio knows a curve at the ends of its steps only: there are the knots of what is not linear.
-    every = step_times(model.phases, model.curves) if any(c is None for c in corners) else np.zeros(0)
-    knots = np.unique(np.concatenate([every, *(c for c in corners if c is not None)]))
-    times = np.concatenate([[0.0], knots[(knots > 0.0) & (knots < end * (1.0 - 1e-9))], [end]])
+    times = _knots(model, corners, end)
     base = model.curves[moving[0].curve].at(times)
     if not base.any():
         raise ProblemError("nothing moves: the load curve is zero", place=f"line {moving[0].line}")
@@ -185,6 +188,30 @@ def drive(model: FebModel) -> Drive:
     factors = tuple(m.factor * scales.get(m.curve, 0.0) * sign / length for m in model.motions)
     travel = {name: sign / length * way for name, way in travel.items()}
     return Drive(History(times, sign * length * base), None if axis is None else sign * axis, factors, travel)
+
+
+def _knots(model: FebModel, corners: Sequence[Array | None], end: float) -> Array:
+    """Times (n,) from 0 to ``end`` between which load curves are linear.
+
+    FEBio knows a curve at the ends of its steps only: there are the knots of what is not linear.
+    """
+    every = step_times(model.phases, model.curves) if any(c is None for c in corners) else np.zeros(0)
+    knots = np.unique(np.concatenate([every, *(c for c in corners if c is not None)]))
+    return np.concatenate([[0.0], knots[(knots > 0.0) & (knots < end * (1.0 - 1e-9))], [end]])
+
+
+def _pressures(model: FebModel, body: Body) -> tuple[Pressure, ...]:
+    """The pressures on tissue, over the whole time."""
+    found, end = [], sum(phase.seconds for phase in model.phases)
+    for load in model.pressures:
+        faces = body.number[model.geometry.surfaces[load.surface]]
+        if (faces < 0).any():
+            what = f"the surface {load.surface!r} of a pressure lies not on tissue"
+            raise ProblemError(what, place=f"line {load.line}")
+        curve = model.curves[load.curve]
+        times = _knots(model, [curve.corners], end)
+        found.append(Pressure(faces, times, load.factor * curve.at(times)))
+    return tuple(found)
 
 
 def _advance(model: FebModel, travel: Mapping[str, Array]) -> tuple[Array | None, float]:

@@ -121,9 +121,11 @@ def check_exportable(problem: Problem, program: str) -> None:
         raise ProblemError(f"a move across the indenter's axis is not written for {program}")
     if problem.history.forced or problem.bodies:
         raise ProblemError(f"an indenter under force, or further rigid bodies, are not written for {program}")
-    if problem.friction != "frictionless":
+    if problem.pressures:
+        raise ProblemError(f"a pressure is not written for {program}")
+    if problem.friction == "sticky" or (problem.friction != "frictionless" and program != "FEBio"):
         raise ProblemError(
-            f"friction is not written for {program}, nor is limbfit's sticky contact",
+            f"friction is not written for {program}" if program != "FEBio" else "FEBio has no sticky contact",
             remedy='export with friction = "frictionless"',
         )
     taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, HELD}
@@ -173,7 +175,8 @@ def _control(problem: Problem, settings: FebSettings) -> Iterator[str]:
     yield '<time_stepper type="default"><max_retries>8</max_retries><opt_iter>15</opt_iter>'
     yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="2">1</dtmax><aggressiveness>1</aggressiveness>'
     yield "</time_stepper>"
-    yield '<solver type="solid"><symmetric_stiffness>symmetric</symmetric_stiffness>'
+    matrix = "symmetric" if problem.friction == "frictionless" else "non-symmetric"
+    yield f'<solver type="solid"><symmetric_stiffness>{matrix}</symmetric_stiffness>'
     yield f"<max_refs>{reformations}</max_refs>"
     yield "<dtol>0.001</dtol><etol>0.01</etol><rtol>1e-05</rtol><lstol>0.9</lstol>"
     yield f'<qn_method type="BFGS"><max_ups>{updates}</max_ups></qn_method></solver></Control>'
@@ -296,7 +299,11 @@ def _contact(problem: Problem, settings: FebSettings) -> Iterator[str]:
     contact = contact_of(problem, settings)
     yield f"<laugon>PENALTY</laugon><penalty>{contact.penalty!r}</penalty>"
     yield f"<auto_penalty>{contact.automatic:d}</auto_penalty>"
-    yield "<two_pass>0</two_pass><symmetric_stiffness>1</symmetric_stiffness><search_tol>0.01</search_tol>"
+    smooth = problem.friction == "frictionless"
+    yield f"<two_pass>0</two_pass><symmetric_stiffness>{smooth:d}</symmetric_stiffness>"
+    yield "<search_tol>0.01</search_tol>"
+    if not smooth:
+        yield f"<fric_coeff>{float(problem.friction)!r}</fric_coeff>"
     yield f"<search_radius>{reach!r}</search_radius></contact></Contact>"
 
 

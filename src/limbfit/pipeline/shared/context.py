@@ -27,7 +27,7 @@ class Progress:
 
     def __str__(self) -> str:
         """One line, as ``listener=print`` shows it."""
-        count = f" {self.done:g} of {self.total:g}" if self.total else ""
+        count = f" {round(self.done, 1):g} of {self.total:g}" if self.total else ""
         return f"{self.stage}{count}: {self.text}" if self.text else f"{self.stage}{count}"
 
 
