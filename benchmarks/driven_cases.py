@@ -8,8 +8,9 @@ import numpy as np
 from mapped_bodies import Array
 
 from limbfit.fe import History, Indenter, Motion, Problem, RigidBody
+from limbfit.fe.contact.contact import ContactSurface
 
-CLEAR_MM = 0.6  # of nodes at a second body's start: between them skin bulges
+CLEAR_MM = 0.05  # of a second body at its start
 
 
 def driven(problem: Problem, depth: float, rng: np.random.Generator) -> Problem:
@@ -31,7 +32,9 @@ def driven(problem: Problem, depth: float, rng: np.random.Generator) -> Problem:
         motion = Motion.of(times, z=[0.0, 0.5 * depth, 0.0])
         if rng.uniform() < 0.5:
             motion = Motion.of(times, force={"z": [0.0, 0.3 * force, 0.0]})
-        skin = problem.mesh.points[np.unique(problem.contact_faces)]
+        faces, rule = problem.contact_faces, problem.contact_rule
+        skin = ContactSurface.build(problem.formulation, problem.mesh.points, faces, rule).points_at_rest
+        skin = skin.reshape(-1, 3)
         ball = _beside(indenter, skin, float(rng.uniform(0.0, 2.0 * np.pi)))
         bodies = (RigidBody(ball, problem.contact_faces, motion, float(rng.uniform(0.0, 1.0)), name="ball"),)
     return replace(problem, history=history, friction=friction, bodies=bodies)

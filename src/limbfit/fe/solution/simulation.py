@@ -73,10 +73,11 @@ class Simulation:
         self.floor, self.pushing = 0.0, False
         width = problem.indenter.width if problem.indenter is not None else 1.0
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
-        self.deepest = control.penetration * _travel(problem)
-        rest = np.zeros((self.system.rows, 3))
+        self.deepest = control.penetration * _travel(problem, self.laws.modulus)
+        rest, drives = np.zeros((self.system.rows, 3)), problem.drives(0.0)
+        if self.system.bodies is not None:
+            rest = self.system.bodies.impose(rest, drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
-        drives = problem.drives(0.0)
         self.rest = self._coordinates(rest, drives)
         start = problem.history.displacement_at(0.0)
         self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives)]
@@ -309,14 +310,22 @@ class Simulation:
         return du, at.force * d_penalty + d_reaction + d_force
 
 
-def _travel(problem: Problem) -> float:
-    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
-    or half the largest body's width where only forces drive them."""
+def _travel(problem: Problem, modulus: float) -> float:
+    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement.
+
+    Where only forces drive bodies it is that of a flat punch on a half-space of the tissue's shear
+    ``modulus``, ``F / (4 mu w)``, and no more than half a width.
+    """
     bodies = problem.rigid_bodies
     if not bodies:
         return float(np.abs(problem.history.driver).max())
-    ways = [np.abs(body.motion.values[:, :3]) * ~body.motion.free[:3] for body in bodies]
-    return max(float(way.max()) for way in ways) or max(body.shape.width for body in bodies) / 2
+    sizes = [np.abs(body.motion.values[:, :3]) for body in bodies]
+    ways = [np.where(body.motion.free[:3], 0.0, size).max() for body, size in zip(bodies, sizes)]
+    if max(ways) > 0.0:
+        return float(max(ways))
+    widths = [body.shape.width for body in bodies]
+    pushed = [float(size.max()) / (4.0 * modulus * width) for size, width in zip(sizes, widths)]
+    return max(min(way, width / 2) for way, width in zip(pushed, widths)) or max(widths) / 2
 
 
 def _grips(system: System, parameters: int) -> tuple[Grip | None, ...]:
