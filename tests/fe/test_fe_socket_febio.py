@@ -165,3 +165,16 @@ def test_a_follower_pressure_is_febios(tmp_path):
     np.testing.assert_allclose(found.times, log.times, rtol=1e-6)
     off = np.abs(found.values - log.values).max()
     assert off < 0.01 * np.abs(log.values - log.values[0]).max()
+
+
+@pytest.mark.slow
+def test_a_load_on_the_socket_is_nearly_febios():
+    """Then pressed on by 5.2 N, left to creep, and let go: the way within 2 % of its largest, where 1 % was
+    aimed at; FEBio's socket slips on where limbfit's sticks."""
+    t, found, expected = donned(PUSHED_ON.then(LOADED), "cone-load")
+    assert t[-1] == pytest.approx(10.5)
+    off = np.abs(found[:, 0] - expected[:, 0]) / expected[:, 0].max()
+    assert off.max() < 0.02
+    assert off[t <= 6.5].max() < 0.006
+    forced = t > 5.5
+    np.testing.assert_allclose(found[forced, 3], expected[forced, 3], atol=2e-3)
