@@ -242,6 +242,16 @@ def test_a_motion_is_told_what_is_wrong():
         History(TIMES)
 
 
+def test_an_open_surface_has_one_side():
+    good = ring(20.0, 21.0, 4, 10.0)
+    turned = good.faces.copy()
+    turned[0] = turned[0, ::-1]
+    with pytest.raises(ProblemError, match="do not agree on a side"):
+        OpenSurface(good.points, turned)
+    with pytest.raises(ProblemError, match="refer to points"):
+        OpenSurface(good.points[:5], good.faces)
+
+
 def test_a_bar_under_a_held_force_creeps_as_the_closed_form():
     """Small strain, one Prony term: 1/E creeps as a standard linear solid in shear over a constant bulk."""
     mu, gamma, tau, seconds = 0.01, 2.0, 0.5, 0.05
@@ -284,6 +294,31 @@ def ring(radius: float, wide: float, n: int, length: float) -> OpenSurface:
     quads = [(i * (n + 1) + j, i * (n + 1) + j + 1) for i in range(2) for j in range(n)]
     faces = [t for a, b in quads for t in ((a, a + n + 1, b), (b, a + n + 1, b + n + 1))]
     return OpenSurface(points, np.array(faces))
+
+
+def test_distances_from_an_open_surface_are_those_of_its_triangles():
+    """Behind the wall, where contact is: gradient and hessian by differences; nothing beyond the brim."""
+    surface = ring(20.0, 21.0, 24, 10.0)
+    rng, h = np.random.default_rng(0), 1e-6
+    angle, height = rng.uniform(0.05, 1.5, 400), rng.uniform(-9.5, 9.5, 400)
+    wall = np.where(height < 0.0, 20.0, 20.0 + height / 10.0)
+    for off in (-0.8, 0.5):  # in the cavity, and in the wall
+        radius = wall + off
+        points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+        values, slopes, bends = surface.local_distance(points)
+        np.testing.assert_allclose(values, -off, atol=0.06)
+        differences = [
+            (surface.local_distance(points + d)[0] - surface.local_distance(points - d)[0]) / (2 * h)
+            for d in h * np.eye(3)
+        ]
+        np.testing.assert_allclose(np.transpose(differences), slopes, atol=1e-4)
+        turned = [
+            (surface.local_distance(points + d)[1] - surface.local_distance(points - d)[1]) / (2 * h)
+            for d in h * np.eye(3)
+        ]
+        np.testing.assert_allclose(np.moveaxis(turned, 0, 2), bends, atol=1e-3)
+    beyond = np.array([[21.5 * np.cos(0.7), 21.5 * np.sin(0.7), 14.0]])
+    assert np.isinf(surface.signed_distance(beyond)).all()
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.2])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from .closest_point import INSIDE, Tree, build_tree, closest_point
-from .triangles import beyond_edges, normal_spread, triangle_normals
+from .triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -55,7 +55,7 @@ class RigidSurface:
 
     def __post_init__(self) -> None:
         points, faces = np.asarray(self.points, dtype=float), np.asarray(self.faces)
-        _check_arrays(points, faces)
+        check_triangles(points, faces, "the indenter's surface")
         faces = faces.astype(np.int64)
         _check_closed(faces)
         points = points - [0.0, 0.0, points[faces, 2].max()]
@@ -107,15 +107,6 @@ class RigidSurface:
         solid = areas > 1e-12 * areas.max()
         upright = (np.einsum("mi,mi->m", normals, after) > 0.5) & (left > 0.0)
         return moved if upright[solid].all() else None
-
-
-def _check_arrays(points: Array, faces: NDArray) -> None:
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ProblemError("the indenter's surface has points that are not three finite numbers each")
-    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-        raise ProblemError("the indenter's surface is not made of triangles", remedy="triangulate it")
-    if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
-        raise ProblemError("the faces of the indenter's surface refer to points that it does not have")
 
 
 def _check_closed(faces: Faces) -> None:

@@ -5,8 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import ProblemError
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
+
+
+def check_triangles(points: Array, faces: NDArray, name: str) -> None:
+    """Raise `ProblemError` where the arrays are no triangles of the surface ``name``."""
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ProblemError(f"{name} has points that are not three finite numbers each")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise ProblemError(f"{name} is not made of triangles", remedy="triangulate it")
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
+        raise ProblemError(f"the faces of {name} refer to points that it does not have")
 
 
 def triangle_normals(corners: Array) -> tuple[Array, Array]:

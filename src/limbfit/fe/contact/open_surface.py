@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point
-from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
+from ...shapes.triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
 
 Array = NDArray[np.float64]
 # What lies beyond the brim by less than this share of the triangle beside it is still met.
@@ -51,12 +51,7 @@ class OpenSurface:
 
     def __post_init__(self) -> None:
         points, faces = np.asarray(self.points, dtype=float), np.asarray(self.faces)
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise ProblemError("the open surface has points that are not three finite numbers each")
-        if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-            raise ProblemError("the open surface is not made of triangles", remedy="triangulate it")
-        if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
-            raise ProblemError("the faces of the open surface refer to points that it does not have")
+        check_triangles(points, faces, "the open surface")
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         if len(np.unique(edges, axis=0)) < len(edges):
             raise ProblemError(
