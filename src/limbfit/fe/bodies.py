@@ -39,7 +39,8 @@ class Contacts:
 
     ``area`` and ``penetration`` are mm^2 and mm over all bodies; ``reactions (b, 6)`` the forces, N, and
     moments, N mm, that move each body's coordinates; ``residual (r, 3)`` N; ``turning (c, 3, k)`` and
-    ``bending (k, k)`` the parts of the tangent that turns of bodies have beyond the springs.
+    ``bending (k, k)`` the parts of the tangent that turns of bodies have beyond the springs; ``tools`` where
+    the bodies are.
     """
 
     energy: float
@@ -50,6 +51,7 @@ class Contacts:
     touch: Touch
     turning: Array
     bending: Array
+    tools: list[Tool]
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,8 @@ class Bodies:
         residual, reactions = np.zeros_like(u), np.zeros((len(self.all), 6))
         turning, bending = np.zeros((*size, self.free)), np.zeros((self.free, self.free))
         energy = deepest = area = 0.0
-        for i, (body, tool) in enumerate(zip(self.all, self.tools(u, drives))):
+        tools = self.tools(u, drives)
+        for i, (body, tool) in enumerate(zip(self.all, tools)):
             at, grip = body.points, grips[i] if i < len(grips) else None
             near = Distances.of(tool, None if grip is None else grip.held)
             areas = body.surface.areas.ravel()
@@ -204,7 +207,7 @@ class Bodies:
                     np.einsum("cij,cik->jk", self.levers[at, :, columns], turning[at, :, columns]), body.free
                 )
         touch = Touch(gaps, normals, weights, blocks, stick, forces)
-        return Contacts(energy, deepest, area, reactions, residual, touch, turning, bending)
+        return Contacts(energy, deepest, area, reactions, residual, touch, turning, bending, tools)
 
     def tangent(self, found: Contacts, drives: Drives, penalty: float, modulus: float, data: Array) -> None:
         """Add the hessian of the contact energy, and of what holds bodies, to the entries ``data``.
@@ -213,12 +216,18 @@ class Bodies:
         """
         self._add(found.touch.blocks, data)
         if self.free:
-            held = []
+            held = self.grounding(modulus)
             for body, forced in zip(self.all, drives.forced):
-                loose = not (found.touch.gaps[body.points] < 0.0).any()
-                ground = GROUNDING * modulus * body.start.width if loose else 0.0
-                held.append(np.where(forced[body.free], ground, self._holding(body, penalty)))
-            self._add_border(found.turning, found.bending + np.diag(np.concatenate(held)), data)
+                touching = (found.touch.gaps[body.points] < 0.0).any()
+                loose = np.where(touching, 0.0, held[body.columns])
+                held[body.columns] = np.where(forced[body.free], loose, self._holding(body, penalty))
+            self._add_border(found.turning, found.bending + np.diag(held), data)
+
+    def grounding(self, modulus: float) -> Array:
+        """Stiffness (k,) of the free coordinates of bodies that touch nothing, N/mm, in tissue of a shear
+        ``modulus``."""
+        sizes = [np.full(len(body.free), body.start.width) for body in self.all]
+        return GROUNDING * modulus * np.concatenate(sizes)
 
     def _holding(self, body: _Body, penalty: float) -> float:
         """What holds a free coordinate where a displacement drives it, N/mm."""
@@ -249,16 +258,11 @@ class Bodies:
     def advance(self, found: Contacts) -> Array:
         """Mixed derivative (r, 3) with respect to displacement and advance of the first body, times -1."""
         body, axis = self.first, self.first.frame[2]
-        at, n = body.points, self.nodes
-        pushed = found.touch.blocks[at] @ axis
-        out = np.zeros((self.rows, 3))
-        out[:n] = body.surface.shares @ pushed
+        out = found.tools[0].gathered((found.touch.blocks[body.points] @ axis)[..., None])[..., 0]
         if len(body.free):
-            columns = self.levers[at, :, body.columns]
-            on_body = np.zeros(6)
-            on_body[body.free] = np.einsum("cik,ci->k", columns, pushed)
-            on_body[body.free] += axis @ found.turning[at, :, body.columns].sum(axis=0)
-            out[body.row : body.row + 2] = on_body.reshape(2, 3)
+            turned = np.zeros(6)
+            turned[body.free] = axis @ found.turning[body.points, :, body.columns].sum(axis=0)
+            out[body.row : body.row + 2] += turned.reshape(2, 3)
         return out
 
     def along(self, forces: Array) -> Array:

@@ -60,9 +60,8 @@ class Pressed:
         at, weights = element.face_rules["gauss"]
         self.N, self.dN = element.face_shape(at)
         self.weights, self.faces = weights, faces
-        self._middle = points[np.unique(faces)].mean(
-            axis=0
-        )  # the volume's apex: the nearer, the less at the rim
+        # The apex of the volume: the nearer it is, the less differs at a rim.
+        self._middle = points[np.unique(faces)].mean(axis=0)
 
     def _frames(self, x: Array) -> tuple[Array, Array, Array]:
         """Place from the apex and the two tangents (f, q, 3) of nodes that are at ``x (n, 3)``."""

@@ -53,6 +53,11 @@ class Increment:
     pressures: tuple[float, ...] = ()
     rims: Array | float = 0.0
 
+    @property
+    def lags(self) -> bool:
+        """Whether the step holds something constant that follows the displacement."""
+        return bool(self.pressures) or any(grip is not None and grip.lags for grip in self.grips)
+
 
 @dataclass(frozen=True)
 class Evaluation:

@@ -115,3 +115,35 @@ def closest_point(corners, tree, x, point):  # type: ignore[no-untyped-def]
                 best, face, feature = distance, f, kind
                 point[:] = trial
     return face, feature, best
+
+
+@njit(cache=True)
+def feature_normal(normals, edge_normals, corner_normals, face, feature, out):  # type: ignore[no-untyped-def]
+    """Fill ``out (3,)`` with the pseudo-normal of a feature, of any length."""
+    if feature == INSIDE:
+        out[:] = normals[face]
+    elif feature < 4:
+        out[:] = edge_normals[face, feature - 1]
+    else:
+        out[:] = corner_normals[face, feature - 4]
+
+
+@njit(cache=True)
+def curvature(corners, face, feature, axis, gradient, inverse, out):  # type: ignore[no-untyped-def]
+    """Fill ``out (3, 3)`` with the hessian of the distance from an edge or a corner, at ``1 / inverse`` mm.
+
+    ``axis (3,)``: direction of a straight edge that a corner lies on, zero for a true corner; of an edge it
+    is filled.
+    """
+    if feature < 4:
+        a, b = feature - 1, feature % 3
+        length = 0.0
+        for i in range(3):
+            axis[i] = corners[face, b, i] - corners[face, a, i]
+            length += axis[i] * axis[i]
+        for i in range(3):
+            axis[i] /= np.sqrt(length)
+    for i in range(3):
+        for j in range(3):
+            identity = 1.0 if i == j else 0.0
+            out[i, j] = inverse * (identity - gradient[i] * gradient[j] - axis[i] * axis[j])

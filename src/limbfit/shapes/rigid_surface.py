@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from .closest_point import INSIDE, Tree, build_tree, closest_point
+from .closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
 from .triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
 
 Array = NDArray[np.float64]
@@ -167,7 +167,7 @@ def surface_distance(body, radius, x, gradient, hessian):  # type: ignore[no-unt
     corners, normals, edge_normals, corner_normals, along, tree, front = body
     point, axis, outward = np.empty(3), np.zeros(3), np.empty(3)
     face, feature, squared = closest_point(corners, tree, x, point)
-    _feature_normal(normals, edge_normals, corner_normals, face, feature, outward)
+    feature_normal(normals, edge_normals, corner_normals, face, feature, outward)
     side = 0.0
     for i in range(3):
         side += (x[i] - point[i]) * outward[i]
@@ -175,7 +175,7 @@ def surface_distance(body, radius, x, gradient, hessian):  # type: ignore[no-unt
     if side < 0.0:
         sign = -1.0
         face, feature, squared = closest_point(corners, front, x, point)
-        _feature_normal(normals, edge_normals, corner_normals, face, feature, outward)
+        feature_normal(normals, edge_normals, corner_normals, face, feature, outward)
     d = np.sqrt(squared)
     hessian[:, :] = 0.0
     if d <= 1e-9 * radius:
@@ -189,29 +189,7 @@ def surface_distance(body, radius, x, gradient, hessian):  # type: ignore[no-unt
         away += (gradient[i] - normals[face, i]) ** 2
     if feature == INSIDE or away < 1e-12:
         return sign * d - radius
-    if feature < 4:
-        a, b = feature - 1, feature % 3
-        length = 0.0
-        for i in range(3):
-            axis[i] = corners[face, b, i] - corners[face, a, i]
-            length += axis[i] * axis[i]
-        for i in range(3):
-            axis[i] /= np.sqrt(length)
-    else:
-        for i in range(3):
-            axis[i] = along[face, feature - 4, i]
-    for i in range(3):
-        for j in range(3):
-            identity = 1.0 if i == j else 0.0
-            hessian[i, j] = sign * (identity - gradient[i] * gradient[j] - axis[i] * axis[j]) / d
+    if feature >= 4:
+        axis[:] = along[face, feature - 4]
+    curvature(corners, face, feature, axis, gradient, sign / d, hessian)
     return sign * d - radius
-
-
-@njit(cache=True)
-def _feature_normal(normals, edge_normals, corner_normals, face, feature, out):  # type: ignore[no-untyped-def]
-    if feature == INSIDE:
-        out[:] = normals[face]
-    elif feature < 4:
-        out[:] = edge_normals[face, feature - 1]
-    else:
-        out[:] = corner_normals[face, feature - 4]

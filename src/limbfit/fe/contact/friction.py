@@ -14,6 +14,7 @@ creep, however many steps it is held for.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ class Coulomb(Grip):
     """A `Grip` whose bounds are ``mu`` times the penetration."""
 
     mu: float
+
+    lags: ClassVar[bool] = True
 
     @classmethod
     def none(cls, mu: float, surface: ContactSurface, parameters: int = 0) -> Coulomb:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,9 @@ class Grip(ABC):
     normals: Array
     bounds: Array
     d_places: Array
+
+    # Whether a step holds something constant that follows the displacement (`coupling`).
+    lags: ClassVar[bool] = False
 
     @property
     def arrays(self) -> tuple[Bools, Array, Array, Array]:

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point
+from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
 from ...shapes.triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
 
 Array = NDArray[np.float64]
@@ -151,10 +151,7 @@ def _wall_distance(wall, reach, x, gradient, hessian):  # type: ignore[no-untype
     if brim[face, feature - 1]:
         # Beside a plane of symmetry the brim is met; beyond it, nothing is.
         return side if squared - side * side <= BEYOND * BEYOND * size else np.inf
-    if feature < 4:
-        outward[:] = edge_normals[face, feature - 1]
-    else:
-        outward[:] = sums[face, feature - 4]
+    feature_normal(normals, edge_normals, sums, face, feature, outward)
     along = length = 0.0
     for i in range(3):
         along += (x[i] - point[i]) * outward[i]
@@ -165,19 +162,9 @@ def _wall_distance(wall, reach, x, gradient, hessian):  # type: ignore[no-untype
             gradient[i] = outward[i] / np.sqrt(length)
         return 0.0
     sign = 1.0 if along >= 0.0 else -1.0
-    if feature < 4:
-        a, b = feature - 1, feature % 3
-        length = 0.0
-        for i in range(3):
-            axis[i] = corners[face, b, i] - corners[face, a, i]
-            length += axis[i] * axis[i]
-        axis /= np.sqrt(length)
     for i in range(3):
         gradient[i] = sign * (x[i] - point[i]) / d
-    for i in range(3):
-        for j in range(3):
-            identity = 1.0 if i == j else 0.0
-            hessian[i, j] = sign * (identity - gradient[i] * gradient[j] - axis[i] * axis[j]) / d
+    curvature(corners, face, feature, axis, gradient, sign / d, hessian)
     return sign * d
 
 

@@ -58,6 +58,9 @@ class Pose:
         The upper right block of ``exp [[W, E], [0, W]]`` is the derivative along E; once more for the second
         (Najfeld and Havel 1995).
         """
+        if not self.turned:  # the series of the exponential at nothing, without an exponential
+            first, *others = (self._spin(direction) for direction in directions)
+            return first if not others else 0.5 * (first @ others[0] + others[0] @ first)
         matrix = self._spin(self.coordinates[3:])
         for direction in directions:
             n = len(matrix)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies import GROUNDING
 from ..system import System
 
 Array = NDArray[np.float64]
@@ -36,14 +37,13 @@ def shear_stiffness(system: System, moduli: Array) -> Array:
         held = places < 0
         data += np.bincount(places[~held], nodal[:, a, b][~held], minlength=len(data))
     places, stiffness = body_stiffness(system, moduli)
-    data[places] += stiffness
+    data[places] += stiffness / GROUNDING
     return data
 
 
 def body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.int32], Array]:
-    """Diagonal entries of the coordinates that are free to move rigid bodies, and a stiffness (k,) for each,
-    N/mm: about that of the tissue against a body of its width."""
+    """Diagonal entries of the coordinates that are free to move rigid bodies, and what holds those of bodies
+    that touch nothing (k,), N/mm."""
     if system.bodies is None or not system.bodies.free:
         return np.zeros(0, dtype=np.int32), np.zeros(0)
-    widths = np.concatenate([np.full(len(body.free), body.start.width) for body in system.bodies.all])
-    return system.indptr[-1 - system.bodies.free : -1], float(np.mean(moduli)) * widths
+    return system.indptr[-1 - system.bodies.free : -1], system.bodies.grounding(float(np.mean(moduli)))

@@ -16,7 +16,6 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from ..bodies import GROUNDING
 from ..system import System
 from .convexity import body_stiffness, shear_stiffness
 from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
@@ -154,7 +153,7 @@ class Factor:
         data = self.stiffened(data, shift) if shift else data
         if len(self._ground[0]):  # a body that touches nothing yet is held by nothing
             data = data.copy()
-            data[self._ground[0]] += GROUNDING * self._ground[1]  # as in `Bodies.tangent`
+            data[self._ground[0]] += self._ground[1]
         try:
             self._solver.factorise(data)
         except NotPositiveDefiniteError:

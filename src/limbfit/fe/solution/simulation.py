@@ -158,7 +158,7 @@ class Simulation:
     ) -> tuple[Equilibrium, Increment]:
         """An equilibrium, and the increment with the grips and the rims of pressures that hold there."""
         start = self.system.impose(u, increment)
-        lags = bool(Coupling(self.system, increment, start))
+        lags = increment.lags
         loosely = replace(control, tolerance=max(control.tolerance, NEARLY)) if lags else control
         found = self._equilibrate(increment, start, loosely)
         for _ in range(MOST_RENEWALS):
