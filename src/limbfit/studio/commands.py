@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Thread
@@ -41,8 +42,18 @@ def start_command(words: Sequence[str], folder: Path, stderr: int | IO[bytes] = 
         env=os.environ | SAFE_PATH,
         start_new_session=True,
     )
+    while process.poll() is None and not _is_known(process.pid):
+        time.sleep(0.001)
     Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
     return process.pid
+
+
+def _is_known(process: int) -> bool:
+    """Whether its command line can be read, by which it is found: at first it has none."""
+    try:
+        return bool(psutil.Process(process).cmdline())
+    except psutil.NoSuchProcess:  # ended meanwhile
+        return True
 
 
 def interrupt(process: int) -> None:
