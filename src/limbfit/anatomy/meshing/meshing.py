@@ -160,11 +160,30 @@ def mesh_site(
     MeshingError
         When the mesher fails, or its mesh has inverted elements that cannot be mended: where and why.
     """
-    start = time.perf_counter()
     base = base or base_mesh(anatomy, settings)
-    fields, frame = base.fields, base.fields.frame
+    frame = base.fields.frame
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
-    size = site_size(base.grid.points, base.size_limit, site, inward, settings)
+    return _meshed(base, site_size(base.grid.points, base.size_limit, site, inward, settings), settings)
+
+
+def mesh_limb(
+    anatomy: Anatomy, settings: MeshSettings, fine_to_mm: float, fat_depth_mm: Array | None = None
+) -> tuple[Mesh, MeshReport]:
+    """A mesh of the whole limb, as for :func:`mesh_site`, that is fine all around it.
+
+    Parameters
+    ----------
+    anatomy, settings, fat_depth_mm : as for :func:`base_mesh`; edges are of ``edge_near_mm``.
+    fine_to_mm : distance from the proximal cut up to which they are; nearer to it they grow.
+    """
+    base = base_mesh(anatomy, settings, fat_depth_mm)
+    return _meshed(base, limb_size(base, fine_to_mm, settings), settings)
+
+
+def _meshed(base: BaseMesh, size: Array, settings: MeshSettings) -> tuple[Mesh, MeshReport]:
+    """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points."""
+    start = time.perf_counter()
+    fields = base.fields
     task = _task(base.grid, size, settings)
     core = _snapped(_adapted(task, fields, settings), fields)
     mesh, stack = with_layers(core, fields, settings.regions)
@@ -177,8 +196,7 @@ def mesh_site(
     _check_usable(mesh, fields)
     seconds = time.perf_counter() - start
     report = mesh_report(mesh, fields, base.trimmed, base.enclosed_mm3, seconds, settings.engine)
-    report = replace(report, repairs=repairs)
-    return mesh.with_points(frame.to_patient(mesh.points)), report
+    return mesh.with_points(fields.frame.to_patient(mesh.points)), replace(report, repairs=repairs)
 
 
 def _adapted(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
@@ -208,6 +226,13 @@ def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: M
     beyond = np.maximum(distance - settings.near_radius_mm, 0.0)
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
     return np.minimum(size, limit)
+
+
+def limb_size(base: BaseMesh, fine_to_mm: float, settings: MeshSettings) -> Array:
+    """Wanted edge length (n,) at the grid's points of a whole limb: fine but for its proximal end."""
+    beyond = np.maximum(base.grid.points[:, 2] + fine_to_mm, 0.0)
+    size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
+    return np.minimum(size, base.size_limit)
 
 
 def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:

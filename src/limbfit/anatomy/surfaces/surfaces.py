@@ -131,7 +131,7 @@ def _placed(surface: Surface, grid: LabelMap) -> Surface:
 def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array) -> Anatomy:
     extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
     _check_sides(labels, end, point, normal)
-    skin = _capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)
+    skin = capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)
     reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
     bones = {}
     for name in labels.bone_names:
@@ -191,7 +191,7 @@ def _distal_volume(labels: LabelMap, name: str, point: Array, normal: Array) -> 
     return float(inside.sum()) * labels.voxel_mm3
 
 
-def _capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
+def capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
     """The part distal of the plane, closed by a flat cap with a sharp rim, in even triangles."""
     heights = (surface.points - point) @ normal
     if heights.min() >= 0 or heights.max() <= 0:

@@ -1,0 +1,66 @@
+"""A liner: one more layer, outside the skin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+
+from ..frame import limb_frame
+from ..surfaces.surfaces import Anatomy, capped
+from ..surfaces.thickness import carried
+from ..surfaces.triangles import Surface, bodies, from_pyvista
+from .layers import prolonged, signed_distance
+
+Array = NDArray[np.float64]
+SPACING_MM = 3.0  # of the grid on which the surface is contoured
+EDGE_MM = 4.0  # of its triangles
+
+
+def under_liner(
+    anatomy: Anatomy, thickness_mm: float, fat_depth_mm: Array | None = None
+) -> tuple[Anatomy, Array | None]:
+    """The anatomy whose outer surface is a liner's, everywhere ``thickness_mm`` outside the skin.
+
+    Parameters
+    ----------
+    anatomy : closed skin and bones, LPS mm.
+    thickness_mm : of the liner; meshed as the outermost layer, it leaves the skin where it was.
+    fat_depth_mm : (n,) depth of the fat's inner face below the vertices of the skin.
+
+    Returns
+    -------
+    anatomy : with the liner's outer surface for its skin.
+    fat_depth_mm : (m,) depth of the fat's inner face below the vertices of that surface.
+    """
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
+    long = prolonged(skin)
+    liner = capped(_contour(long, thickness_mm), np.zeros(3), np.array([0.0, 0.0, 1.0]), EDGE_MM)
+    below = np.flatnonzero(liner.points[:, 2] < -EDGE_MM / 10)
+    liner.points[below] = _at_distance(long, liner.points[below], thickness_mm)
+    depth = None
+    if fat_depth_mm is not None:
+        depth = carried(skin, fat_depth_mm[None], liner.points)[0] + thickness_mm
+    return replace(anatomy, skin=Surface(frame.to_patient(liner.points), liner.faces)), depth
+
+
+def _contour(surface: Surface, distance_mm: float) -> Surface:
+    """A level of the distance outside a closed surface; where that is concave it keeps clear of itself."""
+    pad = distance_mm + 2.0 * SPACING_MM
+    low, high = surface.points.min(axis=0) - pad, surface.points.max(axis=0) + pad
+    size = np.ceil((high - low) / SPACING_MM).astype(int) + 1
+    grid = pv.ImageData(dimensions=size, spacing=[SPACING_MM] * 3, origin=low)
+    grid.point_data["distance"] = signed_distance(surface, np.asarray(grid.points))[0]
+    found = grid.contour([distance_mm], scalars="distance", method="flying_edges", compute_normals=False)
+    outer = bodies(from_pyvista(found.clean()))[0]
+    outer = outer if outer.volume > 0.0 else outer.flipped
+    return Surface(_at_distance(surface, outer.points, distance_mm), outer.faces)
+
+
+def _at_distance(surface: Surface, points: Array, distance_mm: float) -> Array:
+    """Points (n, 3) near a surface's offset, put on it."""
+    distance, slope = signed_distance(surface, points)
+    return np.asarray(points + (distance_mm - distance)[:, None] * slope)
