@@ -24,6 +24,7 @@ from .fe import (
     Problem as Problem,
     RigidBody as RigidBody,
     RigidSurface as RigidSurface,
+    SmoothSurface as SmoothSurface,
     StepControl as StepControl,
     Support as Support,
 )

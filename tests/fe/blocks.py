@@ -144,7 +144,7 @@ def sector(radii: NDArray, n: int, cell_type: str = "hex8") -> Mesh:
 
 def drive(advance: float, x: float = 0.0, y: float = 0.0) -> Drives:
     """What drives an indenter that has gone ``advance`` mm, and ``x, y`` mm across."""
-    return Drives(np.array([[x, y, advance, 0.0, 0.0, 0.0]]), np.zeros((1, 6), dtype=bool))
+    return Drives(np.array([[x, y, advance, 0.0, 0.0, 0.0]]), np.zeros((1, 6), dtype=bool), np.ones(1))
 
 
 def slope_and_difference(centre: Result, control: StepControl) -> tuple[np.ndarray, np.ndarray]:

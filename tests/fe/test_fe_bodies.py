@@ -72,7 +72,8 @@ def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, t
     u[system.nodes :] = [[0.2, -0.1, 3.6], [0.6 * turned, -0.4 * turned, turned]]
     u[system.nodes + 1] *= 10.0  # mm per radian: half the width
     d = rng.normal(size=u.shape) * ~system.supported
-    drives, grips = Drives(np.array([[0.1, 0.2, -0.4, 3.0, -2.0, 5.0]]), np.ones((1, 6), dtype=bool)), ()
+    loads = np.array([[0.1, 0.2, -0.4, 3.0, -2.0, 5.0]])
+    drives, grips = Drives(loads, np.ones((1, 6), dtype=bool), np.ones(1)), ()
     if mu:
         before = u - 0.05 * d
         grip = Coulomb.none(mu, system.surface).after(system.bodies.tools(before, drives)[0], None)

@@ -25,6 +25,7 @@ from __future__ import annotations
 from ..shapes import RigidSurface
 from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
+from .contact.smooth_surface import SmoothSurface
 from .doubts import Doubt
 from .kernel.elements import ELEMENTS
 from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
@@ -57,6 +58,7 @@ __all__ = [
     "Result",
     "RigidBody",
     "RigidSurface",
+    "SmoothSurface",
     "State",
     "Step",
     "StepControl",

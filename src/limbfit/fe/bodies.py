@@ -87,13 +87,14 @@ class _Body:
         """(6,) mm in ``u`` per mm or radian of the coordinates."""
         return np.repeat([1.0, self.unit], 3)
 
-    def tool(self, u: Array, drive: Array) -> Tool:
-        """Where it is at ``u (r, 3)``; the coordinates that no force ever drives are at ``drive (6,)``."""
+    def tool(self, u: Array, drive: Array, growth: float) -> Tool:
+        """Where it is at ``u (r, 3)``, grown so far; the coordinates that no force ever drives are at
+        ``drive (6,)``."""
         coordinates = drive.copy()
         if len(self.free):
             found = u[self.row : self.row + 2].ravel() / self.scale
             coordinates[self.free] = found[self.free]
-        pose = Pose(self.start, self.pivot, coordinates)
+        pose = Pose(self.start.grown(growth), self.pivot, coordinates)
         return Tool(self.surface, pose, u, self.free, self.row, self.unit)
 
 
@@ -120,8 +121,9 @@ class Bodies:
             first, column = body.points.stop, body.columns.stop
             row += 2 if len(body.free) else 0
             self.all.append(body)
-            start = impose_on(body, np.zeros((row, 3)), *stated.motion.at(0.0))
-            check_clear(surface, body.tool(start, stated.motion.at(0.0)[0]).body, stated.name)
+            drive, forced, growth = stated.motion.at(0.0)
+            start = impose_on(body, np.zeros((row, 3)), drive, forced)
+            check_clear(surface, body.tool(start, drive, growth).body, stated.name)
         self.rows, self.count, self.free = row, first, column
         self.levers = np.zeros((first, 3, column))
         self.frames = np.concatenate(
@@ -161,7 +163,7 @@ class Bodies:
 
     def tools(self, u: Array, drives: Drives) -> list[Tool]:
         """Where every body is at ``u (r, 3)``."""
-        return [body.tool(u, drive) for body, drive in zip(self.all, drives.values)]
+        return [body.tool(u, *drive) for body, *drive in zip(self.all, drives.values, drives.growth)]
 
     def impose(self, u: Array, drives: Drives) -> Array:
         """``u`` with the free coordinates that displacements drive now at their values."""

@@ -28,11 +28,14 @@ class Motion:
     values : (n, 6) of the `COORDINATES`: mm and rad; of forced ones the force, N, or the moment, N mm.
     forced : (6,), or (n - 1, 6) for each interval: which coordinates are driven by force; the others are
         held at their values.
+    growth : (n,) how far the shape has grown, from 0, its ``clear`` one, to 1, its final one; 1 throughout
+        where not given.  Always prescribed.
     """
 
     times: Array
     values: Array
     forced: Sequence[bool] | NDArray[np.bool_] = (False,) * 6
+    growth: Array | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         times, values = np.asarray(self.times, dtype=float), np.asarray(self.values, dtype=float)
@@ -47,14 +50,20 @@ class Motion:
         forced = np.asarray(self.forced, dtype=bool)
         if forced.shape not in ((6,), (len(times) - 1, 6)):
             raise ProblemError("a motion says of six coordinates whether they are forced")
+        growth = np.ones(len(times)) if self.growth is None else np.asarray(self.growth, dtype=float)
+        if growth.shape != times.shape:
+            raise ProblemError("the growth of a motion is not one share for each time")
+        if not ((growth >= 0.0) & (growth <= 1.0)).all():
+            raise ProblemError("the growth of a motion is not between 0 and 1")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
+        object.__setattr__(self, "growth", growth)
         object.__setattr__(self, "forced", np.broadcast_to(forced, (len(times) - 1, 6)))
 
     @classmethod
     def of(
         cls, times: Sequence[float] | Array, *, force: dict[str, Sequence[float] | float] | None = None,
-        **moves: Sequence[float] | float,
+        growth: Sequence[float] | Array | None = None, **moves: Sequence[float] | float,
     ) -> Motion:  # fmt: skip
         """From the coordinates by name, ``z=[0, 2, 2]``; those driven by ``force={"z": [0, 15, 15]}``.
 
@@ -72,7 +81,7 @@ class Motion:
             except ValueError:
                 raise ProblemError(f"the values of {name!r} are not one for each time") from None
             forced[COORDINATES.index(name)] = name in driven
-        return cls(np.asarray(times, dtype=float), values, tuple(forced))
+        return cls(np.asarray(times, dtype=float), values, tuple(forced), growth)
 
     def then(self, after: Motion) -> Motion:
         """This motion, and when it ends another, whose times begin at 0 anew."""
@@ -80,6 +89,7 @@ class Motion:
             np.concatenate([self.times, self.times[-1] + after.times]),
             np.concatenate([self.values, after.values]),
             np.concatenate([self.forced, after.forced[:1], after.forced]),
+            np.concatenate([np.asarray(self.growth), np.asarray(after.growth)]),
         )
 
     @property
@@ -87,19 +97,31 @@ class Motion:
         """(6,) which coordinates a force drives at some time."""
         return np.asarray(self.forced).max(axis=0).astype(bool)
 
-    def at(self, t: float) -> tuple[Array, NDArray[np.bool_]]:
-        """The values (6,) at time ``t``, and which of them are forces; at the end of an interval, its own."""
+    @property
+    def grows(self) -> bool:
+        """Whether its shape is ever another than the final one."""
+        return bool((np.asarray(self.growth) != 1.0).any())
+
+    def at(self, t: float) -> tuple[Array, NDArray[np.bool_], float]:
+        """The values (6,) at time ``t``, which of them are forces, and the growth; at the end of an interval,
+        its own."""
         i = min(max(int(np.searchsorted(self.times, t)) - 1, 0), len(self.times) - 2)
         share = np.clip((t - self.times[i]) / (self.times[i + 1] - self.times[i]), 0.0, 1.0)
-        value = (1.0 - share) * self.values[i] + share * self.values[i + 1]
-        return value, np.asarray(self.forced)[i]
+        start, end = self._driven[i : i + 2]
+        found = (1.0 - share) * start + share * end
+        return found[:6], np.asarray(self.forced)[i], float(found[6])
+
+    @property
+    def _driven(self) -> Array:
+        """(n, 7) the values, and the growth."""
+        return np.column_stack([self.values, np.asarray(self.growth)])
 
     @property
     def turns(self) -> Array:
         """Times between the ends where a rate changes, or what drives, s."""
         steps = np.diff(self.times)
         kept = steps > 0.0
-        rates, forced = np.diff(self.values, axis=0)[kept] / steps[kept, None], np.asarray(self.forced)[kept]
+        rates, forced = np.diff(self._driven, axis=0)[kept] / steps[kept, None], np.asarray(self.forced)[kept]
         size = np.abs(rates).max(axis=0, initial=0.0)
         changed = (np.abs(np.diff(rates, axis=0)) > 1e-9 * size).any(axis=1)
         changed |= (forced[1:] != forced[:-1]).any(axis=1)
@@ -108,16 +130,18 @@ class Motion:
 
 @dataclass(frozen=True)
 class Drives:
-    """What drives the rigid bodies at one time: ``values (b, 6)``, and which of them are forces."""
+    """What drives the rigid bodies at one time: ``values (b, 6)``, which of them are forces, and how far the
+    shapes have grown, ``growth (b,)``."""
 
     values: Array
     forced: NDArray[np.bool_]
+    growth: Array
 
     @classmethod
     def of(cls, motions: Sequence[Motion], t: float) -> Drives:
         found = [motion.at(t) for motion in motions]
-        values, forced = np.array([v for v, _ in found]), np.array([f for _, f in found], dtype=bool)
-        return cls(values.reshape(-1, 6), forced.reshape(-1, 6))
+        values, forced = np.array([v for v, _, _ in found]), np.array([f for _, f, _ in found], dtype=bool)
+        return cls(values.reshape(-1, 6), forced.reshape(-1, 6), np.array([g for _, _, g in found]))
 
     @classmethod
     def none(cls) -> Drives:

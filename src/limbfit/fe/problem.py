@@ -298,6 +298,11 @@ def _check_bodies(problem: Problem) -> None:
         if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
             raise ProblemError(f"contact faces{of} have shape {faces.shape}, not (f, {width}) with f > 0")
         _check_friction(body.friction)
+        if body.motion.grows and not body.shape.grows:
+            raise ProblemError(
+                f"the shape{of or ' of the body'} does not grow",
+                remedy="give a SmoothSurface with a clear shape, or a growth of 1",
+            )
     for one in problem.pressures:
         if np.asarray(one.faces).ndim != 2 or np.asarray(one.faces).shape[1] != width:
             raise ProblemError(f"pressed faces have shape {np.asarray(one.faces).shape}, not (f, {width})")

@@ -87,12 +87,15 @@ def _on_triangle(a, b, c, x, point):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def closest_point(corners, tree, x, point):  # type: ignore[no-untyped-def]
-    """Closest point to ``x`` on the triangles of a tree; returns face, feature and squared distance."""
+def closest_point(corners, tree, x, point, within=np.inf):  # type: ignore[no-untyped-def]
+    """Closest point to ``x`` on the triangles of a tree; returns face, feature and squared distance.
+
+    The face is -1 where none is nearer than the squared distance ``within``.
+    """
     boxes, links, order = tree
     stack, trial = np.empty(128, dtype=np.int64), np.empty(3)
     stack[0], depth = 0, 1
-    best, face, feature = np.inf, -1, 0
+    best, face, feature = within, -1, 0
     while depth > 0:
         depth -= 1
         k = stack[depth]

@@ -1,10 +1,11 @@
 """Coulomb friction as an incremental potential whose normal force and tangent plane are lagged.
 
 The force of a point in touch is at most ``mu`` times its normal force.  In a step it is that of a `Grip` with
-the bound ``mu <-phi>`` mm, where penetration and normal are those of the last equilibrium: a convex potential
-(as in incremental potential contact, Li et al. 2020).  The step is solved again with new ones until they do
-not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks by the penalty
-of the contact, so the width in which sticking goes over into slipping is ``mu`` times the penetration.
+the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are those of the last equilibrium: a
+convex potential (as in incremental potential contact, Li et al. 2020).  The step is solved again with new
+ones until they do not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks
+by the penalty of the contact, so the width in which sticking goes over into slipping is ``mu`` times the
+penetration.
 
 A point is anchored where it is at the end of the step in which it first touched; the anchor of one that slips
 follows it at the distance of the bound (return mapping, Wriggers 2006, chapter 5.2).  So what sticks does not
@@ -46,8 +47,8 @@ class Coulomb(Grip):
 
     def _at(self, near: Distances) -> Coulomb:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
-        normals.reshape(-1, 3)[near.points] = near.slopes
-        bounds.ravel()[near.points] = self.mu * np.maximum(-near.gaps, 0.0)
+        normals.reshape(-1, 3)[near.points] = near.normals
+        bounds.ravel()[near.points] = self.mu * np.maximum(-near.gaps, 0.0) * near.steepness
         return replace(self, normals=normals, bounds=bounds)
 
     def after(self, tool: Tool, du: Array | None) -> Coulomb:
@@ -79,13 +80,14 @@ class Coulomb(Grip):
         return self._coupling(near, _Slip.of(self, tool.local))
 
     def _coupling(self, near: Distances, slip: _Slip) -> Array:
-        bends = np.zeros(slip.tangent.shape)
-        bends.reshape(-1, 3, 3)[near.points] = near.bends
+        bends, deeper = np.zeros(slip.tangent.shape), np.zeros(slip.move.shape)
+        bends.reshape(-1, 3, 3)[near.points] = near.tilts
+        deeper.reshape(-1, 3)[near.points] = near.pressing
         n, move = self.normals, slip.move
         across = np.einsum("fqi,fqi->fq", n, move)[..., None, None]
         turned = -(across * bends + n[..., None] * np.einsum("fqi,fqij->fqj", move, bends)[:, :, None])
         along = np.einsum("fqi,fqij->fqj", slip.unit, turned)[:, :, None]
-        yielding = -self.mu * slip.unit[..., None] * n[:, :, None]
+        yielding = self.mu * slip.unit[..., None] * deeper[:, :, None]
         yielding += slip.share * (turned - slip.unit[..., None] * along)
         found = np.where(slip.stuck[..., None, None], turned, yielding)
         return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)

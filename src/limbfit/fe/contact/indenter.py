@@ -95,6 +95,13 @@ class Indenter:
         move = np.array([*across, distance]) @ self.frame
         return replace(self, centre=np.asarray(self.centre, dtype=float) + move)
 
+    @property
+    def grows(self) -> bool:
+        return False
+
+    def grown(self, share: float) -> Indenter:
+        return self
+
     def placed(
         self, centre: NDArray[np.float64], axis: NDArray[np.float64], edge: NDArray[np.float64]
     ) -> Indenter:

@@ -6,8 +6,7 @@ on the tissue's side.  Points beyond the brim, or farther away than the surface'
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,24 +15,22 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
-from ...shapes.triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
+from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
+from .wall import Wall, checked
 
 Array = NDArray[np.float64]
 # What lies beyond the brim by less than this share of the triangle beside it is still met.
 BEYOND = 0.02
-Wall = tuple[Array, Array, Array, Array, NDArray[np.bool_], Tree]
+Facets = tuple[Array, Array, Array, Array, NDArray[np.bool_], Tree]
 
 
 @dataclass(frozen=True, eq=False)
-class OpenSurface:
-    """An open surface as a rigid body; see the module docstring.
+class OpenSurface(Wall):
+    """An open surface as a rigid body; see the module docstring, and `Wall`.
 
     Parameters
     ----------
-    points : (n, 3) mm, in the body's frame.
-    faces : (m, 3) corners, counter-clockwise seen from the tissue.
-    centre : (3,) the origin of the body's frame, mm.
-    axis, edge : (3,) third and first axis of the frame; an advance moves along ``axis``.
+    points, faces, centre, axis, edge : as in `Wall`.
     reach : distance from which the surface is not felt, mm.
 
     Raises
@@ -42,45 +39,16 @@ class OpenSurface:
         Where it is no triangle surface, or its triangles do not agree on a side.
     """
 
-    points: Array
-    faces: NDArray[np.int64]
-    centre: Sequence[float] | Array = (0.0, 0.0, 0.0)
-    axis: Sequence[float] | Array = (0.0, 0.0, 1.0)
-    edge: Sequence[float] | Array = (1.0, 0.0, 0.0)
     reach: float = 20.0
 
     def __post_init__(self) -> None:
-        points, faces = np.asarray(self.points, dtype=float), np.asarray(self.faces)
-        check_triangles(points, faces, "the open surface")
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        if len(np.unique(edges, axis=0)) < len(edges):
-            raise ProblemError(
-                "the triangles of the open surface do not agree on a side, or more than two meet at an edge",
-                remedy="orient them alike, counter-clockwise seen from the tissue",
-            )
+        points, faces = checked(self.points, self.faces, "the open surface")
         if not self.reach > 0.0:
             raise ProblemError(f"a reach of {self.reach} mm is not positive")
         object.__setattr__(self, "points", points)
-        object.__setattr__(self, "faces", faces.astype(np.int64))
+        object.__setattr__(self, "faces", faces)
 
-    @cached_property
-    def frame(self) -> Array:
-        """(3, 3) orthonormal rows: edge, axis x edge, axis."""
-        axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
-        edge = np.asarray(self.edge, dtype=float)
-        edge = edge - (edge @ axis) * axis
-        edge = edge / np.linalg.norm(edge)
-        return np.array([edge, np.cross(axis, edge), axis])
-
-    @property
-    def width(self) -> float:
-        """Its largest extent across the axis, mm."""
-        return float(np.ptp(self.points[self.faces][..., :2], axis=(0, 1)).max())
-
-    @property
-    def length(self) -> float:
-        """Its extent along the axis, mm."""
-        return float(np.ptp(self.points[self.faces][..., 2]))
+        _ = self._box, self._facets  # derived once, and kept where the surface is placed anew
 
     @cached_property
     def _box(self) -> tuple[Array, Array]:
@@ -88,7 +56,7 @@ class OpenSurface:
         return used.min(axis=0) - self.reach, used.max(axis=0) + self.reach
 
     @cached_property
-    def _wall(self) -> Wall:
+    def _facets(self) -> Facets:
         corners = np.ascontiguousarray(self.points[self.faces])
         normals = triangle_normals(corners)[0]
         sums = normal_spread(self.points, self.faces, normals)[1]
@@ -97,33 +65,20 @@ class OpenSurface:
         tree = build_tree(corners, np.arange(len(corners)))
         return corners, normals, edges, sums[self.faces], _brim(self.faces, beyond < 0), tree
 
-    def placed(self, centre: Array, axis: Array, edge: Array) -> OpenSurface:
-        """The same surface with another frame; what was derived from its triangles is kept."""
-        other = replace(self, centre=centre, axis=axis, edge=edge)
-        other.__dict__.update(_wall=self._wall, _box=self._box)
-        return other
+    @property
+    def grows(self) -> bool:
+        return False
 
-    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> OpenSurface:
-        """The surface, advanced along its axis by ``distance`` mm and ``across`` it along x and y."""
-        move = np.array([*across, distance]) @ self.frame
-        return self.placed(np.asarray(self.centre, dtype=float) + move, *self.frame[[2, 0]])
-
-    def signed_distance(self, points: Array) -> Array:
-        """Distance (n,) of points (n, 3), mm; negative behind the surface, infinite where it is not felt."""
-        local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
-        return self.local_distance(local)[0]
+    def grown(self, share: float) -> OpenSurface:
+        return self
 
     def near(self, points: Array) -> NDArray[np.bool_]:
         """Which points (n, 3) of its frame it may touch."""
         low, high = self._box
         return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 
-    def local_distance(self, points: Array) -> tuple[Array, Array, Array]:
-        """Distance (...), mm, gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
-        shape = points.shape[:-1]
-        x = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
-        values, slopes, bends = wall_distances(x, self._wall, self.reach)
-        return values.reshape(shape), slopes.reshape(*shape, 3), bends.reshape(*shape, 3, 3)
+    def _distances(self, x: Array) -> tuple[Array, Array, Array]:
+        return wall_distances(x, self._facets, self.reach)
 
 
 def _brim(faces: NDArray[np.int64], open_edges: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -42,5 +42,12 @@ class RigidShape(Protocol):
     def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> RigidShape:
         """The shape, advanced along its axis by ``distance`` and ``across`` it."""
 
+    @property
+    def grows(self) -> bool:
+        """Whether it has other forms than its final one."""
+
+    def grown(self, share: float) -> RigidShape:
+        """The shape as it is when it has grown so far, 1: its final one."""
+
     def placed(self, centre: Array, axis: Array, edge: Array) -> RigidShape:
         """The shape with another frame."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .contact import ContactSurface
 from .grip import Grip
-from .tool import Tool
+from .tool import Distances, Tool
 
 Array = NDArray[np.float64]
 
@@ -44,12 +44,16 @@ class Anchors(Grip):
         ``du (r, 3, p)`` is the derivative of the tool's ``u``, where that is wanted.
         """
         local = tool.local
-        gaps, normals, curvatures = tool.body.local_distance(local)
-        closed = gaps < 0.0
+        near = Distances.of(tool)
+        closed, normals = np.zeros_like(self.held), np.zeros_like(self.normals)
+        closed.ravel()[near.points] = near.gaps < 0.0
+        normals.reshape(-1, 3)[near.points] = near.normals
         new = (closed & ~self.held)[..., None]
         d_places, d_normals = self.d_places, self.d_normals
         if du is not None:
             moved = tool.moved(du)
+            curvatures = np.zeros((*normals.shape, 3))
+            curvatures.reshape(-1, 3, 3)[near.points] = near.tilts
             d_places = np.where(new[..., None], moved, d_places)
             d_normals = np.where(new[..., None], curvatures @ moved, d_normals)
         places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)

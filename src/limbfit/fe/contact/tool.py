@@ -119,3 +119,27 @@ class Distances:
             wanted |= also.ravel()
         points = np.flatnonzero(wanted)
         return cls(points, local[points], *tool.body.local_distance(local[points]))
+
+    @cached_property
+    def steepness(self) -> Array:
+        """(k,) length of the gradients: one where gaps are distances, less where a surface fades."""
+        return np.linalg.norm(self.slopes, axis=1)
+
+    @cached_property
+    def normals(self) -> Array:
+        """(k, 3) unit normals; zero where a body is not felt."""
+        return self.slopes / np.where(self.steepness > 0.0, self.steepness, 1.0)[:, None]
+
+    @property
+    def tilts(self) -> Array:
+        """(k, 3, 3) derivatives of the unit normals, 1/mm."""
+        n, steep = self.normals, np.where(self.steepness > 0.0, self.steepness, 1.0)
+        along = n[:, :, None] * np.einsum("ki,kij->kj", n, self.bends)[:, None]
+        return (self.bends - along) / steep[:, None, None]
+
+    @property
+    def pressing(self) -> Array:
+        """(k, 3) derivatives of the normal force of points in touch, ``-gap |slope|``."""
+        gaps = np.where(np.isfinite(self.gaps), self.gaps, 0.0)[:, None]
+        bent = np.einsum("kij,kj->ki", self.bends, self.normals)
+        return -(self.steepness[:, None] * self.slopes + gaps * bent)
