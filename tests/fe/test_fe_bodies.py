@@ -153,6 +153,12 @@ def test_a_body_goes_over_from_displacement_to_force():
     np.testing.assert_allclose(found.reactions[7:10, 0, 2], force, rtol=1e-6)
     assert (np.diff(found.coordinates[6:10, 0, 2]) > 0.0).all()
     assert (np.diff(found.coordinates[9:, 0, 2]) < 0.0).all()  # unloaded, it comes out again
+    left = Motion.of([0.0, 1.0, 2.0], force={"z": [np.nan, force, 0.0]})  # the force that holds it then
+    opened = replace(tool, motion=pressed.then(left))
+    again = solve(replace(problem, indenter=None, bodies=(opened,), history=history), control)
+    np.testing.assert_allclose(again.reactions[:, 0, 2], found.reactions[:, 0, 2], rtol=1e-3, atol=1e-9)
+    with pytest.raises(ProblemError, match="leaves open with which force it begins"):
+        solve(replace(problem, indenter=None, bodies=(replace(tool, motion=left),), history=history))
 
 
 def test_a_free_plate_lies_down_on_what_is_askew():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ class Motion:
     times : (n,) s, from 0.  One that stands twice ends what went before and begins what follows: there a
         coordinate may go over from displacement to force, or back.
     values : (n, 6) of the `COORDINATES`: mm and rad; of forced ones the force, N, or the moment, N mm.
+        Where a coordinate goes over to force (`then`), nan is the force that holds it then.
     forced : (6,), or (n - 1, 6) for each interval: which coordinates are driven by force; the others are
         held at their values.
     growth : (n,) how far the shape has grown, from 0, its ``clear`` one, to 1, its final one; 1 throughout
@@ -41,9 +42,10 @@ class Motion:
         times, values = np.asarray(self.times, dtype=float), np.asarray(self.values, dtype=float)
         if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 6):
             raise ProblemError("a motion needs two or more times and six values for each")
-        if not (np.isfinite(times).all() and np.isfinite(values).all()):
-            raise ProblemError("a motion holds values that are not finite")
         steps = np.diff(times)
+        begun = np.append(True, steps == 0.0)  # the first row, and those after a time that stands twice
+        if not (np.isfinite(times).all() and np.isfinite(values[~begun]).all()) or np.isinf(values).any():
+            raise ProblemError("a motion holds values that are not finite")
         twice = np.flatnonzero(steps == 0.0)
         if times[0] != 0.0 or (steps < 0.0).any() or 0 in twice or (np.diff(twice) == 1).any():
             raise ProblemError("the times of a motion do not grow from 0")
@@ -55,10 +57,13 @@ class Motion:
             raise ProblemError("the growth of a motion is not one share for each time")
         if not ((growth >= 0.0) & (growth <= 1.0)).all():
             raise ProblemError("the growth of a motion is not between 0 and 1")
+        forced = np.broadcast_to(forced, (len(times) - 1, 6))
+        if (np.isnan(values[:-1]) & ~forced).any() or np.isnan(values[-1]).any():
+            raise ProblemError("a motion leaves open where a coordinate is held", remedy="state its value")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "growth", growth)
-        object.__setattr__(self, "forced", np.broadcast_to(forced, (len(times) - 1, 6)))
+        object.__setattr__(self, "forced", forced)
 
     @classmethod
     def of(
@@ -92,6 +97,11 @@ class Motion:
             np.concatenate([np.asarray(self.growth), np.asarray(after.growth)]),
         )
 
+    def taken_over(self, t: float, reaction: Array) -> Motion:
+        """With forces (6,) where values begin to be forces at time ``t`` and are left open."""
+        here = np.isclose(self.times, t, rtol=1e-9, atol=0.0)[:, None] & np.isnan(self.values)
+        return replace(self, values=np.where(here, reaction, self.values)) if here.any() else self
+
     @property
     def free(self) -> NDArray[np.bool_]:
         """(6,) which coordinates a force drives at some time."""
@@ -121,7 +131,7 @@ class Motion:
         """Times between the ends where a rate changes, or what drives, s."""
         steps = np.diff(self.times)
         kept = steps > 0.0
-        rates, forced = np.diff(self._driven, axis=0)[kept] / steps[kept, None], np.asarray(self.forced)[kept]
+        rates, forced = np.diff(np.nan_to_num(self._driven), axis=0)[kept] / steps[kept, None], np.asarray(self.forced)[kept]
         size = np.abs(rates).max(axis=0, initial=0.0)
         changed = (np.abs(np.diff(rates, axis=0)) > 1e-9 * size).any(axis=1)
         changed |= (forced[1:] != forced[:-1]).any(axis=1)

@@ -189,6 +189,15 @@ class Problem:
         """What drives the rigid bodies at time ``t``."""
         return Drives.of([body.motion for body in self.rigid_bodies], t)
 
+    def taken_over(self, t: float, reactions: NDArray[np.float64]) -> Problem:
+        """With the ``reactions (b, 6)`` of the bodies at time ``t`` as the forces that are left open then."""
+        first = len(self.rigid_bodies) - len(self.bodies)
+        moved = [body.motion.taken_over(t, reactions[first + i]) for i, body in enumerate(self.bodies)]
+        if all(motion is body.motion for motion, body in zip(moved, self.bodies)):
+            return self
+        bodies = tuple(replace(body, motion=motion) for body, motion in zip(self.bodies, moved))
+        return replace(self, bodies=bodies)
+
     @property
     def turns(self) -> NDArray[np.float64]:
         """Times where what drives a further body, or a pressure, turns, s."""
@@ -308,6 +317,11 @@ def _check_bodies(problem: Problem) -> None:
             raise ProblemError(f"pressed faces have shape {np.asarray(one.faces).shape}, not (f, {width})")
     end = problem.history.times[-1]
     for i, body in enumerate(problem.bodies):
+        if np.isnan(body.motion.values[0]).any():
+            raise ProblemError(
+                f"the motion of {body.name or f'body {i}'} leaves open with which force it begins",
+                remedy="state it; only a coordinate that was held before may take over its force",
+            )
         if body.motion.times[-1] < end * (1.0 - 1e-9):
             raise ProblemError(
                 f"the motion of {body.name or f'body {i}'} ends at {body.motion.times[-1]:g} s, before the "

@@ -114,6 +114,7 @@ class Simulation:
                 continue
             pace.done(now, t, self.counts["newton_iterations"] - before)
             why = ""
+            self.problem = self.problem.taken_over(t, found.reactions)
             times.append(t)
             forces.append(found.force)
             if t == targets[0]:
@@ -319,7 +320,7 @@ def _travel(problem: Problem, modulus: float) -> float:
     bodies = problem.rigid_bodies
     if not bodies:
         return float(np.abs(problem.history.driver).max())
-    sizes = [np.abs(body.motion.values[:, :3]) for body in bodies]
+    sizes = [np.abs(np.nan_to_num(body.motion.values[:, :3])) for body in bodies]
     ways = [np.where(body.motion.free[:3], 0.0, size).max() for body, size in zip(bodies, sizes)]
     if max(ways) > 0.0:
         return float(max(ways))
