@@ -52,7 +52,7 @@ def nodal_forces(system: System, laws: Laws, state: State) -> Array:
     """
     increment = Increment(
         state.time, state.displacement, np.ones(len(laws.prony)), _relaxing(system, laws, state),
-        state.penalty * laws.modulus, state.drives,
+        state.penalty * laws.modulus, state.drives, state.grips,
     )  # fmt: skip
     found = system.evaluate(state.rows, laws, increment, tangent=False)
     return found.residual[: system.nodes]
@@ -96,7 +96,9 @@ def contact_pressure(system: System, laws: Laws, state: State) -> Array:
 def _contact_forces(system: System, laws: Laws, state: State) -> Array:
     """Nodal forces (n, 3) of all contact, N."""
     nothing, penalty = np.zeros(0), state.penalty * laws.modulus
-    increment = Increment(state.time, state.displacement, nothing, nothing, penalty, state.drives)
+    increment = Increment(
+        state.time, state.displacement, nothing, nothing, penalty, state.drives, state.grips
+    )
     return system.contact_force(state.rows, increment)[: system.nodes]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .contact.grip import Grip
 from .doubts import Doubt
 from .history import Memory
 from .interpolation import interpolate
@@ -24,7 +25,8 @@ class State:
 
     ``penalty`` (1/mm) is that of the contact which holds ``u`` in equilibrium.  ``coordinates (2 k, 3)``:
     moves and turns of the bodies that a force drives, mm, in the rows of `System`; ``bodies`` their
-    derivatives (2 k, 3, p).  ``drives`` are what drives all bodies then.
+    derivatives (2 k, 3, p).  ``drives`` are what drives all bodies then, ``grips`` what holds points along
+    them.
     """
 
     time: float
@@ -36,6 +38,7 @@ class State:
     coordinates: Array = field(default_factory=lambda: np.zeros((0, 3)))
     bodies: Array | None = None
     drives: Drives = field(default_factory=Drives.none)
+    grips: tuple[Grip | None, ...] = ()
 
     @property
     def rows(self) -> Array:
@@ -126,6 +129,29 @@ class Result:
     def reaction(self) -> Array:
         """(n, 3) force of the indenter along x, y and z of its frame, N; the last column is ``force``."""
         return self.reactions[:, 0, :3]
+
+    @property
+    def imbalance(self) -> Array:
+        """(n, b) how far the contact of each body is from the forces and moments that are stated for it.
+
+        The larger of two shares: of the force, N, and of the moment about the pivot, N mm, the latter over
+        the stated moment or the force times half the body's width.  0 where nothing is stated.
+        """
+        return np.array([self._imbalance(i) for i in range(len(self.times))])
+
+    def _imbalance(self, i: int) -> Array:
+        drives, out = self.problem.drives(float(self.times[i])), np.zeros(self.reactions.shape[1])
+        for j, body in enumerate(self.problem.rigid_bodies):
+            stated = np.where(drives.forced[j], drives.values[j], 0.0)
+            off = np.where(drives.forced[j], self.reactions[i, j] - stated, 0.0)
+            force = float(
+                np.linalg.norm(np.where(drives.forced[j, :3], stated[:3], self.reactions[i, j, :3]))
+            )
+            moment = max(float(np.linalg.norm(stated[3:])), 0.5 * body.shape.width * force)
+            for part, size in ((off[:3], force), (off[3:], moment)):
+                missed = float(np.linalg.norm(part))
+                out[j] = max(out[j], missed / size if missed > 0.0 and size > 0.0 else 0.0)
+        return out
 
     @property
     def peak_force(self) -> float:

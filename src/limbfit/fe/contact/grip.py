@@ -10,8 +10,8 @@ is a convex potential with a symmetric tangent.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,10 @@ class Grip(ABC):
         """What the contact kernel takes of it, point by point."""
         places, normals = self.places.reshape(-1, 3), self.normals.reshape(-1, 3)
         return self.held.ravel(), places, normals, self.bounds.ravel()
+
+    def bare(self) -> Self:
+        """The grip without derivatives, to be kept."""
+        return replace(self, d_places=np.zeros((*self.held.shape, 3, 0)))
 
     @abstractmethod
     def renewed(self, tool: Tool) -> Grip:

@@ -10,6 +10,7 @@ solved again.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,11 @@ class Anchors(Grip):
         shape = surface.areas.shape
         vectors, slopes = np.zeros((*shape, 3)), np.zeros((*shape, 3, parameters))
         return cls(np.zeros(shape, dtype=bool), vectors, vectors, np.full(shape, np.inf), slopes, slopes)
+
+    def bare(self) -> Self:
+        """The anchors without derivatives, to be kept."""
+        nothing = np.zeros((*self.held.shape, 3, 0))
+        return replace(self, d_places=nothing, d_normals=nothing)
 
     def renewed(self, tool: Tool) -> Anchors:
         """The anchors without those whose points left the indenter."""

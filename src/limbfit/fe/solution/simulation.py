@@ -272,7 +272,8 @@ class Simulation:
     ) -> State:  # fmt: skip
         n = self.system.nodes
         slopes = (None, None) if du is None else (du[:n], du[n:])
-        return State(time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives)
+        grips = tuple(grip and grip.bare() for grip in self.grips)
+        return State(time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives, grips)
 
     def _turns(self, t: float, force: float) -> bool:
         """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
