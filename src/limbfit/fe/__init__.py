@@ -38,6 +38,7 @@ from .solution.guesses import tangent_at_rest
 from .solution.linear import linear_solver
 from .solution.stepping import iterate, solve
 from .system import System
+from .tractions import Tractions, tractions
 
 __all__ = [
     "ELEMENTS",
@@ -64,8 +65,10 @@ __all__ = [
     "StepControl",
     "Support",
     "System",
+    "Tractions",
     "iterate",
     "linear_solver",
     "solve",
     "tangent_at_rest",
+    "tractions",
 ]

@@ -110,7 +110,7 @@ def _result(
     penetration, bodies = column("penetration"), len(problem.rigid_bodies)
     doubts = _doubts(run, deepest, displacement, force, penetration)
     return Result(
-        problem=problem,
+        problem=run.problem,
         times=column("time"),
         displacement=displacement,
         force=force,

@@ -1,0 +1,153 @@
+"""A limb in its socket as a problem for the solver, and when that steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from ..fe import History, Motion, Problem, RigidBody, SmoothSurface, StepControl
+from ..fe.materials import Material
+from ..fe.motion import COORDINATES
+from ..mesh import Mesh
+from ..socket import Socket
+
+Array = NDArray[np.float64]
+
+ELEMENT = "tet10p0"
+OUTER = "skin"  # the face set that the socket may touch, the liner's where there is one
+# Steps while the socket comes on, is held, is loaded and is held again; what relaxes does so fastest at first.
+COMING_ON, HELD, LOADING = 8, 6, 6
+RELAXING = 2.0  # power of the step's number that the time in a hold goes with
+# The stiffness of contact, MPa/mm: where pressures are the largest, 0.2 MPa, the wall is met to 0.1 mm.
+STIFFNESS = 2.0
+
+
+@dataclass(frozen=True)
+class Load:
+    """A load on the socket: ``force (3,)`` N and ``moment (3,)`` N mm about ``point (3,)``, LPS.
+
+    It comes on within ``ramp_s`` from what was there before, and stays for ``hold_s``.
+    """
+
+    name: str
+    force: Array
+    moment: Array
+    point: Array
+    ramp_s: float = 1.0
+    hold_s: float = 2.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a socket comes on a limb, and what it is loaded by then.
+
+    Parameters
+    ----------
+    pivot : (3,) LPS mm, the point that its way is told of, such as the knee centre.
+    proximal, anterior : (3,) unit vectors at right angles.
+    friction : Coulomb's coefficient, or ``frictionless`` or ``sticky``.
+    donning_s, hold_s : how long it grows, or slides on, and then rests.
+    travel_mm : it slides on from so far distal in its final shape; None: it grows where it is.
+    """
+
+    pivot: Array
+    proximal: Array
+    anterior: Array
+    friction: float | str = 0.5
+    donning_s: float = 2.0
+    hold_s: float = 10.0
+    travel_mm: float | None = None
+    loads: Sequence[Load] = ()
+
+    @property
+    def frame(self) -> Array:
+        """(3, 3) rows: the axes of the socket's coordinates, anterior first, proximal last."""
+        return np.array([self.anterior, np.cross(self.proximal, self.anterior), self.proximal])
+
+    @property
+    def ends(self) -> tuple[tuple[str, float, float], ...]:
+        """Name, end of coming on and end of the hold, s, of donning and of every load."""
+        ends, start = [], 0.0
+        for name, ramp, hold in (
+            ("donning", self.donning_s, self.hold_s),
+            *((load.name, load.ramp_s, load.hold_s) for load in self.loads),
+        ):
+            ends.append((name, start + ramp, start + ramp + hold))
+            start += ramp + hold
+        return tuple(ends)
+
+
+def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket, fit: Fit) -> Problem:
+    """The limb's mesh in a socket that is put on and loaded.
+
+    Bones and the proximal cut are held, so the socket moves: its loads are those that it exerts.
+
+    Parameters
+    ----------
+    mesh : LPS mm, with the face set ``skin`` and node sets ``fixed_*``.
+    materials : by region.
+    """
+    frame = fit.frame
+    local = (socket.points - fit.pivot) @ frame.T
+    clear = None if fit.travel_mm is not None else (socket.clear - fit.pivot) @ frame.T
+    shape = SmoothSurface.of(local, socket.faces, clear, centre=fit.pivot, axis=frame[2], edge=frame[0])
+    held = [nodes for name, nodes in mesh.node_sets.items() if name.startswith("fixed_")]
+    motion = _donning(fit)
+    before = None
+    for load in fit.loads:
+        after = _wrench(load, fit)
+        motion, before = motion.then(_loading(load, before, after)), after
+    body = RigidBody(shape, mesh.face_sets[OUTER], motion, fit.friction, name="socket")
+    return Problem(
+        mesh=mesh,
+        materials=materials,
+        fixed=np.unique(np.concatenate(held)),
+        contact_faces=np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64),
+        indenter=None,
+        history=History(np.array([0.0, motion.times[-1]]), np.zeros(2)),
+        bodies=(body,),
+        element=ELEMENT,
+    )
+
+
+def _donning(fit: Fit) -> Motion:
+    times, growth, z = [0.0, fit.donning_s], [0.0, 1.0], [0.0, 0.0]
+    if fit.travel_mm is not None:
+        growth, z = [1.0, 1.0], [-fit.travel_mm, 0.0]
+    if fit.hold_s > 0.0:
+        times, growth, z = [*times, fit.donning_s + fit.hold_s], [*growth, 1.0], [*z, 0.0]
+    return Motion.of(times, growth=growth, z=z)
+
+
+def _wrench(load: Load, fit: Fit) -> Array:
+    """(6,) force, N, and moment about the pivot, N mm, in the socket's coordinates."""
+    force = np.asarray(load.force, dtype=float)
+    moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
+    return np.concatenate([fit.frame @ force, fit.frame @ moment])
+
+
+def _loading(load: Load, before: Array | None, after: Array) -> Motion:
+    """From the last load, or from what holds the donned socket, to this one."""
+    if not load.ramp_s > 0.0:
+        raise ProblemError(f"the load {load.name!r} comes on within {load.ramp_s:g} s", remedy="give it time")
+    rows = [np.full(6, np.nan) if before is None else before, after, after]
+    times = [0.0, load.ramp_s, load.ramp_s + load.hold_s]
+    count = 3 if load.hold_s > 0.0 else 2
+    values = np.array(rows[:count])
+    return Motion.of(times[:count], force=dict(zip(COORDINATES, values.T, strict=True)))
+
+
+def socket_steps(problem: Problem, fit: Fit, modulus: float) -> StepControl:
+    """When a socket's simulation steps, and its contact stiffness; ``modulus`` as `Laws.modulus`, MPa."""
+    times: list[float] = []
+    for i, (_, on, off) in enumerate(fit.ends):
+        start = times[-1] if times else 0.0
+        count = LOADING if i else COMING_ON
+        times += [start + (on - start) * k / count for k in range(1, count + 1)]
+        if off > on:
+            times += [on + (off - on) * (k / HELD) ** RELAXING for k in range(1, HELD + 1)]
+    return StepControl(times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True)
