@@ -20,6 +20,7 @@ FLOORS = [
     {"report", "phantom"},
     {"indentation", "notebook"},
     {"study", "febio", "fields", "acquire"},
+    {"socket"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},
     {"extensions"},

@@ -167,6 +167,19 @@ READ: dict[str, str] = {
     **{key: "pipeline/shared/context.py" for key in KEYS if key.startswith("execution.")},
     **{key: "acquire/" for key in KEYS if key.startswith("acquire.")},
     "acquire.key_gap_ms": "cli/acquire.py",
+    **{key: "pipeline/shared/socket_shape.py" for key in KEYS if key.startswith("socket.")},
+    **dict.fromkeys(
+        ("socket.donning_s", "socket.hold_s", "socket.loads.duration_s", "socket.loads.hold_s"),
+        "study/socket.py",
+    ),
+    **{key: "study/socket.py" for key in KEYS if key.startswith("socket.liner.")},
+    **dict.fromkeys(
+        (
+            *("socket.friction", "socket.edge_mm", "socket.donning", "socket.travel_mm"),
+            "socket.liner.thickness_mm",
+        ),
+        "pipeline/verbs/check.py",
+    ),
     **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},
 }
 # How else the tables above name them.
@@ -260,6 +273,28 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         (GIVEN, {"execution": {"workers": 1, key: 9.0}}, f"execution.{key}")
         for key in ("time_limit_s", "memory_limit_GB")
     ],
+    *[
+        (GIVEN, {"socket": {"file": "other.stl", key: value}}, f"socket.{key}")
+        for key, value in {
+            **{"reduction_percent": 2.0, "trim_mm": 5.0, "flare_mm": 0.0, "distal": "bearing"},
+            **{"areas": [{"name": "1", "region": "tibial crest", "radius_mm": 9.0, "depth_mm": 2.0}]},
+            **{"trim_planes": [{"point": [0.0, 0.0, 9.0]}], "trimline": [[0, 0, 0], [9, 0, 0], [0, 9, 0]]},
+            **{"distal_clearance_mm": 2.0, "face_edge_mm": 5.0},
+        }.items()
+    ],
+    (GIVEN, {"socket.unit": "m"}, "socket.unit"),
+    (GIVEN, {"socket.space": "RAS"}, "socket.space"),
+    (GIVEN, {"socket": {"distal": "bearing", "distal_clearance_mm": 2.0}}, "socket.distal_clearance_mm"),
+    (GIVEN, {"socket.travel_mm": 20.0}, "socket.travel_mm"),
+    *[
+        (GIVEN, {"socket": {"liner": {"thickness_mm": 0, key: value}}}, f"socket.liner.{key}")
+        for key, value in {"material": "gel", "c_kPa": 9.0, "m": 2.0, "gamma": 1.0, "tau_s": 1.0}.items()
+    ],
+    (
+        GIVEN,
+        {"socket": {"loads": [{"name": "1", "force_N": [0, 0, 9]}], "body_weight_N": 700.0}},
+        "socket.body_weight_N",
+    ),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
     (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),

@@ -50,6 +50,10 @@ _OWN_LABELS = "the study's own labels win over the automatic segmentation"
 _NO_BONES = "[surfaces] has no bones"
 _ONE_LENGTH = "edge_far_mm is no longer than edge_near_mm, so edges have one length"
 _AUTOMATIC = ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
+_SHAPE = (
+    *("reduction_percent", "areas", "trim_mm", "trim_planes", "trimline", "flare_mm", "distal"),
+    *("distal_clearance_mm", "face_edge_mm"),
+)
 _SOURCES = ("layer_mm", "position_mm", "axis_degrees", "edge_radius_mm")
 
 VAIN: tuple[Vain, ...] = (
@@ -148,6 +152,38 @@ VAIN: tuple[Vain, ...] = (
         ("uncertainty.edge_radius_mm",),
         lambda s: not SHAPES[s.indenter.shape].is_edge_doubted,
         "it is that of a square indenter",
+    ),
+    Vain(
+        tuple(f"socket.{key}" for key in _SHAPE),
+        lambda s: s.socket.file is not None,
+        "the socket's shape is that of socket.file",
+    ),
+    Vain(
+        ("socket.unit", "socket.space"),
+        lambda s: s.socket.file is None,
+        "it belongs to a socket from a file",
+        "give socket.file, or leave it out",
+    ),
+    Vain(
+        ("socket.distal_clearance_mm",),
+        lambda s: s.socket.distal == "bearing",
+        "the distal end bears",
+    ),
+    Vain(
+        ("socket.travel_mm",),
+        lambda s: s.socket.donning == "growth",
+        'donning = "growth" has no travel',
+        'give donning = "insertion", or leave it out',
+    ),
+    Vain(
+        tuple(f"socket.liner.{key}" for key in ("material", "c_kPa", "m", "gamma", "tau_s")),
+        lambda s: s.socket.liner.thickness_mm == 0,
+        "a liner of 0 mm is none",
+    ),
+    Vain(
+        ("socket.body_weight_N",),
+        lambda s: all(load.preset is None for load in s.socket.loads),
+        "no load is a preset",
     ),
     Vain(
         ("execution.time_limit_s", "execution.memory_limit_GB"),

@@ -15,6 +15,7 @@ from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .material import MaterialTable
 from .meshing import MeshTable
+from .socket import SocketTable
 from .tables import (
     CalibrationTable,
     ExecutionTable,
@@ -55,6 +56,7 @@ class Study(TomlTable):
     febio: FebioTable = FebioTable()
     execution: ExecutionTable = ExecutionTable()
     acquire: AcquireTable = AcquireTable()
+    socket: SocketTable = SocketTable()
     file: Path = Field(default=Path("study.toml"), exclude=True)
     notes: tuple[str, ...] = Field(default=(), exclude=True)
 
@@ -134,6 +136,7 @@ class Study(TomlTable):
             "segmentation.labels": self.segmentation.labels,
             "segmentation.contours": self.segmentation.contours,
             "indenter.file": self.indenter.file,
+            "socket.file": self.socket.file,
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
             **{f"sites.{site.name}.trace": site.trace for site in self.sites},
         }

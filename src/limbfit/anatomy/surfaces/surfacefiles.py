@@ -24,7 +24,11 @@ _HEAD = 4096  # bytes in which a file may state its space
 
 
 def read_surface(
-    path: str | Path, coordinates: Literal["LPS", "RAS"] | None = None, unit: str = "mm"
+    path: str | Path,
+    coordinates: Literal["LPS", "RAS"] | None = None,
+    unit: str = "mm",
+    *,
+    key: str = "surfaces.coordinates",
 ) -> Surface:
     """A surface from .stl, .ply, .vtp or .obj, in LPS mm; coincident points are merged.
 
@@ -33,6 +37,7 @@ def read_surface(
     path : the file.
     coordinates : what the file holds; by default what it says itself, as those of 3D Slicer do, else LPS.
     unit : of the file: mm, cm, m or inch.
+    key : of the study that says the coordinates, for the error's text.
 
     Raises
     ------
@@ -53,7 +58,7 @@ def read_surface(
         raise SurfaceError(
             f"the file says that it is in {stated}, the study says {coordinates}",
             file=path,
-            remedy="correct surfaces.coordinates, or export the surface again",
+            remedy=f"correct {key}, or export the surface again",
         )
     sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
     return _merged(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))

@@ -183,6 +183,19 @@ def _check_edges(surface: Surface, name: str, file: str | Path | None) -> None:
             file=file,
             remedy="close its holes",
         )
+    check_sides(surface, name, file)
+
+
+def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> None:
+    """Refuse a surface, open or closed, whose triangles do not agree on a side.
+
+    Raises
+    ------
+    SurfaceError
+        For edges of more than two faces, and for neighbours that are oriented against each other.
+    """
+    edges = half_edges(surface.faces)
+    counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
     if counts.max() > 2:
         raise SurfaceError(
             f"{name}: {int((counts > 2).sum())} edges join more than two faces",

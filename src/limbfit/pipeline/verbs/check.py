@@ -11,6 +11,7 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...indentation import read_indenter
 from ...study import Study
 from ..shared.context import Listener, Progress, quiet
+from ..shared.socket_shape import load_of, socket_of
 from ..shared.store import Store
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
@@ -62,6 +63,8 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
             "(limbfit run --until sites, then check again)"
         )
+    if "socket" in study.model_fields_set:
+        facts += _socket_facts(study, anatomy)
     flags = record_flags(study, sites, steps, placed, anatomy)
     listener(Progress("check", 2, 2))
     return {
@@ -95,6 +98,32 @@ def _image_facts(study: Study) -> list[str]:
         facts.append("corrected labels: " + ", ".join(labels.names.values()))
         facts += [f"label map: {note}" for note in notes]
     return facts
+
+
+def _socket_facts(study: Study, anatomy: Anatomy | None) -> list[str]:
+    """What ``[socket]`` says; where the limb is known, the socket around its bare skin."""
+    table = study.socket
+    liner = f"a liner of {table.liner.thickness_mm:g} mm" if table.liner.thickness_mm else "no liner"
+    travel = f" over {table.travel_mm:g} mm" if table.travel_mm else ""
+    facts = [
+        f"socket: {liner}, friction {table.friction}, donning by {table.donning}{travel}; "
+        f"{', '.join(load.name for load in table.loads) or 'no load'}; limb meshed at {table.edge_mm:g} mm"
+    ]
+    if anatomy is None:
+        return [
+            *facts,
+            "the socket's shape is checked after limbfit run --until sites",
+        ]
+    socket = socket_of(study, anatomy, anatomy.skin)
+    for load in table.loads:
+        load_of(study, load, anatomy)
+    depth = socket.offset(anatomy.skin)
+    return [
+        *facts,
+        *(f"socket: {note}" for note in socket.notes),
+        f"socket: {socket.volume_mm3 / 1000:.0f} cm3, from {-depth.min():.1f} mm outside the skin to "
+        f"{depth.max():.1f} mm inside it",
+    ]
 
 
 def _sampling(name: str, volume: Volume) -> str:

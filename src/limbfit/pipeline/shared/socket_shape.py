@@ -1,0 +1,135 @@
+"""The socket of a study: its table ``[socket]`` and a limb's anatomy to a face around that limb."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...anatomy.frame import limb_frame
+from ...anatomy.surfaces.surfaces import Anatomy
+from ...anatomy.surfaces.triangles import Surface
+from ...errors import StudyError, SurfaceError
+from ...socket import Area, Recipe, Socket, read_socket, rectified
+from ...socket.landmarks import bone, directions, knee_centre
+from ...socket.loads import STANDARD_LOADS
+from ...socket.regions import Region, default_regions, stated_region
+from ...socket.trim import Trim
+from ...study import Study
+from ...study.socket import SocketAreaTable, SocketLoadTable
+
+Array = NDArray[np.float64]
+
+BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
+BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
+
+
+def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
+    """The study's socket around a limb: read from its file, or rectified from the limb.
+
+    Parameters
+    ----------
+    anatomy : of the limb.
+    outer : the closed surface that the socket touches, skin or liner on skin; flat at the same proximal cut.
+
+    Raises
+    ------
+    StudyError
+        With the key and the remedy.
+    """
+    table, frame = study.socket, limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    with _blaming(study):
+        if table.file is not None:
+            return read_socket(
+                study.path(table.file), table.unit, table.space, outer=outer, frame=frame, bones=anatomy.bones
+            )
+        regions = regions_of(study, anatomy)
+        recipe = Recipe(
+            trim=trim_of(study, anatomy),
+            reduction_percent=table.reduction_percent,
+            areas=[_area(study, area, regions) for area in table.areas],
+            flare_mm=table.flare_mm,
+            distal=table.distal,
+            distal_clearance_mm=table.distal_clearance_mm,
+            edge_mm=table.face_edge_mm,
+        )
+        return rectified(outer, frame, recipe)
+
+
+def trim_of(study: Study, anatomy: Anatomy) -> Trim:
+    """Where the brim runs: as stated, else a plane across the limb below the knee or the proximal cut."""
+    table = study.socket
+    planes = [(np.array(plane.point), np.array(plane.normal)) for plane in table.trim_planes]
+    line = np.array(table.trimline) if table.trimline else None
+    if planes or line is not None:
+        return Trim(planes, line)
+    knee = knee_centre(anatomy)
+    below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if knee is None else BELOW_KNEE_MM)
+    return Trim([(anatomy.cut_point + (_top(anatomy) - below) * anatomy.cut_normal, anatomy.cut_normal)])
+
+
+def _top(anatomy: Anatomy) -> float:
+    """Height of the tibia's top over the proximal cut, mm; that of the cut where no bone is a tibia."""
+    tibia = bone(anatomy, "tibia")
+    return 0.0 if tibia is None else float(anatomy.height(tibia.points).max())
+
+
+def regions_of(study: Study, anatomy: Anatomy) -> dict[str, Region]:
+    """Named regions of the skin: those of any limb, and the study's own, which win."""
+    known = directions(anatomy, study.socket.side)
+    regions = default_regions(anatomy, known)
+    with _blaming(study):
+        for one in study.socket.regions:
+            regions[one.name] = stated_region(anatomy, one.name, np.array(one.position), one.radius_mm)
+    return regions
+
+
+def _area(study: Study, area: SocketAreaTable, regions: Mapping[str, Region]) -> Area:
+    if area.position is not None:
+        return Area(area.name, np.array(area.position), area.radius_mm, area.depth_mm)
+    region = regions.get(area.region or "")
+    if region is None:
+        raise StudyError(
+            f"no region is named {area.region!r}",
+            file=study.file,
+            place=f"socket.areas.{area.name}.region",
+            remedy="the limb has " + ", ".join(regions),
+        )
+    return Area(area.name, region.position, area.radius_mm, area.depth_mm)
+
+
+def load_of(study: Study, load: SocketLoadTable, anatomy: Anatomy) -> tuple[Array, Array, Array]:
+    """Force (3,) N and moment (3,) N mm on the socket about a point (3,) mm, all LPS.
+
+    Raises
+    ------
+    StudyError
+        Where the knee centre or the side of the limb must be known and is not.
+    """
+    point = knee_centre(anatomy) if load.point is None else np.array(load.point)
+    if point is None:
+        raise StudyError(
+            "the knee centre is not known: no bone is named tibia",
+            file=study.file,
+            place=f"socket.loads.{load.name}.point",
+            remedy="state the point about which the moment is meant (LPS, mm)",
+        )
+    if load.preset is None:
+        return np.array(load.force_N), np.array(load.moment_Nmm), point
+    standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
+    with _blaming(study):
+        known = directions(anatomy, study.socket.side)
+        return standard.force(weight, known), standard.moment(weight, known), point
+
+
+@contextmanager
+def _blaming(study: Study) -> Iterator[None]:
+    """What is wrong with the shape is said of the study's table."""
+    try:
+        yield
+    except SurfaceError as error:
+        place = "socket" if error.file is None else "socket.file"
+        what = error.what if error.file is None else f"{error.file}: {error.what}"
+        raise StudyError(what, file=study.file, place=place, remedy=error.remedy) from None

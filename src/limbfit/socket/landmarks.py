@@ -1,0 +1,88 @@
+"""Where anterior and medial are on a limb, and where its knee is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.surfaces.surfaces import Anatomy
+from ..anatomy.surfaces.triangles import Surface
+from ..errors import SurfaceError
+
+Array = NDArray[np.float64]
+
+PLATEAU_MM = 8.0  # of the tibia's top: its mean is the knee centre
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Unit vectors (3,) in LPS, at right angles; ``lateral`` is None where the side is not known."""
+
+    proximal: Array
+    anterior: Array
+    lateral: Array | None
+
+    @property
+    def medial(self) -> Array:
+        """Towards the other leg.
+
+        Raises
+        ------
+        SurfaceError
+            Where the side of the limb is not known.
+        """
+        if self.lateral is None:
+            raise SurfaceError(
+                "medial and lateral are not known: no bones are named tibia and fibula",
+                remedy='state socket.side ("left" or "right")',
+            )
+        return -self.lateral
+
+
+def directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -> Directions:
+    """The directions of a limb: proximal by its cut, anterior by patient space, lateral by fibula or side.
+
+    Parameters
+    ----------
+    side : of the patient; by default lateral is where the fibula lies beside the tibia.
+
+    Raises
+    ------
+    SurfaceError
+        For a limb that lies along the anterior axis of patient space.
+    """
+    proximal = anatomy.cut_normal
+    anterior = np.array([0.0, -1.0, 0.0])
+    anterior = anterior - (anterior @ proximal) * proximal
+    if np.linalg.norm(anterior) < 0.3:
+        raise SurfaceError(
+            "the limb lies along the anterior axis of patient space, so its front is not known",
+            remedy="check that the surfaces are in LPS or RAS, as the study says",
+        )
+    anterior /= np.linalg.norm(anterior)
+    across = np.cross(proximal, anterior)  # to the patient's left
+    if side is None:
+        tibia, fibula = bone(anatomy, "tibia"), bone(anatomy, "fibula")
+        if tibia is None or fibula is None:
+            return Directions(proximal, anterior, None)
+        apart = float((fibula.points.mean(axis=0) - tibia.points.mean(axis=0)) @ across)
+        return Directions(proximal, anterior, across if apart > 0.0 else -across)
+    return Directions(proximal, anterior, across if side == "left" else -across)
+
+
+def bone(anatomy: Anatomy, name: str) -> Surface | None:
+    """The bone of that name, however it is spelled: ``Tibia left`` is a tibia."""
+    return next((b for key, b in anatomy.bones.items() if name in key.lower()), None)
+
+
+def knee_centre(anatomy: Anatomy) -> Array | None:
+    """(3,) LPS mm, the middle of the tibia's top; None where no bone is named tibia."""
+    tibia = bone(anatomy, "tibia")
+    if tibia is None:
+        return None
+    height = anatomy.height(tibia.points)
+    top = tibia.points[height > height.max() - PLATEAU_MM]
+    return np.asarray((top.min(axis=0) + top.max(axis=0)) / 2)

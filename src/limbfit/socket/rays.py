@@ -1,0 +1,214 @@
+"""Rays from a limb's middle line to its surface, on which a socket around it is drawn.
+
+The middle line follows the centres of the limb's sections down to the centre of its rounded end. From there
+on up rays run across the limb frame's z axis; below, they leave that centre in all distal directions. A point
+has three coordinates: its angle around the limb, its station (mm: height over the centre, or the arc below
+it, which is negative) and its radius. Rays do not cross, so a face that has one radius for each angle and
+station cannot fold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import gaussian_filter
+from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+from ..anatomy.frame import Frame
+from ..anatomy.surfaces.triangles import Surface
+from ..errors import SurfaceError
+from .shape import section
+
+Array = NDArray[np.float64]
+
+ANGLES = 180
+STEP_MM = 1.5  # between stations
+BELOW_CUT_MM = 1.0  # the highest station
+DEGREE = 3  # of the middle line
+LEVELS = 60
+SMOOTH_MM = 1.5  # roughness that is shorter is not the limb's shape
+FOLD_MM = 1.0  # a ray that meets the surface again so much farther out meets a fold
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """The rays of a limb; points are those of the limb frame, mm.
+
+    Attributes
+    ----------
+    line : coefficients (degree + 1, 2) of the middle line's x and y in the station.
+    centre_z : height of the end's centre.
+    end_radius : of the limb at that height, mm.
+    top : the station of the proximal cut, beyond which the middle line is straight.
+    """
+
+    line: Array
+    centre_z: float
+    end_radius: float
+    top: float
+
+    @property
+    def lowest(self) -> float:
+        """The station of the distal pole."""
+        return -0.5 * np.pi * self.end_radius
+
+    def middle(self, station: Array) -> Array:
+        """(..., 3) the middle line at stations (...); below the end's centre it stays there."""
+        up = np.maximum(station, 0.0)
+        across = np.stack([np.polyval(column, np.minimum(up, self.top)) for column in self.line.T], axis=-1)
+        return np.concatenate([across, (self.centre_z + up)[..., None]], axis=-1)
+
+    def direction(self, angle: Array, station: Array) -> Array:
+        """(..., 3) unit vectors along the rays."""
+        angle, station = np.broadcast_arrays(angle, station)
+        fall = np.maximum(-station, 0.0) / self.end_radius
+        flat = np.cos(fall)
+        return np.stack([flat * np.cos(angle), flat * np.sin(angle), -np.sin(fall)], axis=-1)
+
+    def points(self, angle: Array, station: Array, radius: Array) -> Array:
+        """Points (..., 3) of coordinates (...)."""
+        return self.middle(station) + radius[..., None] * self.direction(angle, station)
+
+    def coordinates(self, points: Array) -> tuple[Array, Array, Array]:
+        """Angle, station and radius (...) of points (..., 3)."""
+        station = points[..., 2] - self.centre_z
+        spoke = points - self.middle(station)
+        across = np.hypot(spoke[..., 0], spoke[..., 1])
+        fall = np.arctan2(np.maximum(-spoke[..., 2], 0.0), across)
+        below = station < 0.0
+        return (
+            np.arctan2(spoke[..., 1], spoke[..., 0]),
+            np.where(below, -fall * self.end_radius, station),
+            np.where(below, np.hypot(across, spoke[..., 2]), across),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Radii of a closed limb surface on its rays.
+
+    Attributes
+    ----------
+    rays : of the limb.
+    stations : (k,) from the distal pole up to the proximal cut, mm.
+    angles : (ANGLES,) radians from -pi on.
+    radius : (k, ANGLES) mm, without roughness.
+    folds : (k, ANGLES) by how much farther out a ray meets the surface again, mm.
+    """
+
+    rays: Rays
+    stations: Array
+    angles: Array
+    radius: Array
+    folds: Array
+
+    def at(self, angle: Array, station: Array) -> Array:
+        """Radii (...) at angles and stations, mm; those beyond the last station are the last one's."""
+        return self.interpolated(self.radius)(angle, station)
+
+    def interpolated(self, field: Array) -> Callable[[Array, Array], Array]:
+        """A field (k, ANGLES) as a function of angle and station."""
+        angles = np.append(self.angles, np.pi)
+        grid = RegularGridInterpolator((self.stations, angles), np.column_stack([field, field[:, 0]]))
+
+        def value(angle: Array, station: Array) -> Array:
+            turned = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+            clipped = np.clip(station, self.stations[0], self.stations[-1])
+            return np.asarray(grid(np.stack(np.broadcast_arrays(clipped, turned), axis=-1)))
+
+        return value
+
+
+def profile(outer: Surface, frame: Frame) -> Profile:
+    """The radii of a limb's closed outer surface (LPS mm) in its frame.
+
+    Raises
+    ------
+    SurfaceError
+        Where the surface does not surround its own middle line.
+    """
+    local = Surface(frame.to_limb(outer.points), outer.faces)
+    rays = _rays(local)
+    top = -BELOW_CUT_MM - rays.centre_z
+    below = np.linspace(rays.lowest, 0.0, max(8, round(-rays.lowest / STEP_MM)), endpoint=False)
+    stations = np.concatenate([below, np.linspace(0.0, top, max(8, round(top / STEP_MM)))])
+    angles = -np.pi + 2 * np.pi * np.arange(ANGLES) / ANGLES
+    radius, folds = _cast(local, rays, stations, angles)
+    if np.isnan(radius).any():
+        k = int(np.isnan(radius).any(axis=1).argmax())
+        place = frame.to_patient(rays.middle(stations[k]))
+        raise SurfaceError(
+            f"a ray from the limb's middle line at ({_words(place)}) mm leaves the limb without meeting it",
+            remedy="close the surface, or move the proximal cut nearer to the knee",
+        )
+    return Profile(rays, stations, angles, _smooth(radius, stations), folds)
+
+
+def _words(point: Array) -> str:
+    return ", ".join(f"{x:.0f}" for x in point)
+
+
+def _rays(local: Surface) -> Rays:
+    bottom = float(local.points[:, 2].min())
+    if bottom > -30.0:
+        raise SurfaceError(
+            f"the limb reaches {-bottom:.0f} mm below its proximal cut, and a socket needs 30 mm or more",
+            remedy="move the proximal cut up",
+        )
+    levels = np.linspace(bottom, -BELOW_CUT_MM, LEVELS + 2)[1:]
+    measured = np.array([_centre(section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0))) for z in levels])
+    mean_radius = np.sqrt(measured[:, 2] / np.pi)
+    # The end is as high as the limb is wide there; a long one keeps half of the limb for its shank.
+    rounded = np.flatnonzero(levels - bottom >= np.minimum(mean_radius, 0.5 * (-bottom)))[0]
+    centre_z = float(levels[rounded])
+    line = np.polyfit(levels[rounded:] - centre_z, measured[rounded:, :2], DEGREE)
+    return Rays(line, centre_z, float(mean_radius[rounded]), -centre_z)
+
+
+def _centre(segments: Array) -> Array:
+    """Centre (x, y) and area of what section segments (k, 2, 3) enclose."""
+    a, b = segments[:, 0, :2], segments[:, 1, :2]
+    twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    area = twice.sum() / 2
+    return np.append((twice[:, None] * (a + b)).sum(axis=0) / (6 * area), abs(area))
+
+
+def hits_of(surface: Surface, starts: Array, ways: Array) -> list[Array]:
+    """Distances, ascending, at which rays from points (n, 3) along unit vectors (n, 3) meet a surface."""
+    locator = vtkStaticCellLocator()
+    locator.SetDataSet(surface.to_pyvista())
+    locator.BuildLocator()
+    far = 2.0 * float(np.linalg.norm(np.ptp(np.vstack([surface.points, starts]), axis=0)))
+    hits, cells = vtkPoints(), vtkIdList()
+    found = []
+    for start, way in zip(starts, ways):
+        locator.IntersectWithLine(start, start + far * way, 1e-6, hits, cells)
+        met = [(np.array(hits.GetPoint(i)) - start) @ way for i in range(hits.GetNumberOfPoints())]
+        found.append(np.sort(np.array(met)))
+    return found
+
+
+def _cast(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
+    """The radius at which each ray leaves the surface for good, and how far in it left it before."""
+    ways = rays.direction(angles[None, :], stations[:, None])
+    starts = np.broadcast_to(rays.middle(stations)[:, None], ways.shape)
+    hits = hits_of(local, starts.reshape(-1, 3), ways.reshape(-1, 3))
+    radius = np.array([met[-1] if len(met) else np.nan for met in hits])
+    folds = np.array([met[-1] - met[0] if len(met) else 0.0 for met in hits])
+    return radius.reshape(ways.shape[:2]), folds.reshape(ways.shape[:2])
+
+
+def _smooth(radius: Array, stations: Array) -> Array:
+    """Without roughness shorter than ``SMOOTH_MM``; across the pole a ray goes on at the other side."""
+    pad = 6
+    beyond = np.roll(radius[1 : pad + 1][::-1], ANGLES // 2, axis=1)
+    padded = np.vstack([beyond, radius])
+    across = SMOOTH_MM / (2 * np.pi / ANGLES * np.median(radius))
+    return np.asarray(
+        gaussian_filter(padded, (SMOOTH_MM / STEP_MM, across), mode=("nearest", "wrap"))[pad:], dtype=float
+    )

@@ -1,0 +1,227 @@
+"""A socket's inner face from a file, checked against the limb that it shall surround."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.frame import Frame
+from ..anatomy.surfaces.mending import open_loops
+from ..anatomy.surfaces.surfacefiles import read_surface
+from ..anatomy.surfaces.surfaces import signed_distance
+from ..anatomy.surfaces.triangles import (
+    Surface,
+    bodies,
+    check_sides,
+    compacted,
+    half_edges,
+    self_intersections,
+)
+from ..errors import SurfaceError
+from .clearance import cleared
+from .rays import Rays, hits_of, profile
+from .shape import Socket, closed_by_fans
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+SMALLEST, LARGEST = 0.25, 3.0  # of the limb's length, end to end: otherwise another unit
+LOOSE_SHARE = 0.01  # of the faces: pieces that hold less are left out
+DECIDED = 0.5  # mean cosine between normals and rays from which a side is certain
+WALL_SHARE = 0.15  # of the faces that another face hides, from which a closed surface is a wall
+INTO_BONE_MM = 0.5  # by which a bone may reach through the face: roughness
+
+
+def read_socket(
+    file: str | Path,
+    unit: str = "mm",
+    space: Literal["LPS", "RAS"] | None = None,
+    *,
+    outer: Surface,
+    frame: Frame,
+    bones: Mapping[str, Surface] | None = None,
+) -> Socket:
+    """The socket of a .stl, .ply, .vtp or .obj file, around a limb.
+
+    Of a socket with a wall the inner face is taken, where it can be told; one whose triangles look away from
+    the tissue is turned. `Socket.notes` says so.
+
+    Parameters
+    ----------
+    unit, space : of the file; by default mm and what it says itself, else LPS.
+    outer : the limb's closed outer surface (skin, or liner on skin), LPS mm, flat at its proximal cut.
+    frame : of the limb.
+    bones : closed surfaces, LPS mm, that the socket must leave inside.
+
+    Raises
+    ------
+    SurfaceError
+        For a file that is no surface, is in another unit, has holes or no opening, opens distally, does not
+        go around the limb, cuts into a bone or crosses itself: each with the remedy.
+    """
+    file = Path(file)
+    surface = read_surface(file, space, unit, key="socket.space")
+    try:
+        return _read(surface, outer, frame, bones or {})
+    except SurfaceError as error:
+        raise SurfaceError(error.what, file=error.file or file, remedy=error.remedy) from None
+
+
+def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Surface]) -> Socket:
+    _check_size(surface, outer)
+    limb = profile(outer, frame)
+    whole, notes = _one_piece(surface)
+    check_sides(whole, "the socket")
+    face = Surface(frame.to_limb(whole.points), whole.faces)
+    _check_place(face, limb.rays, limb.stations[-1])
+    if not len(open_loops(face)):
+        face, thick = _inner_face(face, limb.rays)
+        notes.append(f"the inner face of a wall of about {thick:.1f} mm is taken")
+    brim, open_distal = _brim(face, limb.rays)
+    side = _side(face, limb.rays)
+    if side > 0.0:
+        face = face.flipped
+        brim = brim[::-1]
+        notes.append("its triangles looked away from the tissue and were turned")
+    crossing = self_intersections(face)
+    if len(crossing):
+        raise SurfaceError(
+            f"the socket crosses itself ({len(crossing)} pairs of faces)",
+            remedy="remesh, smooth or repair it",
+        )
+    _check_bones(face, brim, {name: frame.to_limb(bone.points) for name, bone in bones.items()})
+    clear = frame.to_patient(cleared(face.points, face.faces, limb, outer, frame))
+    return Socket(frame.to_patient(face.points), face.faces, clear, brim, open_distal, tuple(notes))
+
+
+def _check_size(surface: Surface, outer: Surface) -> None:
+    size, limb = (float(np.linalg.norm(np.ptp(s.points, axis=0))) for s in (surface, outer))
+    if not SMALLEST * limb <= size <= LARGEST * limb:
+        unit = "metres, centimetres or inches" if size < limb else "another unit"
+        raise SurfaceError(
+            f"the socket is {size:.3g} mm from end to end, the limb {limb:.0f} mm",
+            remedy=f"if it is in {unit}, say so (socket.unit)",
+        )
+
+
+def _one_piece(surface: Surface) -> tuple[Surface, list[str]]:
+    parts = bodies(surface)
+    loose = [part for part in parts[1:] if len(part.faces) < LOOSE_SHARE * len(surface.faces)]
+    if len(parts) - len(loose) > 1:
+        raise SurfaceError(
+            f"the socket's file holds {len(parts) - len(loose)} separate pieces",
+            remedy="keep the inner face alone in it",
+        )
+    return parts[0], [f"{len(loose)} loose pieces were left out"] if loose else []
+
+
+def _check_place(face: Surface, rays: Rays, top: float) -> None:
+    """Refuse what is not around the limb's middle line, or lies beside it."""
+    middle = face.points.mean(axis=0)
+    axis = rays.middle(np.clip(middle[2] - rays.centre_z, rays.lowest, top))
+    apart = np.hypot(*(middle - axis)[:2])
+    radius = float(np.median(np.linalg.norm((face.points - middle)[:, :2], axis=1)))
+    beyond = max(middle[2] - rays.centre_z - top, rays.lowest + rays.centre_z - middle[2], 0.0)
+    if apart > radius or beyond > 0.0:
+        raise SurfaceError(
+            f"the socket does not surround the limb: its middle is {max(apart, beyond):.0f} mm off",
+            remedy="give it in the limb's space (socket.space: LPS or RAS), where the limb is in it",
+        )
+
+
+def _side(face: Surface, rays: Rays) -> float:
+    """Mean cosine between the faces' normals and the rays through them, by area."""
+    angle, station, _ = rays.coordinates(face.triangles.mean(axis=1))
+    cosine = np.einsum("ij,ij->i", face.face_normals, rays.direction(angle, station))
+    mean = float(np.average(cosine, weights=face.face_areas))
+    if abs(mean) < DECIDED:
+        raise SurfaceError(
+            "the socket's triangles look both at the limb and away from it",
+            remedy="keep the inner face alone, its normals all on one side",
+        )
+    return mean
+
+
+def _winding(loop: Array, rays: Rays) -> int:
+    """How often a closed line (k, 3) goes around the middle line."""
+    angle = rays.coordinates(loop)[0]
+    steps = np.mod(np.diff(angle, append=angle[0]) + np.pi, 2 * np.pi) - np.pi
+    return round(float(steps.sum()) / (2 * np.pi))
+
+
+def _brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
+    """The proximal edge, and whether the distal end is open too."""
+    loops = open_loops(face)
+    around = [loop for loop in loops if _winding(face.points[loop], rays)]
+    if len(around) < len(loops):
+        hole = next(loop for loop in loops if not _winding(face.points[loop], rays))
+        raise SurfaceError(
+            f"the socket has a hole of {len(hole)} edges in its side",
+            remedy="close it; only brim and end may be open",
+        )
+    if not around or len(around) > 2:
+        raise SurfaceError(
+            f"{len(around)} edges of the socket go around the limb", remedy="leave it open at the brim alone"
+        )
+    heights = [float(face.points[loop, 2].mean()) for loop in around]
+    if max(heights) < face.points[:, 2].mean():
+        raise SurfaceError(
+            "the socket opens towards the distal end of the limb and is closed above",
+            remedy="turn it around, or open it at the brim",
+        )
+    return around[int(np.argmax(heights))], len(around) == 2
+
+
+def _inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
+    """The faces of a closed wall that the middle line sees, and the wall's median thickness, mm."""
+    middles = wall.triangles.mean(axis=1)
+    angle, station, radius = rays.coordinates(middles)
+    hits = hits_of(wall, rays.middle(station), rays.direction(angle, station))
+    first = np.array([met[0] if len(met) else np.inf for met in hits])
+    facing = np.einsum("ij,ij->i", wall.face_normals, rays.direction(angle, station)) < 0.0
+    seen = facing & (np.abs(first - radius) < 1e-2)
+    if seen.sum() < WALL_SHARE * len(seen) or (~seen).sum() < WALL_SHARE * len(seen):
+        raise SurfaceError(
+            "the socket is closed: it has no opening for the limb", remedy="cut it open at the brim"
+        )
+    thick = float(np.median([met[1] - met[0] for met, s in zip(hits, seen) if s and len(met) > 1]))
+    inner = bodies(compacted(Surface(wall.points, wall.faces[seen])))[0]
+    inner = _without_ears(inner)
+    if len(inner.faces) < 0.9 * seen.sum():
+        raise SurfaceError(
+            "which of the socket's faces are its inner side cannot be told",
+            remedy="delete the outer side of its wall, and give the inner face alone",
+        )
+    return inner, thick
+
+
+def _without_ears(surface: Surface) -> Surface:
+    """Without faces that hang on by one edge or a corner, so that its edge is one clean line."""
+    faces = surface.faces
+    while True:
+        edges = np.sort(half_edges(faces), axis=1)
+        _, inverse, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+        alone = (counts[inverse.ravel()] == 1).reshape(3, -1).sum(axis=0)
+        if not (alone >= 2).any():
+            return bodies(compacted(Surface(surface.points, faces)))[0]
+        faces = faces[alone < 2]
+
+
+def _check_bones(face: Surface, brim: Ints, bones: Mapping[str, Array]) -> None:
+    closed = closed_by_fans(face.flipped)
+    lowest = float(face.points[brim, 2].min())
+    for name, points in bones.items():
+        below = points[points[:, 2] < lowest - INTO_BONE_MM]
+        if not len(below):
+            continue
+        out = float(signed_distance(closed, below).max())
+        if out > INTO_BONE_MM:
+            raise SurfaceError(
+                f"the socket cuts {out:.1f} mm into the bone {name}",
+                remedy="check its unit and its place on the limb; a socket is larger than the bones in it",
+            )

@@ -1,0 +1,244 @@
+"""Rectification: the inner face of a socket from the outer surface of a limb and a recipe."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.frame import Frame
+from ..anatomy.surfaces.triangles import Surface, self_intersections
+from ..errors import SurfaceError
+from .clearance import cleared
+from .rays import FOLD_MM, Profile, profile
+from .rings import spaced, stitched
+from .shape import Socket
+from .trim import Trim, Trimmed, trimmed
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+FLARE_DEGREES = 60.0  # how far the brim turns outwards
+FLARE_ROWS = 3
+FEWEST_AROUND = 6
+DISTAL_SHARE = 1.0  # of the end's radius: over what height the clearance at the distal end fades out
+STEEPEST = 0.75  # of that height: the largest clearance, so that no part of the face moves past another
+
+
+@dataclass(frozen=True)
+class Area:
+    """A round area of the face that presses in (positive depth) or gives relief.
+
+    Attributes
+    ----------
+    position : (3,) its middle, LPS mm, on the limb or near it.
+    radius_mm : where its depth has faded to nothing.
+    depth_mm : at its middle, along the limb's normal.
+
+    Raises
+    ------
+    SurfaceError
+        Where its sides would be steeper than 45 degrees.
+    """
+
+    name: str
+    position: Array
+    radius_mm: float
+    depth_mm: float
+
+    def __post_init__(self) -> None:
+        steepest = 1.717 / self.radius_mm * abs(self.depth_mm)  # at 1/sqrt(5) of the radius
+        if steepest > 1.0:
+            raise SurfaceError(
+                f"the sides of area {self.name!r} would be steeper than 45 degrees",
+                remedy=f"give a radius of {1.717 * abs(self.depth_mm):.1f} mm or more, or less depth",
+            )
+
+    def depth(self, points: Array) -> Array:
+        """(n,) mm at points (n, 3): ``(1 - r^2/R^2)^3``, which has no kink in slope or curvature."""
+        apart = np.linalg.norm(points - np.asarray(self.position, dtype=float), axis=1) / self.radius_mm
+        return self.depth_mm * np.maximum(1.0 - apart**2, 0.0) ** 3
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a limb's shape becomes a socket's.
+
+    Attributes
+    ----------
+    trim : where the brim runs.
+    reduction_percent : by how much every circumference is less than the limb's.
+    areas : pressed in or relieved besides.
+    flare_mm : radius of the brim's rounding outwards; 0: none.
+    distal : ``"clearance"`` leaves ``distal_clearance_mm`` free under the limb's end, ``"bearing"`` does not.
+    edge_mm : edge length of the triangles.
+    """
+
+    trim: Trim
+    reduction_percent: float = 3.0
+    areas: Sequence[Area] = ()
+    flare_mm: float = 6.0
+    distal: Literal["clearance", "bearing"] = "clearance"
+    distal_clearance_mm: float = 5.0
+    edge_mm: float = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Triangles on the limb, and how far each point lies below the brim along the limb, mm."""
+
+    points: Array
+    faces: Ints
+    below_brim: Array
+    upwards: Array
+    brim: Ints
+
+
+def rectified(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
+    """The inner face of a socket for a limb.
+
+    Parameters
+    ----------
+    outer : the limb's closed outer surface (skin, or liner on skin), LPS mm, flat at its proximal cut.
+    frame : of the limb, whose z axis points proximally from the cut.
+    recipe : what is done to the shape.
+
+    Raises
+    ------
+    SurfaceError
+        Where the limb is folded or its end is no end, the brim leaves the limb, an area misses it, or the
+        face would fold: each with the remedy.
+    """
+    limb = profile(outer, frame)
+    lines = trimmed(limb, frame, recipe.trim)
+    _refuse_folds(limb, lines, frame)
+    drawn = _drawn(lines, recipe)
+    _refuse_far(recipe.areas, frame.to_patient(drawn.points))
+    points = frame.to_patient(_shaped(drawn, limb, frame, recipe))
+    _refuse_crossing(Surface(points, drawn.faces), recipe)
+    clear = frame.to_patient(cleared(frame.to_limb(points), drawn.faces, limb, outer, frame))
+    return Socket(points, drawn.faces, clear, drawn.brim)
+
+
+def _refuse_folds(limb: Profile, lines: Trimmed, frame: Frame) -> None:
+    inside = limb.stations[:, None] <= lines.brim_station[None, :]
+    folds = np.where(inside, limb.folds, 0.0)
+    if folds.max() > FOLD_MM:
+        k, j = np.unravel_index(np.argmax(folds), folds.shape)
+        at = limb.rays.points(limb.angles[j], limb.stations[k], limb.radius[k, j])
+        place = ", ".join(f"{x:.0f}" for x in frame.to_patient(at))
+        raise SurfaceError(
+            f"the limb is folded by {folds.max():.1f} mm at ({place}) mm, and a socket is drawn on rays "
+            "from its middle line",
+            remedy="smooth the fold, trim below it, or give the socket as a file",
+        )
+
+
+def _drawn(lines: Trimmed, recipe: Recipe) -> Drawn:
+    """Rings of even triangles between the distal pole and the brim; the last rows are the flare's."""
+    flare = np.radians(FLARE_DEGREES) * recipe.flare_mm
+    lengths = lines.length
+    rows = max(4, round(float(lengths.mean() - flare) / recipe.edge_mm))
+    shares = np.linspace(0.0, 1.0, rows + 1)[1:, None] * (lengths - flare)
+    if flare:
+        shares = np.vstack(
+            [shares, lengths - flare + flare * np.arange(1, FLARE_ROWS + 1)[:, None] / FLARE_ROWS]
+        )
+    rings, at = [lines.pole[None]], [np.zeros(1)]
+    below, up = [np.array([lengths.mean()])], [np.zeros((1, 3))]
+    for number, way in enumerate(shares):
+        dense = lines.along(way)
+        around = float(np.linalg.norm(dense - np.roll(dense, 1, axis=0), axis=1).sum())
+        count = max(FEWEST_AROUND, round(around / recipe.edge_mm))
+        points, where = spaced(dense, count, 0.5 * (number % 2))
+        rings.append(points)
+        at.append(where)
+        remaining = np.column_stack([dense[:, :2], lengths - way])
+        below.append(_carried(dense, remaining[:, 2:], where)[:, 0])
+        up.append(_carried(dense, lines.tangent(way), where))
+    faces = stitched(at)
+    count = sum(len(ring) for ring in rings)
+    brim = np.arange(count - len(rings[-1]), count)
+    return Drawn(np.vstack(rings), faces, np.concatenate(below), np.vstack(up), brim)
+
+
+def _carried(dense: Array, values: Array, shares: Array) -> Array:
+    """Values (n, d) at the points of a dense ring, at shares of its length."""
+    closed = np.vstack([dense, dense[:1]])
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
+    length /= length[-1]
+    around = np.vstack([values, values[:1]])
+    return np.column_stack([np.interp(shares, length, column) for column in around.T])
+
+
+def _refuse_far(areas: Sequence[Area], points: Array) -> None:
+    for area in areas:
+        apart = float(np.linalg.norm(points - np.asarray(area.position, dtype=float), axis=1).min())
+        if apart > max(5.0, 0.25 * area.radius_mm):
+            raise SurfaceError(
+                f"area {area.name!r} lies {apart:.0f} mm off the socket's face",
+                remedy="give a position on the limb below the brim (LPS, mm), or move the trimline up",
+            )
+
+
+def _shaped(drawn: Drawn, limb: Profile, frame: Frame, recipe: Recipe) -> Array:
+    """The drawn points (limb frame), rectified; distances add up along the limb's own normals."""
+    points = drawn.points
+    normals = -Surface(points, drawn.faces).vertex_normals
+    middle = limb.rays.middle(points[:, 2] - limb.rays.centre_z)
+    middle[:, 2] = points[:, 2]
+    moves = -0.01 * recipe.reduction_percent * (points - middle)
+    in_patient = frame.to_patient(points)
+    for area in recipe.areas:
+        moves -= area.depth(in_patient)[:, None] * normals
+    if recipe.distal == "clearance":
+        moves[:, 2] -= recipe.distal_clearance_mm * _distal(points[:, 2], limb, recipe)
+    return points + moves + _flared(drawn, normals, recipe.flare_mm)
+
+
+def _distal(z: Array, limb: Profile, recipe: Recipe) -> Array:
+    """(n,) share of the distal clearance at heights: 1 at the pole, 0 from the end's height on, smooth."""
+    height = DISTAL_SHARE * limb.rays.end_radius
+    if recipe.distal_clearance_mm > STEEPEST * height / 1.875:
+        raise SurfaceError(
+            f"a distal clearance of {recipe.distal_clearance_mm:g} mm is too much at this end of the limb",
+            remedy=f"state {STEEPEST * height / 1.875:.0f} mm or less",
+        )
+    t = np.clip((z - z.min()) / height, 0.0, 1.0)
+    return 1.0 - t**3 * (10.0 - 15.0 * t + 6.0 * t**2)  # slope and curvature are zero at both ends
+
+
+def _flared(drawn: Drawn, normals: Array, radius: float) -> Array:
+    """Moves (n, 3) that bend what is near the brim along an arc outwards; lengths along it stay."""
+    if radius == 0.0:
+        return np.zeros_like(normals)
+    into = np.maximum(np.radians(FLARE_DEGREES) * radius - drawn.below_brim, 0.0)
+    turned = into / radius
+    out = normals - np.einsum("ij,ij->i", normals, drawn.upwards)[:, None] * drawn.upwards
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    out = np.divide(out, length, out=np.zeros_like(out), where=length > 0)
+    return radius * (
+        (1.0 - np.cos(turned))[:, None] * out + (np.sin(turned) - turned)[:, None] * drawn.upwards
+    )
+
+
+def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
+    crossing = self_intersections(face)
+    if not len(crossing):
+        return
+    place = face.triangles[crossing[0, 0]].mean(axis=0)
+    near = min(
+        recipe.areas,
+        key=lambda area: float(np.linalg.norm(place - np.asarray(area.position)) / area.radius_mm),
+        default=None,
+    )
+    words = ", ".join(f"{x:.0f}" for x in place)
+    raise SurfaceError(
+        f"the socket's face would cross itself at ({words}) mm",
+        remedy="lower reduction_percent or flare_mm"
+        if near is None
+        else f"lower the depth of area {near.name!r} or make it wider",
+    )

@@ -1,0 +1,98 @@
+"""A socket's inner face: an open triangle surface around a limb, and what is measured on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..anatomy.surfaces.mending import open_loops
+from ..anatomy.surfaces.surfaces import signed_distance
+from ..anatomy.surfaces.triangles import Surface
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Socket:
+    """The inner face of a socket in LPS mm, in its final shape and clear of the limb.
+
+    Attributes
+    ----------
+    points : (n, 3) the final shape.
+    faces : (m, 3) counter-clockwise seen from the tissue.
+    clear : (n, 3) the same points where the face is clear of the limb.
+    brim : the proximal edge, one ordered closed line of points (k,).
+    open_distal : whether the distal end is open too.
+    notes : what was done to the file that it came from, in words.
+    """
+
+    points: Array
+    faces: Ints
+    clear: Array
+    brim: Ints
+    open_distal: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def surface(self) -> Surface:
+        """The face as a surface whose normals point at the tissue."""
+        return Surface(self.points, self.faces)
+
+    @cached_property
+    def closed(self) -> Surface:
+        """The space inside as a closed surface, outward; each opening is closed by a fan."""
+        return closed_by_fans(self.surface.flipped)
+
+    @property
+    def volume_mm3(self) -> float:
+        """The volume up to the brim."""
+        return self.closed.volume
+
+    def circumference(self, point: ArrayLike, normal: ArrayLike) -> float:
+        """Length of the face's section by a plane, mm."""
+        return circumference(self.surface, point, normal)
+
+    def offset(self, limb: Surface) -> Array:
+        """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
+        return -signed_distance(limb, self.points)
+
+
+def closed_by_fans(surface: Surface) -> Surface:
+    """An open surface with each of its openings closed by a fan around the opening's middle."""
+    points, faces = [surface.points], [surface.faces]
+    for count, loop in enumerate(open_loops(surface)):
+        middle = np.full(len(loop), len(surface.points) + count)
+        points.append(surface.points[loop].mean(axis=0)[None])
+        faces.append(np.column_stack([np.roll(loop, -1), loop, middle]))
+    return Surface(np.vstack(points), np.vstack(faces))
+
+
+def section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
+    """(k, 2, 3) segments in which a plane cuts a surface, all with the surface's outside on one side."""
+    normal = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
+    height = (surface.points - np.asarray(point, dtype=float)) @ normal
+    height[height == 0.0] = 1e-12  # a point in the plane belongs to one side
+    above = height[surface.faces] > 0.0
+    faces, above = surface.faces[above.any(axis=1) & ~above.all(axis=1)], above[above.any(1) & ~above.all(1)]
+    # The corner that is alone on its side comes first.
+    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    rows = np.arange(len(faces))
+    a, b, c = (faces[rows, (alone + turn) % 3] for turn in range(3))
+
+    def crossing(start: Ints, end: Ints) -> Array:
+        share = height[start] / (height[start] - height[end])
+        return surface.points[start] + share[:, None] * (surface.points[end] - surface.points[start])
+
+    first, second = crossing(a, b), crossing(a, c)
+    turned = (height[a] > 0.0)[:, None]
+    return np.stack([np.where(turned, first, second), np.where(turned, second, first)], axis=1)
+
+
+def circumference(surface: Surface, point: ArrayLike, normal: ArrayLike) -> float:
+    """Length of a surface's section by a plane, mm: what a thread along the surface measures."""
+    segments = section(surface, point, normal)
+    return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())

@@ -1,0 +1,160 @@
+"""Where the brim of a socket runs: planes and a closed line across the limb's meridians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from ..anatomy.frame import Frame
+from ..errors import SurfaceError
+from .rays import Profile
+
+Array = NDArray[np.float64]
+
+LEAST_MM = 30.0  # of face between the distal end and the brim, along the limb
+OFF_LIMB_MM = 30.0  # how far a point of a trimline may lie off the limb
+
+
+@dataclass(frozen=True)
+class Trim:
+    """The brim: below every plane, and below the line where there is one.
+
+    Attributes
+    ----------
+    planes : points and normals (3,), LPS; normals point proximally.
+    line : (k, 3) points of a closed line around the limb, LPS mm, on the limb or near it, in order.
+    """
+
+    planes: Sequence[tuple[Array, Array]] = ()
+    line: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not self.planes and self.line is None:
+            raise SurfaceError("a socket without a trimline", remedy="state a plane or a line")
+
+
+@dataclass(frozen=True, eq=False)
+class Trimmed:
+    """The limb's meridians (limb frame) from the distal pole to the brim.
+
+    Attributes
+    ----------
+    meridians : (angles, k, 3) points, from the pole on.
+    ways : (angles, k) their lengths from the pole, mm.
+    length : (angles,) of each up to the brim, mm.
+    brim_station : (angles,) the station of the brim.
+    """
+
+    meridians: Array
+    ways: Array
+    length: Array
+    brim_station: Array
+
+    @property
+    def pole(self) -> Array:
+        return np.asarray(self.meridians[0, 0])
+
+    def along(self, way: Array) -> Array:
+        """(angles, 3) the point of each meridian this far (angles,) from the pole."""
+        rows = np.arange(len(way))
+        after = np.clip((self.ways < way[:, None]).sum(axis=1), 1, self.ways.shape[1] - 1)
+        low, high = self.ways[rows, after - 1], self.ways[rows, after]
+        share = ((way - low) / (high - low))[:, None]
+        return np.asarray((1 - share) * self.meridians[rows, after - 1] + share * self.meridians[rows, after])
+
+    def tangent(self, way: Array, reach: float = 3.0) -> Array:
+        """(angles, 3) unit vectors along the meridians, towards the brim, over some mm."""
+        step = self.along(way + reach) - self.along(way - reach)
+        return np.asarray(step / np.linalg.norm(step, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A closed line as a height over the angle around the limb."""
+
+    angles: Array
+    heights: Array
+
+    @cached_property
+    def height(self) -> PchipInterpolator:
+        turns = np.concatenate([self.angles + turn for turn in (-2 * np.pi, 0.0, 2 * np.pi)])
+        return PchipInterpolator(turns, np.tile(self.heights, 3))
+
+
+def trimmed(limb: Profile, frame: Frame, trim: Trim) -> Trimmed:
+    """The meridians of a limb up to its trimline.
+
+    Raises
+    ------
+    SurfaceError
+        Where the brim would lie beyond the limb's proximal cut, at its distal end, or a line does not go once
+        around the limb.
+    """
+    stations, angles = limb.stations, limb.angles
+    points = limb.rays.points(angles[:, None], stations[None, :], limb.radius.T)
+    points[:, 0] = points[:, 0].mean(axis=0)  # one pole
+    ways = np.append(
+        np.zeros((len(angles), 1)),
+        np.cumsum(np.linalg.norm(np.diff(points, axis=1), axis=2), axis=1),
+        axis=1,
+    )
+    over = np.max(_over(points, angles, limb, frame, trim), axis=0)
+    after = np.argmax(over > 0.0, axis=1)
+    rows = np.arange(len(angles))
+    missed = ~(over > 0.0).any(axis=1)
+    if missed.any():
+        raise SurfaceError(
+            f"the brim would lie beyond the limb's proximal cut on {100 * missed.mean():.0f} % of its way",
+            remedy="move the trimline down, or the proximal cut up",
+        )
+    low, high = over[rows, after - 1], over[rows, after]
+    share = np.where(after > 0, -low / (high - low), 0.0)
+    length = ways[rows, after - 1] + share * (ways[rows, after] - ways[rows, after - 1])
+    short = (after == 0) | (length < LEAST_MM)
+    if short.any():
+        raise SurfaceError(
+            f"the brim comes within {max(float(length[short].min()), 0.0):.0f} mm of the distal end, "
+            f"and a socket needs {LEAST_MM:g} mm of face",
+            remedy="move the trimline up; the normals of its planes point proximally",
+        )
+    station = stations[after - 1] + share * (stations[after] - stations[after - 1])
+    return Trimmed(points, ways, length, station)
+
+
+def _over(points: Array, angles: Array, limb: Profile, frame: Frame, trim: Trim) -> list[Array]:
+    """How far points (angles, k, 3) lie over each part of the trimline, mm."""
+    found = []
+    for point, normal in trim.planes:
+        direction = frame.rotation @ np.asarray(normal, dtype=float)
+        if direction[2] <= 0.0:
+            raise SurfaceError(
+                "the normal of a trim plane points distally", remedy="turn it so that it points proximally"
+            )
+        found.append((points - frame.to_limb(point)) @ (direction / np.linalg.norm(direction)))
+    if trim.line is not None:
+        line = _line(frame.to_limb(trim.line), limb)
+        found.append(points[..., 2] - line.height(angles)[:, None])
+    return found
+
+
+def _line(points: Array, limb: Profile) -> _Line:
+    angle, station, radius = limb.rays.coordinates(points)
+    off = np.abs(radius - limb.at(angle, station))
+    if off.max() > OFF_LIMB_MM:
+        raise SurfaceError(
+            f"point {int(off.argmax()) + 1} of the trimline lies {off.max():.0f} mm off the limb",
+            remedy="give points on the limb (LPS, mm)",
+        )
+    steps = np.mod(np.diff(angle, append=angle[0]) + np.pi, 2 * np.pi) - np.pi
+    sign = np.sign(steps.sum())
+    if len(points) < 3 or sign == 0 or np.any(sign * steps <= 0) or abs(abs(steps.sum()) - 2 * np.pi) > 0.1:
+        raise SurfaceError(
+            "the trimline does not go once around the limb", remedy="give its points in order around the limb"
+        )
+    order = np.argsort(angle)
+    return _Line(angle[order], points[order, 2])

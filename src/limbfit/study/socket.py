@@ -1,0 +1,160 @@
+"""The table ``[socket]``: the socket's shape, liner, donning and loads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, model_validator
+
+from .friction import Friction
+from .tables import Plane, Positive, TomlTable, Vector
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9 ().,_-]{0,39}$"
+Length = Annotated[float, Field(ge=0)]
+Preset = Literal["double stance", "single stance", "heel strike", "mid-stance", "toe-off"]
+
+# With m = 2 the law is that of a Mooney-Rivlin solid; elastomers relax little. Round figures of the order
+# that Sanders et al. (J Rehabil Res Dev 2004, 41:175) and Cagle et al. (J Prosthet Orthot 2018, 30:187)
+# measured: silicone elastomers are stiffer than gels.
+LINERS: dict[str, dict[str, float]] = {
+    "silicone": {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0},
+    "gel": {"c_kPa": 40.0, "m": 2.0, "gamma": 0.3, "tau_s": 1.0},
+}
+
+
+class LinerTable(TomlTable):
+    """A liner bonded to the skin: its thickness, its material, and parameters that differ from it."""
+
+    thickness_mm: Annotated[float, Field(ge=0, le=20)] = 6.0
+    material: Literal["silicone", "gel"] = "silicone"
+    c_kPa: Positive | None = None
+    m: Positive | None = None
+    gamma: Length | None = None
+    tau_s: Positive | None = None
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The law's parameters by key, as stated or else the material's."""
+        stated = {"c_kPa": self.c_kPa, "m": self.m, "gamma": self.gamma, "tau_s": self.tau_s}
+        return LINERS[self.material] | {key: value for key, value in stated.items() if value is not None}
+
+
+class SocketAreaTable(TomlTable):
+    """A round area that presses in (positive depth) or gives relief, at a point or at a region's middle."""
+
+    name: str = Field(pattern=NAME)
+    position: Vector | None = None
+    region: str | None = None
+    radius_mm: Annotated[float, Field(ge=3, le=150)]
+    depth_mm: Annotated[float, Field(ge=-20, le=20)]
+
+    @model_validator(mode="after")
+    def _one_place(self) -> SocketAreaTable:
+        if (self.position is None) == (self.region is None):
+            raise ValueError("give either position (LPS, mm) or region")
+        return self
+
+
+class SocketRegionTable(TomlTable):
+    """A named round region of the skin, for tables."""
+
+    name: str = Field(pattern=NAME)
+    position: Vector
+    radius_mm: Positive
+
+
+class SocketLoadTable(TomlTable):
+    """A load on the socket: one of the presets times body weight, or a force and a moment about a point."""
+
+    name: str = Field(pattern=NAME)
+    preset: Preset | None = None
+    force_N: Vector | None = None
+    moment_Nmm: Vector = (0.0, 0.0, 0.0)
+    point: Vector | None = None
+    duration_s: Positive = 1.0
+    hold_s: Length = 2.0
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> SocketLoadTable:
+        if (self.preset is None) == (self.force_N is None):
+            raise ValueError(f"give either preset ({', '.join(get_args(Preset))}) or force_N")
+        if self.preset is not None and "moment_Nmm" in self.model_fields_set:
+            raise ValueError("a preset has its own moment; give force_N with moment_Nmm instead")
+        return self
+
+
+@dataclass(frozen=True)
+class SocketStep:
+    """A stretch of the socket's history, ``donning`` or a load: how long it comes on, and then stays."""
+
+    name: str
+    ramp_s: float
+    hold_s: float
+
+
+class SocketTable(TomlTable):
+    """A socket from a file or rectified from the limb; every key has a default.
+
+    ``trim_mm`` is below the top of the tibia, or below the proximal cut by more where no bone is a tibia.
+    ``edge_mm`` is the edge length of the limb's mesh where the socket touches, ``face_edge_mm`` the socket's.
+    """
+
+    file: Path | None = None
+    unit: Literal["mm", "cm", "m", "inch"] = "mm"
+    space: Literal["LPS", "RAS"] | None = None
+    side: Literal["left", "right"] | None = None
+    reduction_percent: Annotated[float, Field(ge=-10, le=15)] = 3.0
+    areas: tuple[SocketAreaTable, ...] = ()
+    trim_mm: Length | None = None
+    trim_planes: tuple[Plane, ...] = ()
+    trimline: tuple[Vector, ...] = ()
+    flare_mm: Annotated[float, Field(ge=0, le=25)] = 6.0
+    distal: Literal["clearance", "bearing"] = "clearance"
+    distal_clearance_mm: Annotated[float, Field(ge=0, le=40)] = 5.0
+    face_edge_mm: Annotated[float, Field(ge=2, le=8)] = 4.0
+    edge_mm: Annotated[float, Field(ge=3, le=30)] = 8.0
+    liner: LinerTable = LinerTable()
+    friction: Friction = 0.5
+    donning: Literal["growth", "insertion"] = "growth"
+    donning_s: Positive = 2.0
+    travel_mm: Positive | None = None
+    hold_s: Length = 10.0
+    body_weight_N: Annotated[float, Field(ge=50, le=3000)] = 800.0
+    loads: tuple[SocketLoadTable, ...] = (SocketLoadTable(name="single stance", preset="single stance"),)
+    regions: tuple[SocketRegionTable, ...] = ()
+
+    @property
+    def steps(self) -> tuple[SocketStep, ...]:
+        """Donning with its hold, and each load with its own, in order."""
+        return (
+            SocketStep("donning", self.donning_s, self.hold_s),
+            *(SocketStep(load.name, load.duration_s, load.hold_s) for load in self.loads),
+        )
+
+    @model_validator(mode="after")
+    def _trimmed_once(self) -> SocketTable:
+        stated = [
+            key for key in ("trim_mm", "trim_planes", "trimline") if getattr(self, key) not in (None, ())
+        ]
+        if "trim_mm" in stated and len(stated) > 1:
+            raise ValueError(f"trim_mm is a plane of its own: leave it or {stated[1]} out")
+        if self.trimline and len(self.trimline) < 3:
+            raise ValueError("trimline needs three points or more, in order around the limb")
+        return self
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> SocketTable:
+        for kind in ("areas", "loads", "regions"):
+            names = [one.name for one in getattr(self, kind)]
+            doubled = sorted({name for name in names if names.count(name) > 1})
+            if doubled:
+                raise ValueError(f"{kind}: names must differ; given twice: {doubled[0]}")
+        return self
+
+    @model_validator(mode="after")
+    def _mesh_is_no_finer_than_the_face(self) -> SocketTable:
+        if self.edge_mm < 0.5 * self.face_edge_mm:
+            raise ValueError("edge_mm is shorter than half of face_edge_mm: the face would show its facets")
+        return self

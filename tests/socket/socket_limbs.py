@@ -1,0 +1,76 @@
+"""Limbs for the tests of the socket's shape: a round one, and real ones where they are here."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from limbfit.anatomy.surfaces.mending import closed_anatomy
+from limbfit.anatomy.surfaces.surfacefiles import read_surface
+from limbfit.anatomy.surfaces.surfaces import Anatomy
+from limbfit.anatomy.surfaces.triangles import Surface, bodies
+
+SHARED = Path(__file__).parents[2] / ".." / "shared" / "data"
+FILES = {
+    "mean": SHARED / "residuum" / "openlimb_mean.stl",
+    **{f"limb-{i}": SHARED / "limbs" / f"limb-{i}.stl" for i in range(1, 10)},
+}
+TOP, TIP = 150.0, 0.0
+CUT_NORMAL = np.array([0.0, 0.0, 1.0])
+
+
+def revolved(profile: np.ndarray, around: int, centre: tuple[float, float] = (0.0, 0.0)) -> Surface:
+    """A closed surface of revolution about z of (k, 2) radius and height, from its lower pole up."""
+    angle = 2 * np.pi * np.arange(around) / around
+    inner = profile[1:]
+    rings = np.stack(
+        [
+            inner[:, :1] * np.cos(angle) + centre[0],
+            inner[:, :1] * np.sin(angle) + centre[1],
+            np.repeat(inner[:, 1:], around, axis=1),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    poles = np.array([[*centre, profile[0, 1]], [*centre, profile[-1, 1]]])
+    points = np.vstack([rings, poles])
+    here, there = np.arange(around), np.roll(np.arange(around), -1)
+    low, high = len(rings), len(rings) + 1
+    faces = [np.column_stack([there, here, np.full(around, low)])]
+    for k in range(len(inner) - 1):
+        a, b = k * around + here, k * around + there
+        faces += [np.column_stack([a, b, b + around]), np.column_stack([a, b + around, a + around])]
+    last = (len(inner) - 1) * around
+    faces.append(np.column_stack([last + here, last + there, np.full(around, high)]))
+    return Surface(points, np.vstack(faces))
+
+
+@cache
+def round_limb() -> Anatomy:
+    """A cone of 40 to 52 mm radius on half a ball, with a tibia in it whose top is at z = 120."""
+    fall = np.linspace(0.0, np.pi / 2, 30)
+    end = np.column_stack([40.0 * np.sin(fall), 40.0 - 40.0 * np.cos(fall)])
+    z = np.linspace(40.0, TOP, 56)[1:]
+    shank = np.column_stack([40.0 + 12.0 * (z - 40.0) / (TOP - 40.0), z])
+    bone = np.array([[0.0, 25.0], [8.0, 27.0], [11.0, 60.0], [12.0, 100.0], [14.0, 118.0], [9.0, 120.0]])
+    fibula = np.array([[0.0, 40.0], [4.0, 42.0], [4.0, 75.0], [5.0, 108.0], [3.0, 110.0]])
+    return Anatomy(
+        revolved(np.vstack([end, shank]), 140),
+        {"tibia": revolved(bone, 24, (0.0, -10.0)), "fibula": revolved(fibula, 16, (-22.0, 5.0))},
+        np.array([0.0, 0.0, TOP]),
+        CUT_NORMAL,
+    )
+
+
+@cache
+def real_limb(name: str) -> Anatomy:
+    """A limb of OpenLimb: the body that is largest is the skin, the others its bones by place and size."""
+    parts = [part for part in bodies(read_surface(FILES[name])) if len(part.faces) > 100]
+    parts.sort(key=lambda part: -float(np.prod(np.ptp(part.points, axis=0))))
+    skin, *bones = parts
+    bones.sort(key=lambda part: float(part.points[:, 2].mean()))
+    low = sorted(bones[:2], key=lambda part: len(part.faces))
+    high = sorted(bones[2:], key=lambda part: len(part.faces))
+    named = {"fibula": low[0], "tibia": low[1], "patella": high[0], "femur": high[1]}
+    return closed_anatomy(skin, named, None, {})[0]
