@@ -19,7 +19,7 @@ FLOORS = [
     {"bench"},
     {"report", "phantom"},
     {"indentation", "notebook"},
-    {"study", "febio", "fields", "acquire"},
+    {"study", "febio", "fields", "acquire", "donning"},
     {"socket"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},

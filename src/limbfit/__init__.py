@@ -21,6 +21,7 @@ Everything the command line does is one call away:
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
 ``limbfit design``        ``design_study(load_study(path), sites=4, depths_mm=(), listener=print)``
+``limbfit socket``        ``fit_socket(load_study(path), listener=print)``
 ``limbfit cube``          ``compress_cube(folder)``, without a study
 ``limbfit studio``        ``serve_studio(study, port=0, browser=True, tell=print)``
 ``limbfit EXPERIMENT``    ``run_experiment(load_study(path), "regions", listener=print)``, and others

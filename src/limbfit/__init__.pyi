@@ -69,6 +69,7 @@ from .pipeline.verbs.demo import (
 from .pipeline.verbs.doctor import diagnose as diagnose
 from .pipeline.verbs.export import export_study as export_study
 from .pipeline.verbs.febfile import simulate_feb as simulate_feb
+from .pipeline.verbs.fitting import fit_socket as fit_socket
 from .pipeline.verbs.planning import design_study as design_study
 from .pipeline.verbs.reproduce import reproduce_study as reproduce_study
 from .pipeline.verbs.run import (

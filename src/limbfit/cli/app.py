@@ -12,7 +12,7 @@ import typer
 from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
-from . import acquire, bench, commands, experiments, febio, geometry, runs, studio, trust
+from . import acquire, bench, commands, experiments, febio, geometry, runs, socket, studio, trust
 from .console import INTERRUPTED, STDOUT, fail, prompt_interrupt
 from .groups import Grouped
 
@@ -35,9 +35,10 @@ def top(
         raise typer.Exit
 
 
-_PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS}
+_PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS, *socket.VERBS}
 _VERBS: tuple[Callable[..., None], ...] = (
     *(*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS),
+    *socket.VERBS,
     *runs.VERBS,
     *acquire.VERBS,
     *studio.VERBS,

@@ -11,6 +11,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "Patient": ("demo", "phantom", "series", "check", "segment", "surfaces", "sites", "mesh"),
     "Identify": ("run", "status", "report", "simulate", "batch", "reproduce"),
     "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
+    "Socket": ("socket",),
     "Experiment": ("design", "acquire", "recording", "virtual-fitsocket"),
     "Exchange": ("export", "febio", "compare"),
     "Machine": ("studio", "doctor", "bench"),

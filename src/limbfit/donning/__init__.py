@@ -1,6 +1,18 @@
 """A limb in its socket: donned, held, loaded; pressure and shear on it, and where the socket goes."""
 
 from .model import Fit, Load, socket_problem, socket_steps
-from .outcome import Donned, Patch, Row, don
+from .outcome import SETTLING, WHOLE, Donned, Held, Patch, Row, don
 
-__all__ = ["Donned", "Fit", "Load", "Patch", "Row", "don", "socket_problem", "socket_steps"]
+__all__ = [
+    "SETTLING",
+    "WHOLE",
+    "Donned",
+    "Fit",
+    "Held",
+    "Load",
+    "Patch",
+    "Row",
+    "don",
+    "socket_problem",
+    "socket_steps",
+]

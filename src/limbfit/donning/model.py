@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 ELEMENT = "tet10p0"
 OUTER = "skin"  # the face set that the socket may touch, the liner's where there is one
-# Steps while the socket comes on, is held, is loaded and is held again; what relaxes does so fastest at first.
+# Steps while the socket comes on, is held, is loaded and is held again; tissue relaxes fastest at first.
 COMING_ON, HELD, LOADING = 8, 6, 6
 RELAXING = 2.0  # power of the step's number that the time in a hold goes with
 # The stiffness of contact, MPa/mm: where pressures are the largest, 0.2 MPa, the wall is met to 0.1 mm.
@@ -141,7 +141,7 @@ def _loading(load: Load, before: Array | None, after: Array) -> Motion:
     return Motion.of(times[:count], force=dict(zip(COORDINATES, values.T, strict=True)))
 
 
-def socket_steps(problem: Problem, fit: Fit, modulus: float) -> StepControl:
+def socket_steps(fit: Fit, modulus: float) -> StepControl:
     """When a socket's simulation steps, and its contact stiffness; ``modulus`` as `Laws.modulus`, MPa."""
     times: list[float] = []
     for i, (_, on, off) in enumerate(fit.ends):

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fe import Problem, Result, Step, System, Tractions, solve, tractions
+from ..fe import Problem, Result, State, Step, System, Tractions, solve, tractions
 from ..fe.kernel.laws import Laws
 from .model import Fit, socket_steps
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+WHOLE, SETTLING = "the limb", "settling"
+LITTLE = 1e-4  # of a parameter: how far it is moved where pressures are differentiated
 
 
 @dataclass(frozen=True)
@@ -29,15 +32,15 @@ class Patch:
     shear_peak_kPa: float
 
     @classmethod
-    def of(cls, found: Tractions, chosen: NDArray[np.bool_], nodal: tuple[Array, Array]) -> Patch:
-        """Over the chosen (f,) faces; ``nodal`` are pressure (n,) and size of the shear (n,) at nodes, kPa."""
-        areas = found.areas[chosen].sum(axis=1)
+    def of(cls, found: Tractions, chosen: Mask, nodal: tuple[Array, Array]) -> Patch:
+        """Over the chosen (f,) faces; ``nodal``: pressure (n,) and size of the shear (n,) at nodes, kPa."""
+        areas = found.areas.sum(axis=1)
         nodes = np.unique(found.faces[chosen])
         shear = np.linalg.norm(found.face_shear_kPa[chosen], axis=1)
         return cls(
-            mean_kPa=float(areas @ found.face_pressure_kPa[chosen] / areas.sum()),
+            mean_kPa=_mean(found, areas, chosen),
             peak_kPa=float(nodal[0][nodes].max()),
-            shear_kPa=float(areas @ shear / areas.sum()),
+            shear_kPa=float(areas[chosen] @ shear / areas[chosen].sum()),
             shear_peak_kPa=float(nodal[1][nodes].max()),
         )
 
@@ -63,25 +66,38 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Held:
+    """The limb when donning, or a load, has been held.
+
+    Parameters
+    ----------
+    row : what the socket does then.
+    pressure, shear, displacement : (n,) kPa, (n, 3) kPa and (n, 3) mm at the mesh's nodes.
+    slopes : of the whole's and each region's mean pressure, kPa, and of ``settling``, mm, the derivatives
+        (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
+    """
+
+    row: Row
+    pressure: Array
+    shear: Array
+    displacement: Array
+    slopes: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
 class Donned:
-    """A socket's simulation: its ``rows``, one for each step, and pressure (n,) and shear (n, 3), kPa, at the
-    mesh's nodes and displacement (n, 3), mm, when donning and each load have been held (by name)."""
+    """A socket's simulation: its ``rows``, one for each step, and what was ``held``, by name."""
 
     result: Result
     rows: tuple[Row, ...]
-    pressure: Mapping[str, Array]
-    shear: Mapping[str, Array]
-    displacement: Mapping[str, Array]
-
-    def at(self, time: float) -> Row:
-        """The row of the step at a time, s."""
-        return min(self.rows, key=lambda row: abs(row.time - time))
+    held: Mapping[str, Held]
 
 
 def don(
     problem: Problem,
     fit: Fit,
-    regions: Mapping[str, NDArray[np.bool_]],
+    regions: Mapping[str, Mask],
+    sensitivities: bool = False,
     on_row: Callable[[Row], None] | None = None,
 ) -> Donned:
     """Simulate a socket's problem.
@@ -90,36 +106,35 @@ def don(
     ----------
     problem : of `socket_problem`.
     regions : masks (f,) of the faces of the socket's body.
+    sensitivities : also derivatives with respect to every material parameter.
     on_row : called after every step.
     """
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     system = System(problem)
+    patches = {WHOLE: np.ones(len(problem.bodies[0].faces), dtype=bool), **regions}
     rows: list[Row] = []
-    kept: dict[str, tuple[Array, Array, Array]] = {}
-    ends = {off: name for name, _, off in fit.ends}
+    held: dict[str, Held] = {}
 
     def note(step: Step) -> None:
         found = tractions(system, laws, step.state)
         pressure, shear = found.at_nodes(len(problem.mesh.points))
-        rows.append(_row(step, found, (pressure, np.linalg.norm(shear, axis=1)), regions))
-        for off, name in ends.items():
+        rows.append(_row(step, found, (pressure, np.linalg.norm(shear, axis=1)), patches))
+        for name, _, off in fit.ends:
             if np.isclose(step.time, off):
-                kept[name] = pressure, shear, step.state.u
+                slopes = _slopes(problem, system, laws, step.state, patches) if sensitivities else {}
+                held[name] = Held(rows[-1], pressure, shear, step.state.u, slopes)
         if on_row is not None:
             on_row(rows[-1])
 
-    result = solve(
-        problem, socket_steps(problem, fit, laws.modulus), on_step=note, store="none", system=system
-    )
-    off_by = result.imbalance[1:, 0]
-    told = tuple(_balanced(row, float(share)) for row, share in zip(rows, off_by, strict=True))
-    return Donned(result, told, *({name: values[i] for name, values in kept.items()} for i in range(3)))
+    control = socket_steps(fit, laws.modulus)
+    result = solve(problem, control, sensitivities, on_step=note, store="none", system=system)
+    shares = result.imbalance[1:, 0]
+    told = tuple(replace(row, imbalance=float(share)) for row, share in zip(rows, shares, strict=True))
+    return Donned(result, told, held)
 
 
-def _row(
-    step: Step, found: Tractions, nodal: tuple[Array, Array], regions: Mapping[str, NDArray[np.bool_]]
-) -> Row:
-    everywhere = np.ones(len(found.faces), dtype=bool)
+def _row(step: Step, found: Tractions, nodal: tuple[Array, Array], patches: Mapping[str, Mask]) -> Row:
+    values = {name: Patch.of(found, mask, nodal) for name, mask in patches.items()}
     return Row(
         time=step.time,
         force=step.reactions[0, :3],
@@ -128,18 +143,36 @@ def _row(
         turn=np.degrees(step.coordinates[0, 3:]),
         contact_area_mm2=found.contact_area,
         imbalance=0.0,
-        whole=Patch.of(found, everywhere, nodal),
-        regions={name: Patch.of(found, mask, nodal) for name, mask in regions.items()},
+        whole=values.pop(WHOLE),
+        regions=values,
     )
 
 
-def _balanced(row: Row, imbalance: float) -> Row:
-    return Row(**{**row.__dict__, "imbalance": imbalance})
+def _slopes(
+    problem: Problem, system: System, laws: Laws, state: State, patches: Mapping[str, Mask]
+) -> dict[str, Array]:
+    """Derivatives (p,) of what `Held` tells: the state's own carry them to the contact's pressure."""
+    found = {name: np.zeros(laws.count) for name in (*patches, SETTLING)}
+    assert state.sensitivity is not None
+    assert state.bodies is not None
+    for i, value in enumerate(problem.parameters):
+        ways = []
+        for step in (LITTLE * value, -LITTLE * value):
+            there = replace(
+                state,
+                u=state.u + step * state.sensitivity[..., i],
+                coordinates=state.coordinates + step * state.bodies[..., i],
+                penalty=state.penalty * (1.0 + step * laws.modulus_gradient[i] / laws.modulus),
+            )
+            at = tractions(system, laws, there)
+            areas = at.areas.sum(axis=1)
+            ways.append({name: _mean(at, areas, mask) for name, mask in patches.items()})
+        for name in patches:
+            found[name][i] = (ways[0][name] - ways[1][name]) / (2.0 * LITTLE)
+        if len(state.bodies):
+            found[SETTLING][i] = value * state.bodies[0, 2, i]
+    return found
 
 
-def stretches(fit: Fit, rows: tuple[Row, ...]) -> Iterator[tuple[str, tuple[Row, ...]]]:
-    """The rows of donning and of each load, by name."""
-    start = 0.0
-    for name, _, off in fit.ends:
-        yield name, tuple(row for row in rows if start < row.time <= off * (1.0 + 1e-9))
-        start = off
+def _mean(found: Tractions, areas: Array, chosen: Mask) -> float:
+    return float(areas[chosen] @ found.face_pressure_kPa[chosen] / areas[chosen].sum())

@@ -131,7 +131,10 @@ class Motion:
         """Times between the ends where a rate changes, or what drives, s."""
         steps = np.diff(self.times)
         kept = steps > 0.0
-        rates, forced = np.diff(np.nan_to_num(self._driven), axis=0)[kept] / steps[kept, None], np.asarray(self.forced)[kept]
+        rates, forced = (
+            np.diff(np.nan_to_num(self._driven), axis=0)[kept] / steps[kept, None],
+            np.asarray(self.forced)[kept],
+        )
         size = np.abs(rates).max(axis=0, initial=0.0)
         changed = (np.abs(np.diff(rates, axis=0)) > 1e-9 * size).any(axis=1)
         changed |= (forced[1:] != forced[:-1]).any(axis=1)

@@ -27,6 +27,7 @@ from .design import run_design
 from .refinement import FACTORS, run_refinement
 from .regions import run_regions
 from .sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
+from .socket import run_socket
 from .uncertainty import run_uncertainty
 
 
@@ -98,6 +99,13 @@ _OWN: tuple[Experiment, ...] = (
         tables=("material", "solver", "indenter"),
         site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s"),
         options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
+    ),
+    Experiment(
+        "socket",
+        run_socket,
+        needs=("surfaces",),
+        tables=("socket", "geometry", "mesh", "material"),
+        options={"parameters": {}, "parameters_from": ""},
     ),
 )
 

@@ -70,6 +70,8 @@ def input_files(study: Study) -> dict[str, list[Path]]:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
     if study.indenter.file is not None:
         files["calibrate"] = [study.indenter.file]
+    if study.socket.file is not None:
+        files["socket"] = [study.socket.file]
     files["traces"] += [site.trace for site in study.sites if site.trace is not None]
     return files
 

@@ -11,6 +11,7 @@ from .cube import cube_section
 from .design import design_section
 from .regions import regions_section
 from .sensitivity import SENSITIVITIES
+from .socket import socket_section
 from .uncertainty import uncertainty_section
 from .validation import validation_section
 
@@ -23,6 +24,7 @@ _OWN: dict[str, Maker] = {
     **SENSITIVITIES,
     "crossvalidate": validation_section,
     "design": design_section,
+    "socket": socket_section,
 }
 SECTIONS = Registry("report section", _OWN)
 

@@ -1,0 +1,64 @@
+"""A socket on the limb: ``limbfit socket`` with the parameters that are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...errors import InputError
+from ...indentation import Parameters
+from ...priors import of_tissues
+from ...study import Study
+from ..shared.context import Listener, quiet
+from ..shared.store import Store
+from .run import run_experiment
+from .simulate import known_parameters
+
+LITERATURE = "literature"
+
+
+def fit_socket(
+    study: Study,
+    *,
+    parameters: Parameters | None = None,
+    literature: bool = False,
+    listener: Listener = quiet,
+) -> dict[str, Any]:
+    """Put the study's socket on its limb and load it.
+
+    Nothing here is a medical device.
+
+    Parameters
+    ----------
+    parameters : per tissue; by default the identified ones, or those of people where none were identified.
+    literature : those of people even so: medians of the priors, the others as the study starts them.
+
+    Returns
+    -------
+    dict
+        What ``results/socket/socket.json`` holds, and ``folder``.
+
+    Raises
+    ------
+    InputError
+        For a socket that does not fit the limb, or identified parameters that are stale.
+    RunError
+        Where the simulation does not come to its end.
+    """
+    used, origin = (parameters, "given") if parameters else _known(study, literature)
+    return run_experiment(study, "socket", listener=listener, parameters=used, parameters_from=origin)
+
+
+def _known(study: Study, literature: bool) -> tuple[Parameters, str]:
+    store = Store(study.results)
+    if not literature and store.stamp("calibrate") is not None:
+        return known_parameters(study, store)
+    values = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
+    try:
+        medians = of_tissues(study.tissues, study.calibration.prior_tissues)
+    except InputError:
+        return values, "start of the study"
+    for name, (median, _) in medians.items():
+        tissue, key = name.split(".")
+        if key in values[tissue]:
+            values[tissue] = {**values[tissue], key: median}
+    return values, LITERATURE

@@ -1,0 +1,100 @@
+"""What a socket does to the limb: pressure and shear by region, settling, balance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..drawing.socket_pictures import pressure_figures, settling_figure
+from ..formats import NOTHING, fixed, friction, heading, numeric
+from ..page import Block, Note, Prose, Row, Section, Table
+from ..store import Json, Results
+
+ORIGINS = {
+    "identified": "identified from this limb's records",
+    "literature": "those of people (medians), not of this limb",
+    "given": "given by hand",
+}
+PUBLISHED = (
+    "Measured peaks of pressure between limb and socket in stance are mostly 30 to 200 kPa (Sanders et al., "
+    "J Rehabil Res Dev 1997, 34:19; Dumbleton et al., J Rehabil Res Dev 2009, 46:405)."
+)
+
+
+def socket_section(store: Results, content: Json) -> Section:
+    """What the experiment ``socket`` found."""
+    loads = content["loads"]
+    names = ["donning", *(load["name"] for load in loads)]
+    held = [content["donning"], *loads]
+    blocks: list[Block] = [
+        Note(
+            "A simulation for research, not a medical device: it says what a rigid socket does to this model "
+            "of the limb."
+        ),
+        Prose(_shape(content)),
+        Prose(_loads(loads)),
+        *pressure_figures(store, names),
+        settling_figure(content),
+        _regions(names, held),
+        Prose(PUBLISHED),
+        Prose(
+            f"Sum of contact forces and moments against the stated load: within "
+            f"{content['balance_percent']:.2g} % at every step. Pressures are those of contact, on the "
+            "outside of the liner where there is one; a mean is the normal force over the area, a peak the "
+            "largest mean around a node, which depends on the mesh."
+        ),
+        *(Note(text) for text in content["warnings"]),
+    ]
+    return Section("socket", "The limb in its socket", tuple(blocks))
+
+
+def _shape(content: Json) -> str:
+    shape, liner = content["socket"], content["socket"]["liner"]
+    made = (
+        f"rectified from the limb, {shape['reduction_percent']:g} % less in circumference"
+        if shape["reduction_percent"] is not None
+        else f"read from {shape['source']}"
+    )
+    areas = f", with {len(shape['areas'])} areas pressed in or relieved" if shape["areas"] else ""
+    lined = f"a liner of {liner['thickness_mm']:g} mm" if liner["thickness_mm"] else "no liner"
+    origin = ORIGINS.get(content["parameters_from"], content["parameters_from"])
+    return (
+        f"The socket is {made}{areas}: {shape['volume_cm3']:.0f} cm3, at most {shape['deepest_mm']:.1f} mm "
+        f"inside the limb's unloaded surface. Contact is {friction(content['friction'])}; {lined}. "
+        f"Tissues: {origin}."
+    )
+
+
+def _loads(loads: list[Json]) -> str:
+    if not loads:
+        return "No load was stated: the socket is donned and held."
+    words = []
+    for load in loads:
+        size = sum(value**2 for value in load["force_N"]) ** 0.5
+        words.append(f"{load['name']}, {size:.0f} N: the limb settles by {load['settling_mm']:.1f} mm")
+    return "; ".join(words) + "."
+
+
+def _regions(names: list[str], held: list[Mapping[str, Any]]) -> Table:
+    head = (
+        "Region",
+        "Mean pressure (kPa)",
+        "95 % (kPa)",
+        "Peak (kPa)",
+        "Mean shear (kPa)",
+        "Peak shear (kPa)",
+    )
+    rows = []
+    for name, one in zip(names, held, strict=True):
+        rows.append(Row((heading(name), *(numeric("") for _ in head[1:])), marked=True))
+        for region in one["regions"]:
+            known = region["interval_kPa"]
+            interval = NOTHING if known is None else f"{fixed(known[0])} to {fixed(known[1])}"
+            cells = [fixed(region["mean_kPa"]), interval]
+            cells += [fixed(region[key]) for key in ("peak_kPa", "shear_kPa", "shear_peak_kPa")]
+            rows.append(Row((heading(region["region"]), *map(numeric, cells))))
+    caption = (
+        "Pressure and shear by region of the limb, when donning and each load have been held. 95 %: from the "
+        "identified parameters' covariance, to first order; liner and friction count as known."
+    )
+    return Table("socket-regions", caption, head, tuple(rows))
