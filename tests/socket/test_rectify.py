@@ -112,6 +112,15 @@ def test_an_area_is_as_deep_as_asked(depth: float) -> None:
     assert change[half] / depth == pytest.approx((1 - (apart[half] / 25.0) ** 2) ** 3, abs=0.05)
 
 
+def test_a_position_on_the_skin_means_the_liner_outside_it() -> None:
+    limb = round_limb()
+    liner = Surface(limb.skin.points * [1.15, 1.15, 1.0], limb.skin.faces)  # some 6 mm off the skin
+    at = np.array([0.0, -44.4, 80.0])
+    recipe = replace(PLAIN, reduction_percent=0.0, areas=[Area("front", at, 25.0, 5.0)])
+    depth = rectified(liner, frame_of(limb), recipe).offset(liner)
+    assert depth.max() == pytest.approx(5.0, rel=0.04)
+
+
 def test_distal_clearance_and_bearing() -> None:
     limb = round_limb()
     bearing, clear = made(), made(replace(PLAIN, distal="clearance", distal_clearance_mm=8.0))

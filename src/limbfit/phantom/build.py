@@ -5,6 +5,7 @@ DIR/
   traces/site-<name>.csv      what the robot recorded
   truth/                      the true surfaces
   truth.json                  parameters, sites, limb, how the forces were made
+  socket/socket.stl           a rectified socket, where one is asked for
   study.toml                  what a user would write
 """
 
@@ -29,6 +30,8 @@ from .geometry import SKIN_AND_FAT, SKIN_LAYER, Limb, make_limb
 from .mri import DETAIL_GRIDS, make_grid, write_series
 from .record import Ramp, record
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
+from .socket import STUDY as SOCKET_STUDY
+from .socket import write_socket
 from .studyfile import study_text
 from .surfaces import true_anatomy
 
@@ -67,6 +70,7 @@ def make_phantom(
     seed: int = 0,
     sites: Sequence[str] | None = None,
     fat: bool = False,
+    socket: bool = False,
     mapping: Mapping = map,
     progress: Listener | None = None,
 ) -> dict[str, Any]:
@@ -79,6 +83,7 @@ def make_phantom(
     seed : which patient; the same seed gives the same files.
     sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
     fat : three tissues, skin of 2 mm over fat of 4 mm over muscle, instead of two.
+    socket : also a rectified socket for the limb with a liner, as a file that the study names.
     mapping : like ``map``; given one that works in several processes, sites are simulated side by side.
     progress : called with what is being done, how much of it is done, and of how much.
 
@@ -105,6 +110,9 @@ def make_phantom(
         truth = _truth(limb, everywhere, detail, seed, parameters)
         truth["sites"] = _write_traces(work, limb, indented, detail, seed, parameters, mapping, tell)
         text = study_text(indented, detail, seed, limb.layers)
+        if socket:
+            truth["socket"] = write_socket(work, limb)
+            text += SOCKET_STUDY
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth

@@ -49,6 +49,13 @@ def true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     )
 
 
+def outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surface:
+    """The closed surface (LPS mm) about ``thickness_mm`` outside the skin: that of a liner."""
+    reach = thickness_mm + 4.0
+    box = Box((-80.0 - reach, -85.0 - reach, -reach), (80.0 + reach, 85.0 + reach, PROXIMAL_CUT_MM), spacing)
+    return _placed(limb, contour(lambda p: skin_field(limb.shape, p) - thickness_mm, box))
+
+
 def _bone(limb: Limb, name: str, spacing: float) -> Surface:
     box = Box((-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM), spacing)
     return contour(lambda p: bone_field(limb.shape, name, p), box)

@@ -80,6 +80,9 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
     face = Surface(frame.to_limb(whole.points), whole.faces)
     _check_place(face, limb.rays, limb.stations[-1])
     if not len(open_loops(face)):
+        if face.volume < 0.0:
+            face = face.flipped
+            notes.append("its triangles looked into its wall and were turned")
         face, thick = _inner_face(face, limb.rays)
         notes.append(f"the inner face of a wall of about {thick:.1f} mm is taken")
     brim, open_distal = _brim(face, limb.rays)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ Ints = NDArray[np.int64]
 FLARE_DEGREES = 60.0  # how far the brim turns outwards
 FLARE_ROWS = 3
 FEWEST_AROUND = 6
+OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some
 DISTAL_SHARE = 1.0  # of the end's radius: over what height the clearance at the distal end fades out
 STEEPEST = 0.75  # of that height: the largest clearance, so that no part of the face moves past another
 
@@ -116,7 +118,8 @@ def rectified(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
     lines = trimmed(limb, frame, recipe.trim)
     _refuse_folds(limb, lines, frame)
     drawn = _drawn(lines, recipe)
-    _refuse_far(recipe.areas, frame.to_patient(drawn.points))
+    face = Surface(frame.to_patient(drawn.points), drawn.faces)
+    recipe = replace(recipe, areas=_on_face(recipe.areas, face))
     points = frame.to_patient(_shaped(drawn, limb, frame, recipe))
     _refuse_crossing(Surface(points, drawn.faces), recipe)
     clear = frame.to_patient(cleared(frame.to_limb(points), drawn.faces, limb, outer, frame))
@@ -174,14 +177,21 @@ def _carried(dense: Array, values: Array, shares: Array) -> Array:
     return np.column_stack([np.interp(shares, length, column) for column in around.T])
 
 
-def _refuse_far(areas: Sequence[Area], points: Array) -> None:
+def _on_face(areas: Sequence[Area], face: Surface) -> list[Area]:
+    """The areas with their middles on the drawn face (LPS), which a liner keeps off the skin."""
+    moved = []
     for area in areas:
-        apart = float(np.linalg.norm(points - np.asarray(area.position, dtype=float), axis=1).min())
-        if apart > max(5.0, 0.25 * area.radius_mm):
+        position = np.asarray(area.position, dtype=float)
+        _, near, foot = igl.point_mesh_squared_distance(position[None], face.points, face.faces)
+        normal, apart = face.face_normals[near[0]], position - foot[0]
+        beside = float(np.linalg.norm(apart - (apart @ normal) * normal))
+        if beside > max(5.0, 0.25 * area.radius_mm) or abs(apart @ normal) > OFF_FACE_MM:
             raise SurfaceError(
-                f"area {area.name!r} lies {apart:.0f} mm off the socket's face",
+                f"area {area.name!r} lies {np.linalg.norm(apart):.0f} mm off the socket's face",
                 remedy="give a position on the limb below the brim (LPS, mm), or move the trimline up",
             )
+        moved.append(replace(area, position=foot[0]))
+    return moved
 
 
 def _shaped(drawn: Drawn, limb: Profile, frame: Frame, recipe: Recipe) -> Array:

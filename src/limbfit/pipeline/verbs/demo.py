@@ -20,6 +20,7 @@ def make_phantom_study(
     detail: str = "coarse",
     seed: int = 0,
     fat: bool = False,
+    socket: bool = False,
     listener: Listener = quiet,
     workers: int = 0,
 ) -> dict[str, Any]:
@@ -30,6 +31,7 @@ def make_phantom_study(
             detail=detail,
             seed=seed,
             fat=fat,
+            socket=socket,
             mapping=executor.map,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
         )

@@ -1,0 +1,146 @@
+"""A socket to be printed: a wall around its inner face, a round brim and a flat face for an adapter."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import igl
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.surfaces.triangles import Surface, self_intersections
+from ..errors import SurfaceError
+from .shape import Socket
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+BRIM_STEPS = 6  # of the half circle between the two sides
+THINNEST = 0.9  # of the thickness that was asked for
+AROUND = 96  # edges of the adapter's cylinder
+SLIVER_MM = 0.005  # what is shorter where adapter and wall meet would collapse in an STL file
+
+
+def wall(
+    socket: Socket,
+    axis: Array,
+    thickness_mm: float = 4.0,
+    *,
+    adapter_diameter_mm: float = 60.0,
+    adapter_mm: float = 8.0,
+) -> Surface:
+    """The socket as a closed body, LPS mm, outward.
+
+    Its inner side is the socket's face; the outer side lies ``thickness_mm`` outside it along its normals.
+
+    Parameters
+    ----------
+    axis : (3,) proximal direction; the adapter's face looks the other way.
+    thickness_mm : of the wall.
+    adapter_diameter_mm : of the cylinder at the distal end; 0: none.
+    adapter_mm : its material between the lowest point of the cavity and its flat face, mm.
+
+    Raises
+    ------
+    SurfaceError
+        For a socket whose distal end is open, a wall that would be thinner than 90 % of what was asked or
+        cross itself, and an adapter that is as wide as the socket.
+    """
+    if socket.open_distal:
+        raise SurfaceError("a socket with an open distal end has no wall", remedy="close its end")
+    shell = _manifold(_shell(socket, thickness_mm), "wall")
+    if adapter_diameter_mm == 0.0:
+        return _surface(shell)
+    axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    block = _block(socket, axis, adapter_diameter_mm, max(adapter_mm, thickness_mm))
+    cavity = _manifold(socket.closed, "cavity")
+    return _surface((shell + (_manifold(block, "adapter") - cavity)).set_tolerance(SLIVER_MM))
+
+
+def _shell(socket: Socket, thickness: float) -> Surface:
+    """Both sides and the half circle that joins them along the brim."""
+    inner, outwards = socket.points, -socket.surface.vertex_normals
+    outer = inner + thickness * outwards
+    squared = igl.point_mesh_squared_distance(outer, inner, socket.faces)[0]
+    least = float(np.sqrt(squared.min()))
+    body = _joined(socket, outer, outwards, thickness)
+    if least < THINNEST * thickness or len(self_intersections(body)):
+        raise SurfaceError(
+            f"a wall of {thickness:g} mm would fold outside the socket's narrow places ({least:.1f} mm)",
+            remedy="make it thinner, or the areas of the socket wider or less deep",
+        )
+    return body
+
+
+def _joined(socket: Socket, outer: Array, outwards: Array, thickness: float) -> Surface:
+    brim, count = socket.brim, len(socket.points)
+    points, out = socket.points[brim], outwards[brim]
+    along = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+    up = np.cross(along, out)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    if np.einsum("ij,ij->i", up, points - socket.points.mean(axis=0)).mean() < 0.0:
+        up = -up
+    rings = [brim]
+    added = []
+    for turn in np.pi * np.arange(1, BRIM_STEPS) / BRIM_STEPS:
+        middle = points + thickness / 2 * out
+        added.append(middle + thickness / 2 * (np.sin(turn) * up - np.cos(turn) * out))
+        rings.append(2 * count + (len(added) - 1) * len(brim) + np.arange(len(brim)))
+    rings.append(brim + count)
+    strips = []
+    for low, high in pairwise(rings):
+        strips.append(np.column_stack([np.roll(low, -1), low, high]))
+        strips.append(np.column_stack([np.roll(low, -1), high, np.roll(high, -1)]))
+    faces = np.vstack([socket.faces, socket.faces[:, ::-1] + count, *strips])
+    return Surface(np.vstack([socket.points, outer, *added]), faces)
+
+
+def _block(socket: Socket, axis: Array, diameter: float, below: float) -> Surface:
+    """The adapter's cylinder, up to where the cavity is wider than it is."""
+    height = socket.points @ axis
+    lowest = socket.points[height.argmin()]
+    spokes = socket.points - lowest
+    across = np.linalg.norm(spokes - np.outer(spokes @ axis, axis), axis=1)
+    under = across < diameter / 2
+    top = float(height[under].max()) + 0.1 * below  # at no point's own height
+    if top > height.min() + 0.5 * np.ptp(height):
+        raise SurfaceError(
+            f"an adapter of {diameter:g} mm is as wide as the socket",
+            remedy="give a smaller diameter, or 0 for none",
+        )
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    ring = diameter / 2 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+    low = lowest - below * axis
+    high = lowest + (top - float(height.min())) * axis
+    points = np.vstack([low + ring, high + ring, low, high])
+    here, there = np.arange(AROUND), np.roll(np.arange(AROUND), -1)
+    bottom, lid = np.full(AROUND, 2 * AROUND), np.full(AROUND, 2 * AROUND + 1)
+    faces = np.vstack(
+        [
+            np.column_stack([here, there, there + AROUND]),
+            np.column_stack([here, there + AROUND, here + AROUND]),
+            np.column_stack([there, here, bottom]),
+            np.column_stack([here + AROUND, there + AROUND, lid]),
+        ]
+    )
+    return Surface(points, faces)
+
+
+def _manifold(surface: Surface, name: str) -> manifold3d.Manifold:
+    mesh = manifold3d.Mesh64(surface.points, surface.faces.astype(np.uint64))
+    body = manifold3d.Manifold(mesh)
+    if body.status() != manifold3d.Error.NoError:
+        raise SurfaceError(
+            f"the socket's {name} is no closed body ({body.status().name})",
+            remedy="remesh the socket",
+        )
+    return body
+
+
+def _surface(body: manifold3d.Manifold) -> Surface:
+    mesh = body.to_mesh64()
+    return Surface(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64))

@@ -1,0 +1,165 @@
+"""A socket from a file is the one that was written, or refused in one line with the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from socket_limbs import CUT_NORMAL, round_limb
+
+from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.surfaces.surfacefiles import write_surface
+from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.errors import SurfaceError
+from limbfit.socket import Recipe, Socket, read_socket, rectified
+from limbfit.socket.shape import closed_by_fans
+from limbfit.socket.trim import Trim
+
+TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])
+
+
+def read(file: Path, unit: str = "mm", space: str | None = None) -> Socket:
+    limb = round_limb()
+    frame = limb_frame(limb.cut_point, limb.cut_normal)
+    return read_socket(file, unit, space, outer=limb.skin, frame=frame, bones=limb.bones)  # type: ignore[arg-type]
+
+
+@cache
+def drawn() -> Socket:
+    limb = round_limb()
+    return rectified(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0))
+
+
+def face() -> Surface:
+    return drawn().surface
+
+
+def offset_by(surface: Surface, outwards: float) -> Surface:
+    """The face moved away from the tissue."""
+    return Surface(surface.points - outwards * surface.vertex_normals, surface.faces)
+
+
+def walled(thickness: float = 4.0) -> Surface:
+    """The face with an outer side and a strip between their brims, as a closed body, outward."""
+    inner, outer = face(), offset_by(face(), thickness)
+    brim, n = drawn().brim, len(inner.points)
+    after = np.roll(brim, -1)
+    lower, upper = np.column_stack([brim, after + n, after]), np.column_stack([brim, brim + n, after + n])
+    strip = np.vstack([lower, upper])
+    flipped = outer.faces[:, ::-1] + n
+    body = Surface(np.vstack([inner.points, outer.points]), np.vstack([inner.faces, flipped, strip]))
+    edges = {tuple(e) for e in np.vstack([body.faces[:, [i, (i + 1) % 3]] for i in range(3)])}
+    if len(edges) != 3 * len(body.faces):  # the brim runs the other way
+        strip = strip[:, ::-1]
+        body = Surface(body.points, np.vstack([inner.faces, flipped, strip]))
+    return body
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+def test_round_trip(tmp_path: Path, suffix: str) -> None:
+    write_surface(tmp_path / f"socket{suffix}", face())
+    socket = read(tmp_path / f"socket{suffix}")
+    assert socket.notes == ()
+    assert not socket.open_distal
+    assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-5)
+    assert len(socket.points) == len(drawn().points)
+    assert len(socket.brim) == len(drawn().brim)
+    limb = round_limb()
+    assert -Socket(socket.clear, socket.faces, socket.clear, socket.brim).offset(limb.skin).max() > 0.49
+
+
+def test_unit_and_space(tmp_path: Path) -> None:
+    flipped = Surface(face().points * [-1e-3, -1e-3, 1e-3], face().faces)
+    write_surface(tmp_path / "ras.stl", flipped)
+    socket = read(tmp_path / "ras.stl", "m", "RAS")
+    assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-4)
+
+
+def test_inside_out_is_turned_and_said(tmp_path: Path) -> None:
+    write_surface(tmp_path / "socket.stl", face().flipped)
+    socket = read(tmp_path / "socket.stl")
+    assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-5)
+    assert "turned" in socket.notes[0]
+    after = np.roll(socket.brim, -1)
+    edges = {tuple(e) for e in np.vstack([socket.faces[:, [i, (i + 1) % 3]] for i in range(3)])}
+    assert all(edge in edges for edge in zip(socket.brim, after))
+
+
+def test_an_open_end(tmp_path: Path) -> None:
+    keep = face().triangles[:, :, 2].min(axis=1) > 15.0
+    write_surface(tmp_path / "tube.stl", Surface(face().points, face().faces[keep]))
+    socket = read(tmp_path / "tube.stl")
+    assert socket.open_distal
+    assert socket.points[socket.brim, 2].min() > 100.0
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_a_wall_the_inner_side_is_taken(tmp_path: Path, turned: bool) -> None:
+    body = walled()
+    assert body.volume > 0
+    write_surface(tmp_path / "wall.stl", body.flipped if turned else body)
+    socket = read(tmp_path / "wall.stl")
+    assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=2e-3)
+    assert len(socket.faces) == pytest.approx(len(drawn().faces), rel=0.01)
+    assert "4.0 mm" in socket.notes[-1]
+
+
+def moved(*by: float) -> Surface:
+    return Surface(face().points + by, face().faces)
+
+
+def with_hole() -> Surface:
+    faces = face().faces
+    middle = face().triangles.mean(axis=1)
+    return Surface(face().points, faces[np.linalg.norm(middle - [0.0, -44.0, 70.0], axis=1) > 12.0])
+
+
+def mixed() -> Surface:
+    faces = face().faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    return Surface(face().points, faces)
+
+
+def crossed() -> Surface:
+    points = face().points.copy()
+    near = np.linalg.norm(points - [0.0, -44.0, 70.0], axis=1) < 8.0
+    points[near] += [0.0, 100.0, 0.0]
+    return Surface(points, face().faces)
+
+
+def upside_down() -> Surface:
+    return Surface(face().points * [1.0, -1.0, -1.0] + [0.0, 0.0, 112.0], face().faces)
+
+
+BAD: dict[str, Callable[[], Surface]] = {
+    "socket.unit": lambda: Surface(face().points * 1e-3, face().faces),
+    "from end to end, the limb": lambda: Surface(face().points * 25.4, face().faces),
+    "no opening": lambda: closed_by_fans(face().flipped),
+    "a hole of": with_hole,
+    "does not surround the limb": lambda: moved(150.0, 20.0, 0.0),
+    "is 309 mm off": lambda: moved(0.0, 0.0, 400.0),
+    "into the bone": lambda: Surface(
+        (face().points - [0, 0, 60]) * [0.35, 0.35, 1] + [0, 0, 60], face().faces
+    ),
+    "opens towards the distal end": upside_down,
+    "neighbouring faces are oriented": mixed,
+    "crosses itself": crossed,
+    "separate pieces": lambda: Surface(
+        np.vstack([face().points, moved(0.0, 0.0, 200.0).points]),
+        np.vstack([face().faces, face().faces + len(face().points)]),
+    ),
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_what_is_no_socket_of_this_limb_is_refused(tmp_path: Path, words: str) -> None:
+    write_surface(tmp_path / "socket.stl", BAD[words]())
+    with pytest.raises(SurfaceError) as caught:
+        read(tmp_path / "socket.stl")
+    assert words in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path / "socket.stl"))
+    assert "\n" not in str(caught.value)
+    assert caught.value.remedy

@@ -1,0 +1,153 @@
+"""The table [socket] of a study: its shape, regions and loads, and what is wrong told by key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from socket_limbs import round_limb
+
+from limbfit.anatomy.surfaces.surfacefiles import write_surface
+from limbfit.errors import StudyError
+from limbfit.pipeline.shared.socket_shape import load_of, regions_of, socket_of
+from limbfit.pipeline.verbs.check import check_study
+from limbfit.socket import Socket
+from limbfit.socket.landmarks import knee_centre
+from limbfit.study import Study, load_study
+
+AREA = '[[socket.areas]]\nname = "a"\nradius_mm = 20\ndepth_mm = 4\n'
+SITE = '[[sites]]\nname = "1"\ndepth_mm = 5\nposition = [0.0, -46.0, 80.0]\n'
+
+
+def study_of(folder: Path, text: str = "", bones: bool = True) -> Study:
+    limb = round_limb()
+    write_surface(folder / "skin.stl", limb.skin)
+    named = ""
+    if bones:
+        for name, surface in limb.bones.items():
+            write_surface(folder / f"{name}.stl", surface)
+            named += f'{name} = "{name}.stl"\n'
+    head = f'[study]\nname = "s"\n[surfaces]\nskin = "skin.stl"\n[surfaces.bones]\n{named}{SITE}'
+    (folder / "study.toml").write_text(head + text)
+    return load_study(folder)
+
+
+def drawn(study: Study) -> Socket:
+    return socket_of(study, round_limb(), round_limb().skin)
+
+
+def test_a_study_without_the_table_has_a_socket(tmp_path: Path) -> None:
+    study = study_of(tmp_path)
+    assert "socket" not in study.model_fields_set
+    socket = drawn(study)
+    assert socket.points[socket.brim, 2].max() == pytest.approx(110.0, abs=1.5)  # 10 mm below the tibia
+    assert [(s.name, s.ramp_s, s.hold_s) for s in study.socket.steps] == [
+        ("donning", 2.0, 10.0),
+        ("single stance", 1.0, 2.0),
+    ]
+    assert study.socket.liner.parameters == {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0}
+    force, moment, point = load_of(study, study.socket.loads[0], round_limb())
+    np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
+    np.testing.assert_allclose(moment, 0.0, atol=1e-9)
+    np.testing.assert_allclose(point, knee_centre(round_limb()))
+
+
+def test_the_table_says_the_shape(tmp_path: Path) -> None:
+    text = "[socket]\nreduction_percent = 0\nflare_mm = 0\ntrim_mm = 25\ndistal = 'bearing'\n"
+    area = '[[socket.areas]]\nname = "a"\nregion = "shin"\nradius_mm = 20\ndepth_mm = 4\n'
+    region = '[[socket.regions]]\nname = "shin"\nposition = [0, -44, 60]\nradius_mm = 12\n'
+    study = study_of(tmp_path, text + area + region)
+    socket = drawn(study)
+    assert socket.points[socket.brim, 2] == pytest.approx(95.0, abs=0.1)
+    depth = socket.offset(round_limb().skin)
+    deepest = socket.points[depth.argmax()]
+    assert depth.max() == pytest.approx(4.0, rel=0.05)
+    assert np.linalg.norm(deepest - [0.0, -42.0, 60.0]) < 6.0
+    assert regions_of(study, round_limb())["shin"].faces.any()
+
+
+def test_loads_of_ones_own(tmp_path: Path) -> None:
+    text = (
+        '[[socket.loads]]\nname = "mine"\nforce_N = [0, 10, 500]\nmoment_Nmm = [1e4, 0, 0]\n'
+        "point = [0, 0, 90]\n"
+        '[[socket.loads]]\nname = "step"\npreset = "heel strike"\n[socket]\nbody_weight_N = 1000\n'
+        "[socket.liner]\nmaterial = 'gel'\nm = 4\n"
+    )
+    study = study_of(tmp_path, text)
+    force, moment, point = load_of(study, study.socket.loads[0], round_limb())
+    assert force.tolist() == [0, 10, 500]
+    assert moment.tolist() == [1e4, 0, 0]
+    assert point.tolist() == [0, 0, 90]
+    force, moment, _ = load_of(study, study.socket.loads[1], round_limb())
+    np.testing.assert_allclose(force, [200.0, -200.0, 1100.0])  # medial is +x: the fibula lies at -x
+    np.testing.assert_allclose(moment, np.cross([50.0, -50.0, 0.0], force))
+    assert study.socket.liner.parameters == {"c_kPa": 40.0, "m": 4.0, "gamma": 0.3, "tau_s": 1.0}
+
+
+def test_check_draws_the_socket(tmp_path: Path) -> None:
+    study = study_of(tmp_path, "[socket]\nreduction_percent = 2\n")
+    facts = "\n".join(check_study(study)["facts"])
+    assert "a liner of 6 mm" in facts
+    assert "mm outside the skin" in facts
+    write_surface(tmp_path / "mine.stl", drawn(study).surface.flipped)
+    facts = "\n".join(check_study(study_of(tmp_path, "[socket]\nfile = 'mine.stl'\n"))["facts"])
+    assert "were turned" in facts
+
+
+BAD: dict[str, tuple[str, str, bool]] = {
+    "unknown key": ("[socket]\nreduction = 3\n", "see docs/study.md", True),
+    "give either position (LPS, mm) or region": (AREA, "", True),
+    "no region is named 'knee cap'": (AREA + 'region = "knee cap"\n', "tibial crest", True),
+    "off the socket's face": (AREA + "position = [0, -90, 60]\n", "on the limb below the brim", True),
+    "steeper than 45 degrees": (
+        AREA.replace("20", "4") + "position = [0, -44, 60]\n",
+        "or less depth",
+        True,
+    ),
+    "beyond the limb's proximal cut": (
+        "[socket]\ntrim_planes = [{ point = [0, 0, 160] }]\n",
+        "move the trimline down",
+        True,
+    ),
+    "trim_mm is a plane of its own": (
+        "[socket]\ntrim_mm = 9\ntrim_planes = [{ point = [0, 0, 90] }]\n",
+        "",
+        True,
+    ),
+    "trimline needs three points": ("[socket]\ntrimline = [[0, 0, 90]]\n", "", True),
+    "names must differ": ((AREA + "position = [0, -44, 60]\n") * 2, "", True),
+    "give either preset": ('[[socket.loads]]\nname = "x"\n', "", True),
+    "a preset has its own moment": (
+        '[[socket.loads]]\nname = "x"\npreset = "toe-off"\nmoment_Nmm = [0, 0, 1]\n',
+        "",
+        True,
+    ),
+    "nowhere.stl does not exist": ('[socket]\nfile = "nowhere.stl"\n', "", True),
+    "the knee centre is not known": ("[socket]\nhold_s = 1\n", "state the point", False),
+    "medial and lateral are not known": (
+        '[[socket.loads]]\nname = "x"\npreset = "toe-off"\npoint = [0, 0, 120]\n',
+        "socket.side",
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_what_is_wrong_is_told_by_key(tmp_path: Path, words: str) -> None:
+    text, remedy, bones = BAD[words]
+    with pytest.raises(StudyError) as caught:
+        check_study(study_of(tmp_path, text, bones))
+    told = str(caught.value)
+    assert words in told
+    assert remedy in told
+    assert "study.toml" in told
+    assert "socket" in told
+    assert "\n" not in told
+
+
+def test_a_table_without_shape_is_a_study_of_its_keys(tmp_path: Path) -> None:
+    table: dict[str, Any] = study_of(tmp_path, "[socket]\nfriction = 'sticky'\n").socket.model_dump()
+    assert table["friction"] == "sticky"
+    assert table["loads"][0]["preset"] == "single stance"

@@ -1,0 +1,109 @@
+"""A wall for printing is watertight and as thick as asked, by a tool that did not make it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from socket_limbs import CUT_NORMAL, FILES, real_limb, round_limb
+
+from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.surfaces.surfacefiles import write_surface
+from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.errors import SurfaceError
+from limbfit.socket import Area, Recipe, Socket, rectified
+from limbfit.socket.landmarks import knee_centre
+from limbfit.socket.trim import Trim
+from limbfit.socket.wall import wall
+
+RECIPE = Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]))
+
+
+def drawn(recipe: Recipe = RECIPE) -> Socket:
+    limb = round_limb()
+    return rectified(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), recipe)
+
+
+def read_back(body: Surface, folder: Path) -> trimesh.Trimesh:
+    write_surface(folder / "wall.stl", body)
+    return trimesh.load(folder / "wall.stl")
+
+
+def thickness(body: trimesh.Trimesh, socket: Socket) -> np.ndarray:
+    """From middles of the inner face's triangles through the wall, along their normals."""
+    middles, outwards = socket.surface.triangles.mean(axis=1), -socket.surface.face_normals
+    hits, rays, _ = body.ray.intersects_location(middles + 1e-3 * outwards, outwards, multiple_hits=True)
+    apart = np.linalg.norm(hits - middles[rays], axis=1)
+    least = np.full(len(middles), np.inf)
+    np.minimum.at(least, rays, apart)
+    return least
+
+
+def check_wall(socket: Socket, axis: np.ndarray, folder: Path, thick: float) -> trimesh.Trimesh:
+    body = read_back(wall(socket, axis, thick), folder)
+    assert body.is_watertight
+    assert body.is_winding_consistent
+    assert body.volume > 0
+    assert body.euler_number == 2  # one body without handles
+    assert body.body_count == 1
+    measured = thickness(body, socket)
+    assert np.isfinite(measured).all()
+    low = np.percentile(measured, 1)
+    assert 0.95 * thick < low
+    side = (socket.surface.triangles.mean(axis=1) - socket.points.mean(axis=0)) @ axis > 0
+    assert np.median(measured[side]) == pytest.approx(thick, rel=0.02)
+    return body
+
+
+def test_a_wall_with_brim_and_adapter(tmp_path: Path) -> None:
+    areas = [Area("press", np.array([0.0, -44.0, 80.0]), 22.0, 5.0)]
+    socket = drawn(replace(RECIPE, areas=areas))
+    body = check_wall(socket, CUT_NORMAL, tmp_path, 4.0)
+    bottom = body.bounds[0, 2]
+    assert bottom == pytest.approx(socket.points[:, 2].min() - 8.0, abs=1e-3)
+    flat = (np.abs(body.triangles[:, :, 2] - bottom) < 1e-3).all(axis=1)
+    assert body.area_faces[flat].sum() == pytest.approx(np.pi * 30.0**2, rel=0.01)
+    assert body.face_normals[flat][:, 2].max() < -0.999
+    brim_top = socket.points[socket.brim, 2].max()
+    assert 0.0 < body.bounds[1, 2] - brim_top < 4.0
+
+
+def test_the_inner_side_is_the_face(tmp_path: Path) -> None:
+    socket = drawn()
+    body = read_back(wall(socket, CUT_NORMAL, 4.0), tmp_path)
+    _, apart, _ = trimesh.proximity.closest_point(body, socket.points)
+    assert apart.max() < 0.01
+
+
+def test_without_an_adapter(tmp_path: Path) -> None:
+    socket = drawn(replace(RECIPE, flare_mm=0.0))
+    body = read_back(wall(socket, CUT_NORMAL, 3.0, adapter_diameter_mm=0.0), tmp_path)
+    assert body.is_watertight
+    measured = thickness(body, socket)
+    assert np.percentile(measured, [1, 99]) == pytest.approx(3.0, rel=0.02)
+
+
+def test_walls_that_cannot_be_made_are_refused() -> None:
+    narrow = drawn(replace(RECIPE, areas=[Area("narrow", np.array([0.0, -44.0, 80.0]), 11.0, 6.0)]))
+    with pytest.raises(SurfaceError, match="would fold") as caught:
+        wall(narrow, CUT_NORMAL, 15.0)
+    assert caught.value.remedy
+    with pytest.raises(SurfaceError, match="as wide as the socket"):
+        wall(drawn(), CUT_NORMAL, adapter_diameter_mm=200.0)
+    with pytest.raises(SurfaceError, match="open distal end"):
+        wall(replace(drawn(), open_distal=True), CUT_NORMAL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mean", "limb-1", "limb-8"])
+@pytest.mark.skipif(not FILES["mean"].is_file(), reason="shared/data is not here")
+def test_real_limbs(tmp_path: Path, name: str) -> None:
+    limb = real_limb(name)
+    knee = knee_centre(limb)
+    assert knee is not None
+    trim = Trim([(knee - 15.0 * limb.cut_normal, limb.cut_normal)])
+    socket = rectified(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(trim))
+    check_wall(socket, limb.cut_normal, tmp_path, 4.0)
