@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -238,3 +239,31 @@ def test_what_limbfit_has_not_is_refused(tmp_path, case):
     text = change((tmp_path / "model.feb").read_text())
     with pytest.raises(ProblemError, match=words):
         to_problem(read_feb(written(tmp_path, text)))
+
+
+SOCKET = Path(__file__).parents[3] / "shared" / "reference" / "socket"
+
+
+@pytest.mark.skipif(not SOCKET.is_dir(), reason="the FEBio reference results are not beside the repository")
+@pytest.mark.parametrize("case", ["slide", "cone-load", "tube"])
+def test_febios_own_inputs_are_written_anew(tmp_path, case):
+    """A dragged plate, a socket that goes over to a force, a tube under pressure: read, written, read."""
+    problem = to_problem(read_feb(SOCKET / f"{case}.feb"))
+    found = back(problem, tmp_path)
+    assert len(found.rigid_bodies) == len(problem.rigid_bodies)
+    for mine, theirs in zip(problem.rigid_bodies, found.rigid_bodies):
+        assert (theirs.name, theirs.friction) == (mine.name, mine.friction)
+        np.testing.assert_array_equal(theirs.pivot, mine.pivot)
+        np.testing.assert_array_equal(theirs.faces, mine.faces)
+        np.testing.assert_array_equal(theirs.shape.frame, mine.shape.frame)
+        near = problem.mesh.points[mine.faces].mean(axis=1)
+        np.testing.assert_allclose(theirs.shape.signed_distance(near), mine.shape.signed_distance(near))
+        for t in np.linspace(0.0, problem.history.times[-1], 43):
+            (values, forced), (expected, under) = theirs.motion.at(t), mine.motion.at(t)
+            np.testing.assert_allclose(values, expected, atol=1e-12)
+            np.testing.assert_array_equal(forced, under)
+    held = [(s.component, s.factor, s.nodes.tolist()) for s in problem.supports]
+    assert [(s.component, s.factor, s.nodes.tolist()) for s in found.supports] == held
+    for mine, theirs in zip(problem.pressures, found.pressures, strict=True):
+        np.testing.assert_array_equal(theirs.faces, mine.faces)
+        np.testing.assert_allclose([theirs.at(t) for t in mine.times], mine.values)
