@@ -19,6 +19,7 @@ from limbfit.bench.measuring import in_fresh_process, max_rss_MB, timed_solve
 from limbfit.bench.parity import ALL_CASES, bench_febio_parity
 from limbfit.bench.reference import CUBES, find_reference, load_case
 from limbfit.bench.scaling import exponent
+from limbfit.bench.socket import SOCKET
 from limbfit.cli import main
 from limbfit.errors import InputError
 from limbfit.fe import ELEMENTS, StepControl, System
@@ -145,6 +146,24 @@ def test_parity_rows():
     assert row["max_difference_percent"] < 1e-4
     assert row["febio_peak_stress_kPa"] == pytest.approx(25.2, abs=0.05)
     json.dumps(row, allow_nan=False)
+
+
+@with_reference
+def test_parity_of_a_socket_is_told_by_its_parts():
+    """The input that takes least: each part has its goal, and is within it."""
+    rows = bench_febio_parity(REFERENCE, cases=SOCKET[-1:], tell=silent)
+    (part,) = SOCKET[-1].parts
+    (row,) = rows
+    assert (row["case"], row["goal_percent"]) == (f"tube: {part.name}", 1.0)
+    assert row["max_difference_percent"] < part.goal
+    assert row["febio_peak_displacement_mm"] > 0.5
+    json.dumps(row, allow_nan=False)
+
+
+@with_reference
+def test_a_missing_case_of_a_socket_is_bad_input(tmp_path):
+    with pytest.raises(InputError, match=r"tube\.feb.*--reference"):
+        bench_febio_parity(tmp_path, cases=SOCKET[-1:], tell=silent)
 
 
 def command(monkeypatch, capsys, *words: object) -> tuple[int, str, str]:

@@ -210,3 +210,14 @@ def test_partial_slip_of_a_ball_is_that_of_cattaneo_and_mindlin():
     expected = mu * P * (1.0 - np.maximum(1.0 - drag / limit, 0.0) ** 1.5)
     assert drag[-1] > limit
     np.testing.assert_allclose(Q, expected, atol=0.03 * mu * P)
+
+
+@pytest.mark.parametrize("most", [20, 40])
+def test_iterations_that_lead_nowhere_count_and_a_step_keeps_to_the_bound(most):
+    """A tolerance that rounding never meets: friction's own search fails again and again in one step."""
+    across = np.array([[0.0, 0.0], [0.0, 0.0], [6.0, 0.0]])
+    history = History(np.array([0.0, 1.0, 2.0]), np.array([0.0, 4.0, 4.0]), across)
+    problem = replace(punch("tet10", 2, 1), history=history, friction=0.5)
+    found = solve(problem, StepControl(times=(1.0, 2.0), tolerance=1e-15, most_iterations=most))
+    assert found.reason.endswith(f"no more than {most} Newton iterations were allowed")
+    assert found.statistics["newton_iterations"] <= most

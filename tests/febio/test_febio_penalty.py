@@ -25,8 +25,8 @@ from limbfit.febio import (
     to_problem,
     write_feb,
 )
-from limbfit.febio.model import Contact
 from limbfit.febio.penalty import CURRENT_AREA, automatic_penalties, explicit_penalty
+from limbfit.febio.reading.model import Contact
 
 EXPORTS = Path(__file__).parents[3] / "shared" / "reference" / "exports"
 recorded = pytest.mark.skipif(
@@ -93,7 +93,7 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     contact = Contact(rule, ("", ""), 3.0, True, False, 0)
     system = System(problem)
     times = np.array([1.0, 2.0, 3.0])
-    weights = FaceWise(system, contact, times)
+    weights = FaceWise(system, (contact,), times)
     own = automatic_penalties(problem, problem.contact_faces, 1.0) * 3.0
     modulus = np.mean([m.instantaneous_modulus for m in problem.materials.values()])
     rest = face_quadrature(problem.formulation, points, problem.contact_faces, "gauss")[1]
@@ -101,9 +101,9 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     np.testing.assert_allclose(uniform * system.surface.areas, own[:, None] * rest, rtol=1e-12)
     for t, stretch in ((1.0, 1.0), (2.0, np.sqrt(1.105))):  # 1.21 is as far from 1.105 as that from 1
         u = np.column_stack([(stretch - 1.0) * points[:, :2], np.zeros(len(points))])
-        nothing = np.zeros((1, 6))
-        state = State(t, float(problem.history.at(t)), u, 1.0, None)
-        weights.after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, nothing, nothing, None, state))
+        state, nothing = State(t, float(problem.history.at(t)), u, 1.0, None), np.zeros((1, 6))
+        place = np.array([[0.0, 0.0, state.displacement, 0.0, 0.0, 0.0]])
+        weights.after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, nothing, place, None, state))
     np.testing.assert_allclose(uniform * system.surface.areas, grown * own[:, None] * rest, rtol=1e-9)
 
 

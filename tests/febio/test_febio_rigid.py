@@ -83,7 +83,10 @@ def test_a_body_that_is_held_holds_what_it_carries(tmp_path):
 BONE = '<material id="3" name="bone" type="rigid body"/></Material>'
 TWO = '<bc node_set="top" type="rigid"><rb>bone</rb></bc></Boundary>'
 ELSEWHERE = '<bc node_set="top" type="zero displacement"><z_dof>1</z_dof></bc></Boundary>'
-FORCE = '<rigid_load type="rigid_force"><rb>plate</rb></rigid_load></Rigid>'
+FORCE = (
+    '<rigid_load type="rigid_force"><rb>plate</rb><dof>Rx</dof><value lc="1">1</value></rigid_load></Rigid>'
+)
+TURN = '<rigid_bc type="rigid_rotation"><rb>plate</rb><dof>Ru</dof><value lc="1">1</value></rigid_bc></Rigid>'
 LOCK = '<rigid_connector type="rigid lock"/></Rigid>'
 REFUSED = {
     "free to turn": (
@@ -91,8 +94,14 @@ REFUSED = {
         r"line \d+, <material>: the rigid body 'plate' is neither fixed nor displaced in Ru; limbfit solves",
     ),
     "free to move": (CUBE.replace("<Rx_dof>1</Rx_dof>", ""), "neither fixed nor displaced in Rx"),
-    "turned": (CUBE.replace("<dof>z</dof>", "<dof>Ru</dof>"), "<rigid_bc>: the rotation of a rigid body is"),
-    "pushed": (CUBE.replace("</Rigid>", FORCE), r"line \d+, <rigid_load>: 'rigid_force' is not supported"),
+    "turned": (
+        CUBE.replace("<Ru_dof>1</Ru_dof>", "").replace("</Rigid>", TURN),
+        r"line \d+: the rigid body 'plate' carries tissue, and turns",
+    ),
+    "pushed": (
+        CUBE.replace("<Rx_dof>1</Rx_dof>", "").replace("</Rigid>", FORCE),
+        "neither fixed nor displaced in Rx; limbfit solves for no rigid body that carries tissue",
+    ),
     "joined": (CUBE.replace("</Rigid>", LOCK), "<rigid_connector>: 'rigid lock' is not supported"),
     "held elsewhere": (
         CUBE.replace("</Boundary>", ELSEWHERE),

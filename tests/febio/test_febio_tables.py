@@ -13,8 +13,8 @@ from limbfit.bench.blocks import punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History
 from limbfit.febio import FebSettings, read_feb, run_feb, write_feb
-from limbfit.febio.geometry import Part
-from limbfit.febio.rigid import centre_of_mass
+from limbfit.febio.reading.geometry import Part
+from limbfit.febio.reading.rigid import centre_of_mass
 
 TABLES = """<Output><logfile>
 <node_data data="z;uz" file="nodes.txt" delim=","></node_data>

@@ -243,7 +243,7 @@ def test_what_febio_has_not_is_refused(tmp_path):
     for change, words in (
         ({"friction": "sticky"}, "sticky"),
         ({"element": "tet10v"}, "no element 'tet10v'"),
-        ({"indenter": None}, "fixed nodes"),
+        ({"indenter": None}, "nothing drives"),
     ):
         with pytest.raises(ProblemError, match=words):
             write_feb(replace(block(), **change), tmp_path / "x.feb", FebSettings())

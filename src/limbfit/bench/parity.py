@@ -12,16 +12,21 @@ from ..fe import System, iterate, solve
 from ..fe.kernel.laws import Laws
 from ..fe.observables import element_fields
 from .reference import CUBES, PUNCHED, ReferenceCase, Tell, find_reference, load_case, pushing_force
+from .socket import SOCKET, SocketCase, compare_socket
 
 KPA = 1e-3  # MPa
 Row = dict[str, Any]
 ALL_CASES = CUBES + PUNCHED
+GOAL = 1.0  # percent
 
 
 def bench_febio_parity(
-    reference: Path | None = None, *, tell: Tell, cases: Sequence[ReferenceCase] = ALL_CASES
+    reference: Path | None = None,
+    *,
+    tell: Tell,
+    cases: Sequence[ReferenceCase | SocketCase] = (*ALL_CASES, *SOCKET),
 ) -> list[Row]:
-    """Rows ``case, element, max_difference_percent, ..``, one per case.
+    """Rows ``case, element, max_difference_percent, goal_percent, ..``, one per case, or per part of one.
 
     The difference is the largest over the whole curve, in percent of FEBio's largest value.
 
@@ -35,10 +40,14 @@ def bench_febio_parity(
         Where the reference folder or a case in it is missing.
     """
     folder = reference or find_reference(Path.cwd())
-    rows = []
+    rows: list[Row] = []
     for i, case in enumerate(cases):
         tell(i, len(cases), case.name)
-        rows.append({"case": case.name.split("/")[-1], "element": case.element, **_compare(case, folder)})
+        if isinstance(case, SocketCase):
+            rows += compare_socket(case, folder)
+            continue
+        row = {"case": case.name.split("/")[-1], "element": case.element, "goal_percent": GOAL}
+        rows.append(row | _compare(case, folder))
     tell(len(cases), len(cases), "done")
     return rows
 

@@ -35,17 +35,15 @@ def febio_parity(reference: Reference = None, as_json: AsJson = False) -> None:
     if as_json:
         print_json(rows)
         return
-    table = Table("case", "element", "difference (%)", "peak", "FEBio's peak", "what explains it", box=None)
+    table = Table(
+        "case", "element", "difference (%)", "goal (%)", "peak", "FEBio's peak", "what explains it", box=None
+    )
     for row in rows:
-        difference, unit = row["max_difference_percent"], "kPa" if "peak_stress_kPa" in row else "N"
-        peaks = [
-            row.get(f"{who}peak_{'stress' if unit == 'kPa' else 'force'}_{unit}") for who in ("", "febio_")
-        ]
+        difference = row["max_difference_percent"]
+        peaks = [next((f"{row[key]:.4g} {key.rpartition('_')[2]}" for key in row if key.startswith(who)), "-")
+                 for who in ("peak_", "febio_peak_")]  # fmt: skip
         shown = "-" if difference is None else f"{difference:.2g}"
-        table.add_row(
-            row["case"], row["element"], shown,
-            *("-" if peak is None else f"{peak:.4g} {unit}" for peak in peaks), row["note"],
-        )  # fmt: skip
+        table.add_row(row["case"], row["element"], shown, f"{row['goal_percent']:g}", *peaks, row["note"])
     STDOUT.print(table)
 
 

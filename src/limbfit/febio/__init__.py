@@ -2,11 +2,11 @@
 
 from .abaqus import write_inp
 from .logs import Log, read_log
-from .model import FebModel, read_feb
 from .optimising import Range, in_indenter_frame, write_optimisation
 from .penalty import FaceWise, mean_penalty
 from .problem import step_control, to_problem
 from .program import FebioRun, axial_force, find_febio, result_of_log, run_febio
+from .reading.model import FebModel, read_feb
 from .running import FebRun, run_feb
 from .verdict import SLACK, Verdict, judge
 from .writing import FebSettings, contact_of, differences, write_feb

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from ..errors import ProblemError, RunError
 from ..fe import Material, Problem, System
 from ..mesh import Mesh
-from .faceting import Tool, tool_mesh
-from .writing import FRONT, HELD, INDENTER, PATCH, FebSettings, check_exportable
+from .faceting import FRONT, INDENTER, PATCH, Tool, tool_mesh
+from .moving import HELD
+from .writing import FebSettings, check_plain
 
 Array = NDArray[np.float64]
 _ELEMENT = {"tet4": "C3D4", "tet10": "C3D10", "tet10p0": "C3D10H", "tet10g8": "C3D10", "hex8": "C3D8"}
@@ -42,7 +43,7 @@ def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSet
     RunError
         Where the file cannot be written.
     """
-    check_exportable(problem, program.capitalize())
+    check_plain(problem, program.capitalize())
     for name in problem.mesh.region_names:
         _check_material(name, problem.materials[name], program)
     system = System(problem)

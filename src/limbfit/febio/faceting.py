@@ -11,11 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fe import Indenter
+from ..errors import ProblemError
+from ..fe import Indenter, Motion, OpenSurface, Problem, System
+from ..fe.contact.rigid import RigidShape
+from .moving import in_space
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+INDENTER, PATCH, FRONT = "indenter", "contact_patch", "indenter_front"
 BLUNT = 0.05  # edge radius over the width that FEBio's contact goes round without retries
 
 
@@ -51,3 +55,55 @@ def tool_mesh(indenter: Indenter) -> Tool:
 
 def _placed(indenter: Indenter, local: Array) -> Array:
     return np.asarray(np.asarray(indenter.centre) + local @ indenter.frame)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body as it is written: its mesh, where its centre of mass (3,) is put, its motion along and
+    about the axes of space, the faces (f, k) of tissue that it may touch, and what all that is called."""
+
+    name: str
+    patch: str
+    front: str
+    pair: str
+    tool: Tool
+    centre: Array
+    motion: Motion
+    faces: Indices
+    friction: str | float
+
+
+def written_bodies(problem: Problem) -> list[Body]:
+    """The rigid bodies of a problem where they start.
+
+    Raises
+    ------
+    ProblemError
+        For a motion that FEBio cannot be told, and two bodies of one name.
+    """
+    system = System(problem)
+    found: list[Body] = []
+    for i, body in enumerate([] if system.bodies is None else system.bodies.all):
+        stated, first = body.stated, i == 0 and problem.indenter is not None
+        name = INDENTER if first else stated.name or f"body_{i + 1}"
+        if name in {other.name for other in found}:
+            raise ProblemError(f"two rigid bodies have the name {name!r}", remedy="give each its own")
+        patch, front, pair = (PATCH, FRONT, "indentation") if first else (
+            f"{name}_patch", f"{name}_front", f"{name}_contact"
+        )  # fmt: skip
+        motion = in_space(name, stated.motion, body.start.frame)
+        faces = np.asarray(stated.faces, dtype=np.int64)
+        tool = _mesh_of(body.start)
+        found.append(Body(name, patch, front, pair, tool, body.pivot, motion, faces, stated.friction))
+    return found
+
+
+def _mesh_of(shape: RigidShape) -> Tool:
+    if isinstance(shape, Indenter):
+        return tool_mesh(shape)
+    if not isinstance(shape, OpenSurface):
+        raise ProblemError(f"a rigid body that is a {type(shape).__name__} is not written for FEBio")
+    used, faces = np.unique(shape.faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    points = shape.points[used] @ shape.frame + np.asarray(shape.centre, dtype=float)
+    return Tool(points, faces, "tri3", faces)

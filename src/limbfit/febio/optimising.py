@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError, RunError
 from ..fe import Indenter, Problem
-from .writing import INDENTER
+from .faceting import INDENTER
 
 Array = NDArray[np.float64]
 NAMES = ("c", "m", "gamma", "tau")
@@ -36,14 +36,20 @@ class Range:
 
 
 def in_indenter_frame(problem: Problem) -> Problem:
-    """The same indentation in the frame of its indenter, which goes along z."""
+    """The same problem in the frame of its indenter, which goes along z."""
     indenter = problem.indenter
     if indenter is None:
         raise ProblemError("there is no indenter")
     frame, centre = indenter.frame, np.asarray(indenter.centre, dtype=float)
     mesh = problem.mesh.with_points((problem.mesh.points - centre) @ frame.T)
     turned: Indenter = replace(indenter, centre=np.zeros(3), axis=[0.0, 0.0, 1.0], edge=[1.0, 0.0, 0.0])
-    return replace(problem, mesh=mesh, indenter=turned)
+    bodies = []
+    for body in problem.bodies:
+        shape = body.shape
+        place = (np.asarray(shape.centre, dtype=float) - centre) @ frame.T
+        there = shape.placed(place, frame @ shape.frame[2], frame @ shape.frame[0])
+        bodies.append(replace(body, shape=there, pivot=(body.origin - centre) @ frame.T))
+    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies))
 
 
 def write_optimisation(

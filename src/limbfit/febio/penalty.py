@@ -9,7 +9,9 @@ Source: FEBio, ``FEContactInterface::AutoPenalty``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,7 @@ from ..fe.contact.contact import ContactSurface, touching_offset
 from ..fe.kernel.elements import face_quadrature, reference_gradients
 from ..fe.materials import prony_factors
 from ..mesh import Mesh
-from .model import Contact
+from .reading.model import Contact
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,8 +34,8 @@ CURRENT_AREA = 1.21
 
 def explicit_penalty(problem: Problem, steps: StepControl) -> float:
     """The explicit penalty of ``sliding-elastic`` that is as stiff as limbfit's contact, MPa/mm."""
-    assert problem.indenter is not None
-    own = 2000.0 / problem.indenter.width if steps.penalty is None else steps.penalty
+    width = 1.0 if problem.indenter is None else problem.indenter.width
+    own = 2000.0 / width if steps.penalty is None else steps.penalty
     return own * _mean_modulus(problem) / CURRENT_AREA
 
 
@@ -68,47 +70,65 @@ class FaceWise:
 
     Parameters
     ----------
+    contacts : that of every rigid body of the problem, in their order.
     times : (k,) s, the steps that will be taken.
     """
 
-    def __init__(self, system: System, contact: Contact, times: Array) -> None:
-        problem = system.problem
-        assert system.surface is not None
-        self.system, self.faces, self.times = system, np.asarray(problem.contact_faces), np.asarray(times)
-        # On quadratic faces the mean stretch comes nearer to FEBio's forces (0.4 to 0.7 % on exported sites)
-        # than the area itself (0.7 to 2 %), on linear ones the area does; why is not known.
-        self.current = contact.rule == "sliding-elastic" and self.faces.shape[1] != 6
-        stiffness = np.full(len(self.faces), contact.penalty)
-        if contact.automatic:
-            stiffness *= automatic_penalties(problem, self.faces, float(self.times[0]))
-        self.share = stiffness[:, None] / mean_stiffness(contact, problem, float(self.times[0]))
-        if self.current:
-            self.share /= CURRENT_AREA
-        self.areas = self._areas_at(problem.mesh.points)
-        self.displacement = float(problem.history.at(0.0))
-        self._weigh(self.areas)
+    def __init__(self, system: System, contacts: Sequence[Contact], times: Array) -> None:
+        assert system.bodies is not None
+        self.system, self.times = system, np.asarray(times)
+        first = float(self.times[0])
+        mean = mean_stiffness(contacts[0], system.problem, first)
+        if contacts[0].rule == "sliding-elastic":
+            mean *= CURRENT_AREA
+        self.faces = [
+            _Faces(body, contact, system.problem, first, mean)
+            for body, contact in zip(system.bodies.all, contacts, strict=True)
+        ]
 
     def after(self, step: Step) -> None:
         """Weigh the contact points for the step that follows an accepted one."""
+        later = self.times[self.times > step.time * (1.0 + 1e-9)]
+        ahead = float(later[0]) if len(later) else step.time
+        for faces, coordinates in zip(self.faces, step.coordinates):
+            faces.after(step, coordinates, ahead)
+
+
+class _Faces:
+    """The faces that one body touches."""
+
+    def __init__(self, body: Any, contact: Contact, problem: Problem, first: float, mean: float) -> None:
+        self.body, self.problem, self.all = body, problem, np.asarray(body.stated.faces)
+        # On quadratic faces the mean stretch comes nearer to FEBio's forces (0.4 to 0.7 % on exported sites)
+        # than the area itself (0.7 to 2 %), on linear ones the area does; why is not known.
+        elastic = contact.rule == "sliding-elastic"
+        self.current = elastic and self.all.shape[1] != 6
+        stiffness = np.full(len(self.all), contact.penalty)
+        if contact.automatic:
+            stiffness *= automatic_penalties(problem, self.all, first)
+        self.share = stiffness[:, None] / mean * (1.0 if self.current or not elastic else CURRENT_AREA)
+        self.areas = self._areas_at(problem.mesh.points)
+        self.coordinates = body.stated.motion.at(0.0)[0]
+        self._weigh(self.areas)
+
+    def after(self, step: Step, coordinates: Array, ahead: float) -> None:
+        """Foresee the areas at the time ``ahead``, s, from where the body is and what moves it."""
         if not self.current:
             return
-        history = self.system.problem.history
-        later = self.times[self.times > step.time * (1.0 + 1e-9)]
-        areas = self._areas_at(self.system.problem.mesh.points + step.state.u)
-        ahead = float(history.at(later[0])) - step.displacement if len(later) else 0.0
-        gone = step.displacement - self.displacement
-        ratio = float(np.clip(ahead / gone, -2.0, 2.0)) if gone else 0.0
+        areas = self._areas_at(self.problem.mesh.points + step.state.u)
+        there, forced = self.body.stated.motion.at(ahead)
+        gone, way = coordinates - self.coordinates, np.where(forced, 0.0, there - coordinates)
+        moved = float(gone[:3] @ gone[:3])
+        ratio = float(np.clip(way[:3] @ gone[:3] / moved, -2.0, 2.0)) if moved else 0.0
         self._weigh(np.maximum(areas + ratio * (areas - self.areas), 0.5 * areas))
-        self.areas, self.displacement = areas, step.displacement
+        self.areas, self.coordinates = areas, coordinates
 
     def _areas_at(self, points: Array) -> Array:
-        problem = self.system.problem
-        return face_quadrature(problem.formulation, points, self.faces, problem.contact_rule)[1]
+        problem = self.problem
+        return face_quadrature(problem.formulation, points, self.all, problem.contact_rule)[1]
 
     def _weigh(self, areas: Array) -> None:
-        assert self.system.bodies is not None
-        body = self.system.bodies.first
-        body.surface = replace(body.surface, areas=self.share * areas)
+        self.body.surface = replace(self.body.surface, areas=self.share * areas)
 
 
 def automatic_penalties(problem: Problem, faces: Indices, dt: float) -> Array:

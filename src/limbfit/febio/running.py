@@ -11,9 +11,10 @@ import numpy as np
 
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Result, Step, System, solve
-from .model import read_feb
+from .driving import contacts_of_bodies
 from .penalty import FaceWise
 from .problem import penalised, step_control, to_problem
+from .reading.model import read_feb
 from .tables import Tables
 
 
@@ -56,8 +57,8 @@ def run_feb(
         tables = Tables(model, system, folder, Path(path).stem)
         weights = None
         if penalised(model) and "penalty" not in settings:
-            assert model.contact is not None
-            weights = FaceWise(system, model.contact, np.asarray(control.times))
+            laws = [contacts[0] for contacts in contacts_of_bodies(model).values()]
+            weights = FaceWise(system, laws, np.asarray(control.times))
     except ProblemError as error:
         raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None
     assert control.times is not None

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..fe import Step, System
 from ..fe.kernel.laws import Laws
 from ..fe.observables import ElementFields, element_fields, nodal_forces
-from .model import FebModel
-from .problem import Body, deformable_body, drive, touching_body
-from .requests import Request
+from .driving import contacts_of_bodies, drive
+from .reading.model import FebModel
+from .reading.requests import Request
+from .tissue import tissue_of
 
 Array = NDArray[np.float64]
 _CAUCHY = ("sx", "sy", "sz", "sxy", "syz", "sxz")
@@ -29,10 +31,11 @@ class Tables:
     def __init__(self, model: FebModel, system: System, folder: Path, stem: str) -> None:
         problem = system.problem
         self.model, self.problem, self.system = model, problem, system
-        self.body: Body = deformable_body(model)
+        self.tissue = tissue_of(model)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.travel = drive(model).travel
-        self.touching = "" if model.contact is None else touching_body(model)
+        # The bodies of the problem by FEBio's name, in the problem's order.
+        self.bodies = dict(zip(contacts_of_bodies(model), problem.rigid_bodies))
         self.count = 0
         names = [request.file or f"{stem}.log" for request in model.requests]
         self.paths = [folder / name for name in names]
@@ -72,18 +75,25 @@ class Tables:
             stream.flush()
         self.count += 1
 
-    def _advance(self, body: str, step: Step | None) -> Array:
-        """How far a rigid body has gone (3,), mm."""
+    def _pose(self, name: str, step: Step | None) -> tuple[Array, Array]:
+        """Move (3,) of a rigid body's centre of mass, mm, and its rotation vector (3,), rad, in space."""
+        if name in self.bodies and self.problem.indenter is None:
+            i, body = list(self.bodies).index(name), self.bodies[name]
+            coordinates = body.motion.at(0.0)[0] if step is None else step.coordinates[i]
+            return coordinates[:3] @ body.shape.frame, coordinates[3:] @ body.shape.frame
         gone = float(self.problem.history.at(0.0)) if step is None else step.displacement
-        return gone * self.travel[body]
+        return gone * self.travel[name], np.zeros(3)
 
     def _displacement(self, step: Step | None) -> Array:
         """Displacement (n, 3) of all nodes of the file, mm; nodes of no element stay."""
         u = np.zeros_like(self.model.geometry.points)
         for part in self.model.parts_of(self.model.rigid).values():
-            u[part.cells] = self._advance(part.material, step)
+            move, turn = self._pose(part.material, step)
+            nodes, centre = np.unique(part.cells), self.model.rigid[part.material].centre
+            arms = self.model.geometry.points[nodes] - centre
+            u[nodes] = move + Rotation.from_rotvec(turn).apply(arms) - arms
         if step is not None:
-            u[self.body.nodes] = step.state.u
+            u[self.tissue.nodes] = step.state.u
         return u
 
     def _columns(
@@ -125,22 +135,40 @@ class Tables:
         return found
 
     def _of_rigid(self, step: Step | None) -> dict[str, Array]:
-        """Position of the centre of mass, mm, and force on the tissue, N, of every rigid body."""
-        moved = np.array([body.centre for body in self.model.rigid.values()]).reshape(-1, 3)
-        force = np.zeros_like(moved)
-        for i, name in enumerate(self.model.rigid):
-            moved[i] += self._advance(name, step)
+        """Place of the centre of mass, mm, rotation vector, rad, force, N, and moment about that place, N mm,
+        of every rigid body."""
+        names = ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
+        rows = np.zeros((len(self.model.rigid), len(names)))
+        for i, (name, body) in enumerate(self.model.rigid.items()):
+            move, turn = self._pose(name, step)
+            rows[i, :3], rows[i, 3:6] = body.centre + move, turn
             if step is not None:
-                force[i] = self._force(name, step)
-        return dict(zip(("x", "y", "z", "Fx", "Fy", "Fz"), np.hstack([moved, force]).T))
+                rows[i, 6:] = self._force(name, body.centre + move, turn, step)
+        return dict(zip(names, rows.T))
 
-    def _force(self, body: str, step: Step) -> Array:
-        """Force (3,) of a rigid body on the tissue that it touches and carries, N."""
-        force = np.zeros(3)
-        if body == self.touching:
-            assert self.system.indenter is not None
-            force += step.reaction @ self.system.indenter.frame
-        if body in self.model.carried:
-            nodes = self.body.number[self.model.carried[body]]
-            force += nodal_forces(self.system, self.laws, step.state)[nodes].sum(axis=0)
-        return force
+    def _force(self, name: str, at: Array, turn: Array, step: Step) -> Array:
+        """Force and moment (6,) about ``at`` of a rigid body on the tissue that it touches and carries."""
+        total = np.zeros(6)
+        if name in self.bodies:
+            assert self.system.bodies is not None
+            i = list(self.bodies).index(name)
+            body = self.system.bodies.all[i]
+            force, conjugate = step.reactions[i].reshape(2, 3) @ body.frame
+            pivot = body.pivot + step.coordinates[i, :3] @ body.frame
+            moment = np.linalg.solve(_turning(turn).T, conjugate)
+            total += [*force, *(moment + np.cross(pivot - at, force))]
+        if name in self.model.carried:
+            nodes = self.tissue.number[self.model.carried[name]]
+            forces = nodal_forces(self.system, self.laws, step.state)[nodes]
+            arms = self.tissue.mesh.points[nodes] + step.state.u[nodes] - at
+            total += [*forces.sum(axis=0), *np.cross(arms, forces).sum(axis=0)]
+        return total
+
+
+def _turning(w: Array) -> Array:
+    """(3, 3) the spin of a body in space per unit of its rotation vector ``w``: Rodrigues' left Jacobian."""
+    angle, skew = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * skew)
+    a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + a * skew + b * skew @ skew)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 
@@ -14,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError, RunError
-from ..fe import Material, Problem, StepControl, System
+from ..fe import Indenter, Material, Problem, StepControl
 from ..fe.solution.control import schedule
-from .faceting import Tool, blunt, tool_mesh
-from .model import Contact
+from .faceting import FRONT, INDENTER, PATCH, Body, Tool, blunt, written_bodies
+from .moving import HELD, Curves, boundary_lines, conditions, pressure_lines, row, step_ends
 from .penalty import explicit_penalty, mean_stiffness
+from .reading.model import Contact
 
 Array = NDArray[np.float64]
 
-INDENTER = "indenter"
-PATCH, FRONT, HELD = "contact_patch", "indenter_front", "held"
 # FEBio's names of limbfit's elements; hex8 with an uncoupled material is three-field by itself.
 _QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10p0": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
 _FACE = {3: "tri3", 4: "quad4", 6: "tri6"}
@@ -50,28 +50,47 @@ class FebSettings:
     title: str = ""
 
 
-def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> Tool:
-    """Write an indentation as FEBio input; returns the indenter's rigid mesh.
+def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> Tool | None:
+    """Write a problem as FEBio input; returns the rigid mesh of its indenter, or of its first body, if any.
 
     Raises
     ------
     ProblemError
-        For a problem that FEBio cannot be given as it is: sticky contact, limbfit's own elements, no
-        indenter, supports that move.
+        For a problem that FEBio cannot be given as it is: sticky contact, limbfit's own elements, a force
+        along an axis askew.
     RunError
         Where the file cannot be written.
     """
-    check_exportable(problem, "FEBio")
     settings = settings or FebSettings()
-    system = System(problem)
-    assert system.indenter is not None
-    tool = tool_mesh(system.indenter)
+    bodies = _checked_bodies(problem)
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _lines(problem, system, tool, settings))
+            stream.writelines(f"{line}\n" for line in _lines(problem, bodies, settings))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
-    return tool
+    return bodies[0].tool if bodies else None
+
+
+def _checked_bodies(problem: Problem) -> list[Body]:
+    """The rigid bodies of a problem that FEBio can be given.
+
+    Raises
+    ------
+    ProblemError
+        Where it cannot.
+    """
+    check_element(problem, "FEBio")
+    if not (problem.rigid_bodies or problem.pressures or any(s.factor for s in problem.supports)):
+        raise ProblemError("nothing drives the problem: there is nothing to write for FEBio")
+    if any(body.friction == "sticky" for body in problem.rigid_bodies):
+        raise ProblemError("FEBio has no sticky contact", remedy='export with friction = "frictionless"')
+    bodies = written_bodies(problem)
+    mesh = problem.mesh
+    own = {name for body in bodies for name in (body.name, body.patch, body.front)} | {HELD}
+    taken = own & {*mesh.node_sets, *mesh.face_sets, *mesh.region_names}
+    if taken:
+        raise ProblemError(f"a set or tissue has the name {min(taken)!r}, which is a rigid body's")
+    return bodies
 
 
 def contact_of(problem: Problem, settings: FebSettings) -> Contact:
@@ -84,7 +103,6 @@ def contact_of(problem: Problem, settings: FebSettings) -> Contact:
 
 def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     """What FEBio still does otherwise with the input than limbfit does, a line each."""
-    assert problem.indenter is not None
     own, automatic = explicit_penalty(problem, settings.steps), settings.penalty is not None
     if automatic:
         mean = mean_stiffness(contact_of(problem, settings), problem, first_step(problem))
@@ -101,7 +119,8 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     lines = [contact, "indenter: facets, without the side walls", "time: FEBio's own steps"]
     if not automatic:
         lines.append("force: within 2 % of the peak of limbfit's, as far as these go")
-    if not blunt(problem.indenter):
+    shapes = [body.shape for body in problem.rigid_bodies]
+    if not all(blunt(shape) for shape in shapes if isinstance(shape, Indenter)):
         lines.append(
             "edge: FEBio's contact gets through with edges rounded by 2 mm, or a twentieth of the width; "
             "under one as sharp as this it may stop before the end"
@@ -109,12 +128,17 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def check_exportable(problem: Problem, program: str) -> None:
-    """Raise `ProblemError` where another program cannot be given the problem as it is."""
+def check_element(problem: Problem, program: str) -> None:
+    """Raise `ProblemError` where another program has no such element."""
     name = problem.formulation.name
     if name not in _QUADRATURE:
         known = ", ".join(_QUADRATURE)
         raise ProblemError(f"{program} has no element {name!r}", remedy=f"export with one of {known}")
+
+
+def check_plain(problem: Problem, program: str) -> None:
+    """Raise `ProblemError` where a problem is more than a frictionless indentation along the axis."""
+    check_element(problem, program)
     if problem.indenter is None or problem.supports:
         raise ProblemError(f"only indentations with fixed nodes are written for {program}")
     if problem.history.across is not None:
@@ -123,76 +147,109 @@ def check_exportable(problem: Problem, program: str) -> None:
         raise ProblemError(f"an indenter under force, or further rigid bodies, are not written for {program}")
     if problem.pressures:
         raise ProblemError(f"a pressure is not written for {program}")
-    if problem.friction == "sticky" or (problem.friction != "frictionless" and program != "FEBio"):
+    if problem.friction != "frictionless":
         raise ProblemError(
-            f"friction is not written for {program}" if program != "FEBio" else "FEBio has no sticky contact",
-            remedy='export with friction = "frictionless"',
+            f"friction is not written for {program}", remedy='export with friction = "frictionless"'
         )
     taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, HELD}
     if taken or INDENTER in problem.mesh.region_names:
         raise ProblemError(f"a set or tissue has the name {(*taken, INDENTER)[0]!r}, which is the indenter's")
 
 
-def _lines(problem: Problem, system: System, tool: Tool, settings: FebSettings) -> Iterator[str]:
+def _lines(problem: Problem, bodies: list[Body], settings: FebSettings) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     for words in (f"limbfit: {settings.title}; mm, N, s, MPa", *differences(problem, settings)):
         yield f"<!-- {escape(' '.join(words.replace('--', '-').split()))} -->"
+    curves, regions = Curves(), problem.mesh.region_names
+    end = float(problem.history.times[-1])
+    ends = step_ends([body.motion for body in bodies], end)
+    rigid = [conditions(body.name, body.motion, ends, curves) for body in bodies]
+    by_step = [[line for body in rigid for line in body[k]] for k in range(len(ends))]
+    musts = np.concatenate([[0.0], schedule(problem.history, settings.steps, problem.turns)])
+    largest = np.full(len(musts), largest_step(problem))
+    must = curves.add("must_points", np.column_stack([musts, largest]), "STEP")
+    boundary = list(boundary_lines(problem, curves))
+    loads = list(pressure_lines(problem, curves))
+    controls = [list(_control(problem, settings, must, *span)) for span in pairwise([0.0, *ends])]
     yield '<febio_spec version="4.0">'
     yield '<Module type="solid"/>'
-    yield from _control(problem, settings)
+    if len(ends) == 1:
+        yield from controls[0]
     yield "<Globals><Constants><T>0</T><R>0</R><Fc>0</Fc></Constants></Globals>"
     yield "<Material>"
-    regions = problem.mesh.region_names
     for i, name in enumerate(regions, 1):
         yield from material_lines(i, name, problem.materials[name])
-    assert system.indenter is not None
-    yield (
-        f'<material id="{len(regions) + 1}" name="{INDENTER}" type="rigid body"><density>1</density>'
-        f"<center_of_mass>{_row(np.asarray(system.indenter.centre))}</center_of_mass></material>"
-    )
+    for i, body in enumerate(bodies, len(regions) + 1):
+        yield (
+            f'<material id="{i}" name={quoteattr(body.name)} type="rigid body"><density>1</density>'
+            f"<center_of_mass>{row(body.centre)}</center_of_mass></material>"
+        )
     yield "</Material>"
-    yield from _mesh(problem, tool)
-    yield from _domains(problem, tool)
-    yield f'<Boundary><bc name="held" node_set="{HELD}" type="zero displacement">'
-    yield "<x_dof>1</x_dof><y_dof>1</y_dof><z_dof>1</z_dof></bc></Boundary>"
-    yield from _rigid(system.indenter.frame[2])
-    yield from _contact(problem, settings)
-    yield from _load_curves(problem, settings)
-    yield from _output(len(regions) + 1, settings)
+    yield from _mesh(problem, bodies)
+    yield from _domains(problem, bodies)
+    yield from ("<Boundary>", *boundary, "</Boundary>")
+    if bodies and len(ends) == 1:
+        yield from ("<Rigid>", *by_step[0], "</Rigid>")
+    if bodies:
+        contacts = (line for body in bodies for line in _contact(problem, body, settings))
+        yield from ("<Contact>", *contacts, "</Contact>")
+    if loads:
+        yield from ("<Loads>", *loads, "</Loads>")
+    yield from curves.lines()
+    if len(ends) > 1:
+        yield "<Step>"
+        for k, (control, lines) in enumerate(zip(controls, by_step), 1):
+            yield from (f'<step id="{k}">', *control, "<Rigid>", *lines, "</Rigid>", "</step>")
+        yield "</Step>"
+    yield from _output(range(len(regions) + 1, len(regions) + len(bodies) + 1), settings)
     yield "</febio_spec>"
 
 
-def _control(problem: Problem, settings: FebSettings) -> Iterator[str]:
+def _control(problem: Problem, settings: FebSettings, must: int, begin: float, end: float) -> Iterator[str]:
     """Steps that FEBio grows and halves; stiff contact needs a tangent in every iteration.
 
     With an explicit penalty quasi-Newton updates stall.
     """
-    end, size = float(problem.history.times[-1]), first_step(problem)
+    size = _dividing(end - begin, 0.25 * largest_step(problem))
     updates, reformations = (0, 60) if settings.penalty is None else (10, 25)
-    yield f"<Control><analysis>STATIC</analysis><time_steps>{round(end / size)}</time_steps>"
+    yield f"<Control><analysis>STATIC</analysis><time_steps>{round((end - begin) / size)}</time_steps>"
     yield f"<step_size>{size!r}</step_size>"
     yield "<plot_level>PLOT_MUST_POINTS</plot_level><output_level>OUTPUT_MAJOR_ITRS</output_level>"
     yield '<time_stepper type="default"><max_retries>8</max_retries><opt_iter>15</opt_iter>'
-    yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="2">1</dtmax><aggressiveness>1</aggressiveness>'
+    yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="{must}">1</dtmax><aggressiveness>1</aggressiveness>'
     yield "</time_stepper>"
-    matrix = "symmetric" if problem.friction == "frictionless" else "non-symmetric"
+    smooth = not problem.pressures and not any(_slides(body.friction) for body in problem.rigid_bodies)
+    matrix = "symmetric" if smooth else "non-symmetric"
     yield f'<solver type="solid"><symmetric_stiffness>{matrix}</symmetric_stiffness>'
     yield f"<max_refs>{reformations}</max_refs>"
     yield "<dtol>0.001</dtol><etol>0.01</etol><rtol>1e-05</rtol><lstol>0.9</lstol>"
     yield f'<qn_method type="BFGS"><max_ups>{updates}</max_ups></qn_method></solver></Control>'
 
 
+def _slides(friction: str | float) -> bool:
+    """Whether a body slides with friction."""
+    return friction not in ("frictionless", 0.0)
+
+
 def largest_step(problem: Problem) -> float:
-    """The largest step, s: a sixteenth of the loading, half of that under sharp edges."""
-    assert problem.indenter is not None
-    history = problem.history
-    return history.loading_s / (16.0 if blunt(problem.indenter) else 32.0)
+    """The largest step, s: a sixteenth of the first way in, half of that under sharp edges."""
+    ways = [] if problem.indenter is None else [problem.history.loading_s]
+    for body in problem.bodies:
+        ends = [*body.motion.turns, body.motion.times[-1]]
+        ways += [float(ends[0])] if body.motion.values.any() else []
+    shapes = [body.shape for body in problem.rigid_bodies]
+    round_enough = all(blunt(shape) for shape in shapes if isinstance(shape, Indenter))
+    return min(ways, default=float(problem.history.times[-1])) / (16.0 if round_enough else 32.0)
 
 
 def first_step(problem: Problem) -> float:
     """The first step, s: a quarter of the largest at most, and a whole part of the time."""
-    end = float(problem.history.times[-1])
-    return end / float(np.ceil(4.0 * end / largest_step(problem)))
+    return _dividing(float(problem.history.times[-1]), 0.25 * largest_step(problem))
+
+
+def _dividing(span: float, size: float) -> float:
+    """A whole part of a span of time, not above ``size``, s."""
+    return span / float(np.ceil(span / size))
 
 
 def material_lines(number: int, name: str, material: Material) -> Iterator[str]:
@@ -224,30 +281,39 @@ def material_lines(number: int, name: str, material: Material) -> Iterator[str]:
     yield f'<elastic type="Ogden"><k>0</k>{terms}</elastic></material>'
 
 
-def _mesh(problem: Problem, tool: Tool) -> Iterator[str]:
-    mesh, count = problem.mesh, len(problem.mesh.points)
+def _mesh(problem: Problem, bodies: list[Body]) -> Iterator[str]:
+    mesh = problem.mesh
+    firsts = np.cumsum([len(mesh.points), *(len(body.tool.points) for body in bodies)])
     yield '<Mesh><Nodes name="all">'
-    for i, point in enumerate(np.vstack([mesh.points, tool.points]), 1):
-        yield f'<node id="{i}">{_row(point)}</node>'
+    for i, point in enumerate(np.vstack([mesh.points, *(body.tool.points for body in bodies)]), 1):
+        yield f'<node id="{i}">{row(point)}</node>'
     yield "</Nodes>"
     number = 1
     for r, name in enumerate(mesh.region_names):
         cells = mesh.cells[mesh.regions == r]
         yield from _elements(name, mesh.cell_type, cells, number)
         number += len(cells)
-    yield from _elements(INDENTER, tool.cell_type, tool.cells + count, number)
-    for name, nodes in {HELD: problem.fixed, **mesh.node_sets}.items():
+    for body, first in zip(bodies, firsts):
+        yield from _elements(body.name, body.tool.cell_type, body.tool.cells + first, number)
+        number += len(body.tool.cells)
+    sets = {HELD: problem.fixed, **mesh.node_sets}
+    sets |= {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
+    for name, nodes in sets.items():
         if len(nodes):
             yield f"<NodeSet name={quoteattr(name)}>{_ids(nodes)}</NodeSet>"
     named = {  # FEBio makes an element set of every part
         f"{name}_surface" if name in mesh.region_names else name: faces
         for name, faces in mesh.face_sets.items()
     }
-    surfaces = {PATCH: np.asarray(problem.contact_faces), FRONT: tool.front + count, **named}
-    for name, faces in surfaces.items():
+    surfaces = {body.patch: body.faces for body in bodies}
+    surfaces |= {body.front: body.tool.front + first for body, first in zip(bodies, firsts)}
+    surfaces |= {f"pressed_{i}": np.asarray(one.faces) for i, one in enumerate(problem.pressures, 1)}
+    for name, faces in {**surfaces, **named}.items():
         yield from _surface(name, faces)
-    yield f'<SurfacePair name="indentation"><primary>{PATCH}</primary><secondary>{FRONT}</secondary>'
-    yield "</SurfacePair></Mesh>"
+    for body in bodies:
+        yield f"<SurfacePair name={quoteattr(body.pair)}><primary>{body.patch}</primary>"
+        yield f"<secondary>{body.front}</secondary></SurfacePair>"
+    yield "</Mesh>"
 
 
 def _elements(name: str, cell_type: str, cells: NDArray[np.int64], first: int) -> Iterator[str]:
@@ -265,7 +331,7 @@ def _surface(name: str, faces: NDArray[np.int64]) -> Iterator[str]:
     yield "</Surface>"
 
 
-def _domains(problem: Problem, tool: Tool) -> Iterator[str]:
+def _domains(problem: Problem, bodies: list[Body]) -> Iterator[str]:
     rule = _QUADRATURE[problem.formulation.name]
     given = f' elem_type="{rule}"' if rule else ""
     if problem.formulation.name == "tet10p0":  # one volume ratio and pressure per element
@@ -273,68 +339,39 @@ def _domains(problem: Problem, tool: Tool) -> Iterator[str]:
     yield "<MeshDomains>"
     for name in problem.mesh.region_names:
         yield f"<SolidDomain name={quoteattr(name)} mat={quoteattr(name)}{given}/>"
-    if tool.cell_type == "hex8":
-        yield f'<SolidDomain name="{INDENTER}" mat="{INDENTER}"/>'
-    else:
-        yield f'<ShellDomain name="{INDENTER}" mat="{INDENTER}">'
-        yield "<shell_thickness>0.01</shell_thickness></ShellDomain>"
+    for body in bodies:
+        names = f"name={quoteattr(body.name)} mat={quoteattr(body.name)}"
+        if body.tool.cell_type == "hex8":
+            yield f"<SolidDomain {names}/>"
+        else:
+            yield f"<ShellDomain {names}><shell_thickness>0.01</shell_thickness></ShellDomain>"
     yield "</MeshDomains>"
 
 
-def _rigid(axis: Array) -> Iterator[str]:
-    held = "".join(f"<R{x}_dof>{int(axis[i] == 0.0)}</R{x}_dof>" for i, x in enumerate("xyz"))
-    turns = "".join(f"<R{x}_dof>1</R{x}_dof>" for x in "uvw")
-    yield f'<Rigid><rigid_bc name="guide" type="rigid_fixed"><rb>{INDENTER}</rb>{held}{turns}</rigid_bc>'
-    for i, x in enumerate("xyz"):
-        if axis[i] != 0.0:
-            yield f'<rigid_bc name="advance_{x}" type="rigid_displacement"><rb>{INDENTER}</rb><dof>{x}</dof>'
-            yield f'<value lc="1">{float(axis[i])!r}</value><relative>0</relative></rigid_bc>'
-    yield "</Rigid>"
-
-
-def _contact(problem: Problem, settings: FebSettings) -> Iterator[str]:
-    """The way of the reference cases; the search reaches as far as the punch goes in, and half again."""
-    reach = max(1.5 * float(problem.history.driver.max()), 2.0)
-    yield '<Contact><contact name="indentation" type="sliding-elastic" surface_pair="indentation">'
+def _contact(problem: Problem, body: Body, settings: FebSettings) -> Iterator[str]:
+    """The way of the reference cases; the search reaches as far as a body goes in, and half again."""
+    ways = np.where(body.motion.free, 0.0, np.abs(body.motion.values))[:, :3]
+    reach = max(1.5 * float(ways.max()), 10.0 if body.motion.free.any() else 2.0)
+    pair = quoteattr(body.pair)
+    yield f'<contact name={pair} type="sliding-elastic" surface_pair={pair}>'
     contact = contact_of(problem, settings)
     yield f"<laugon>PENALTY</laugon><penalty>{contact.penalty!r}</penalty>"
     yield f"<auto_penalty>{contact.automatic:d}</auto_penalty>"
-    smooth = problem.friction == "frictionless"
+    smooth = not _slides(body.friction)
     yield f"<two_pass>0</two_pass><symmetric_stiffness>{smooth:d}</symmetric_stiffness>"
     yield "<search_tol>0.01</search_tol>"
     if not smooth:
-        yield f"<fric_coeff>{float(problem.friction)!r}</fric_coeff>"
-    yield f"<search_radius>{reach!r}</search_radius></contact></Contact>"
+        yield f"<fric_coeff>{float(body.friction)!r}</fric_coeff>"
+    yield f"<search_radius>{reach!r}</search_radius></contact>"
 
 
-def _load_curves(problem: Problem, settings: FebSettings) -> Iterator[str]:
-    """1: the advance of the indenter, mm; 2: the largest step, s, at the times that must be met."""
-    history = problem.history
-    musts = np.concatenate([[0.0], schedule(history, settings.steps)])
-    curves = [
-        ("advance", "LINEAR", np.column_stack([history.times, history.driver])),
-        ("must_points", "STEP", np.column_stack([musts, np.full(len(musts), largest_step(problem))])),
-    ]
-    yield "<LoadData>"
-    for i, (name, interpolate, points) in enumerate(curves, 1):
-        yield f'<load_controller id="{i}" name="{name}" type="loadcurve">'
-        yield f"<interpolate>{interpolate}</interpolate><extend>CONSTANT</extend><points>"
-        yield from (f"<pt>{_row(point)}</pt>" for point in points)
-        yield "</points></load_controller>"
-    yield "</LoadData>"
-
-
-def _output(number: int, settings: FebSettings) -> Iterator[str]:
+def _output(numbers: Iterable[int], settings: FebSettings) -> Iterator[str]:
     variables = ("displacement", "stress", "relative volume", "contact pressure", "contact gap")
     yield '<Output><plotfile type="febio">' + "".join(f'<var type="{name}"/>' for name in variables)
-    yield "</plotfile><logfile>"
-    file = quoteattr(settings.force_file)
-    data = f'<rigid_body_data data="Fx;Fy;Fz;x;y;z" file={file} delim=",">'
-    yield f"{data}{number}</rigid_body_data></logfile></Output>"
-
-
-def _row(values: Iterable[float]) -> str:
-    return ",".join(repr(float(value)) for value in values)
+    items = ",".join(str(number) for number in numbers)
+    table = f'data="Fx;Fy;Fz;x;y;z" file={quoteattr(settings.force_file)} delim=","'
+    rigid = f"<logfile><rigid_body_data {table}>{items}</rigid_body_data></logfile>"
+    yield f"</plotfile>{rigid if items else ''}</Output>"
 
 
 def _ids(nodes: Iterable[int]) -> str:

@@ -111,8 +111,8 @@ def _gmres(
 def couple(
     system: System, laws: Laws, increment: Increment, u: Array, factor: Factor, control: NewtonControl,
     floor: float, seconds: defaultdict[str, float],
-) -> tuple[Equilibrium, Increment] | None:  # fmt: skip
-    """Equilibrium near ``u (r, 3)`` with grips and rims as they are there; None where it is not found.
+) -> tuple[tuple[Equilibrium, Increment] | None, int]:  # fmt: skip
+    """Equilibrium near ``u (r, 3)`` with grips and rims as they are there, or None, and the iterations spent.
 
     Newton's method on the residual, which must fall at every step: there is no energy.
     """
@@ -128,12 +128,12 @@ def couple(
     for iteration in range(MOST_ITERATIONS):
         norm, scale = residual_norm(system, here), reaction_scale(system, here, floor)
         if norm <= control.tolerance * scale:
-            return Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now
+            return (Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now), iteration
         b = -here.residual.ravel()[system.free][:, None]
         try:
             d = _gmres(here, factor, Coupling(system, now, u), b, np.zeros_like(b), FORCING)
         except NotPositiveDefiniteError:
-            return None
+            return None, iteration + 1
         direction = np.zeros(here.residual.size)
         direction[system.free] = d[:, 0]
         way, step = direction.reshape(u.shape), 1.0
@@ -143,6 +143,6 @@ def couple(
                 break
             step *= 0.5
         else:
-            return None
+            return None, iteration + 1
         u, now, here = u + step * way, there, at
-    return None
+    return None, MOST_ITERATIONS

@@ -38,6 +38,8 @@ TOO_DEEP, MOST_RAISES = 1.2, 5
 NEARLY = 0.1
 # How often the grip of a step is renewed; residual over reactions that is left then and is taken as it is.
 MOST_RENEWALS, UNSETTLED = 30, 1e-2
+# Renewals in a row that may bring it no closer: then it goes round, or away.
+VAIN_RENEWALS, CLOSER = 6, 0.9
 # Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
 STEEP_PRESSURE = 15.0
 
@@ -93,10 +95,7 @@ class Simulation:
         pace, why = Pace(self.control.max_iterations), ""
         times, forces = [0.0], [0.0]
         while targets:
-            now, spent = (
-                self.states[-1].time,
-                self.counts["newton_iterations"] >= self.control.most_iterations,
-            )
+            now, spent = self.states[-1].time, self._spent()
             if spent:
                 bound = f"no more than {self.control.most_iterations} Newton iterations were allowed"
                 why = f"{why}; {bound}" if why else bound
@@ -162,16 +161,18 @@ class Simulation:
         lags = increment.lags
         loosely = replace(control, tolerance=max(control.tolerance, NEARLY)) if lags else control
         found = self._equilibrate(increment, start, loosely)
+        closest, vain = np.inf, 0
         for _ in range(MOST_RENEWALS):
             if found.reason or found.at.penetration > control.bearable:
                 return found, increment
             if lags:
-                settled = couple(
+                settled, spent = couple(
                     self.system, self.laws, increment, found.u, self.factor, control, self.floor, self.seconds
                 )
                 if settled is not None:
-                    self.counts["newton_iterations"] += settled[0].iterations
+                    self.counts["newton_iterations"] += spent
                     return settled
+                self.counts["vain_iterations"] += spent
             again = renewed(self.system, increment, found.u)
             if again is increment:
                 return found, increment
@@ -179,8 +180,17 @@ class Simulation:
             found = self._equilibrate(increment, found.u, control)
             if not found.iterations:
                 return found, increment
+            vain = 0 if found.first < CLOSER * closest else vain + 1
+            closest = min(closest, found.first)
+            if vain > VAIN_RENEWALS or self._spent():
+                break
         reason = "" if found.first <= UNSETTLED else "friction, or the rim of a pressure, does not settle"
-        return replace(found, reason=reason, unsettled=found.first), increment
+        return replace(found, reason=found.reason or reason, unsettled=found.first), increment
+
+    def _spent(self) -> bool:
+        """Whether no more Newton iterations are allowed, those that led nowhere counted."""
+        used = self.counts["newton_iterations"] + self.counts["vain_iterations"]
+        return used >= self.control.most_iterations
 
     def _equilibrate(self, increment: Increment, guess: Array, control: NewtonControl) -> Equilibrium:
         """From the guess or the last displacement; from the last one where that fails."""

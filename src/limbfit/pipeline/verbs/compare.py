@@ -99,7 +99,7 @@ def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
     penalty = mean_penalty(contact, problem, float(times[0]))
     steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
     system = System(problem)
-    weights = FaceWise(system, contact, times)
+    weights = FaceWise(system, (contact,), times)
     return solve(problem, steps, store="none", on_step=weights.after, system=system)
 
 

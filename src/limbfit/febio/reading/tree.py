@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from ..errors import ProblemError
+from ...errors import ProblemError
 
 MOST_BYTES = 256 * 2**20  # some two million nodes
 MOST_DEPTH = 40

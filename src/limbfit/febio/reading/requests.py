@@ -11,7 +11,7 @@ from .tree import Node
 KNOWN = {
     "node_data": ("x", "y", "z", "ux", "uy", "uz"),
     "element_data": ("x", "y", "z", "sx", "sy", "sz", "sxy", "syz", "sxz", "s1", "s2", "s3", "J"),
-    "rigid_body_data": ("x", "y", "z", "Fx", "Fy", "Fz"),
+    "rigid_body_data": ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz"),
 }
 
 

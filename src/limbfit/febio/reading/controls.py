@@ -44,8 +44,8 @@ def read_phases(root: Node, curves: Mapping[int, Curve]) -> tuple[Phase, ...]:
     if steps is not None and len(steps):
         for step in steps:
             for child in step:
-                if child.tag != "Control":
-                    raise child.refuse("only <Control> may change from step to step")
+                if child.tag not in ("Control", "Rigid"):
+                    raise child.refuse("only <Control> and <Rigid> may change from step to step")
         controls = [step.child("Control") for step in steps]
     else:
         controls = [root.child("Control")]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ProblemError
-from ..fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from ...errors import ProblemError
+from ...fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from .tree import Node
 
 Array = NDArray[np.float64]
@@ -35,10 +35,12 @@ _VOLUMETRIC = {
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid material: its number in the file and its centre of mass (3,), mm; NaN: to be found."""
+    """A rigid material: its number in the file, its centre of mass (3,), mm (NaN: to be found), and its
+    line."""
 
     number: int
     centre: Array
+    line: int = 0
 
 
 def read_materials(
@@ -63,7 +65,8 @@ def read_materials(
         numbers.add(number)
         if node.attribute("type") == "rigid body":
             centre = node.find("center_of_mass")
-            rigid[name] = RigidBody(number, np.array([np.nan] * 3 if centre is None else centre.numbers(3)))
+            at = np.array([np.nan] * 3 if centre is None else centre.numbers(3))
+            rigid[name] = RigidBody(number, at, node.line)
             continue
         try:
             soft[name] = _law(node)

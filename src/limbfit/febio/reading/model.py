@@ -13,14 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ProblemError
-from ..fe import Material
+from ...errors import ProblemError
+from ...fe import Material
 from .controls import Phase, read_phases
 from .curves import Curve, read_curves
 from .geometry import Geometry, Indices, Part, node_set, read_geometry
 from .materials import RigidBody, read_materials
+from .motions import RigidCondition, amount, body_of, curved, read_conditions
 from .requests import Request, read_requests
-from .rigid import FREEDOMS, carried_nodes, centre_of_mass, fixed_freedoms
+from .rigid import carried_nodes, centre_of_mass
 from .tree import Node, read_tree
 
 Array = NDArray[np.float64]
@@ -39,7 +40,7 @@ _CONTACT_ZERO = ("tension", "offset", "node_reloc")
 
 @dataclass(frozen=True)
 class Motion:
-    """Displacement ``component`` of nodes or of a rigid body: ``factor`` times a load curve (0: held)."""
+    """Displacement ``component`` of nodes: ``factor`` times a load curve (0: held)."""
 
     target: str
     nodes: Indices
@@ -62,6 +63,15 @@ class Contact:
     line: int
     friction: float = 0.0
 
+    @property
+    def penalised(self) -> bool:
+        """Whether it has a penalty of FEBio's; augmented and nodal contact are limbfit's own."""
+        return not self.augmented and self.rule != "sliding-node-on-facet"
+
+    def acts_as(self, other: Contact) -> bool:
+        """Whether both have one law, wherever they act."""
+        return replace(self, surfaces=other.surfaces, line=other.line) == other
+
 
 @dataclass(frozen=True)
 class PressureLoad:
@@ -78,7 +88,7 @@ class FebModel:
     """A ``.feb`` in mm, N, s, MPa.
 
     ``materials`` are the deformable ones, ``rigid`` the others, both by name; ``motions`` those of nodes,
-    ``rigid_motions`` those of rigid bodies; ``carried`` nodes of tissue that move with a rigid body, by its
+    ``conditions`` those of rigid bodies; ``carried`` nodes of tissue that move with a rigid body, by its
     name; ``notes`` what was read and has no meaning for limbfit.
     """
 
@@ -86,9 +96,9 @@ class FebModel:
     materials: Mapping[str, Material]
     rigid: Mapping[str, RigidBody]
     motions: tuple[Motion, ...]
-    rigid_motions: tuple[Motion, ...]
+    conditions: tuple[RigidCondition, ...]
     carried: Mapping[str, Indices]
-    contact: Contact | None
+    contacts: tuple[Contact, ...]
     pressures: tuple[PressureLoad, ...]
     curves: Mapping[int, Curve]
     phases: tuple[Phase, ...]
@@ -144,9 +154,9 @@ def _model(root: Node) -> FebModel:
         materials,
         rigid,
         tuple(_node_motions(root.find("Boundary"), geometry, curves)),
-        _rigid_motions(root, rigid, geometry, curves),
+        read_conditions(root, rigid, curves),
         carried_nodes(geometry, materials, rigid, _tied(root.find("Boundary"), rigid)),
-        _contact(root.find("Contact"), geometry),
+        tuple(_contact(node, geometry) for node in root.find("Contact") or ()),
         tuple(_pressures(root.find("Loads"), geometry, curves)),
         curves,
         read_phases(root, curves),
@@ -179,17 +189,7 @@ def _driven(bc: Node, curves: Mapping[int, Curve]) -> tuple[int, float, int]:
         raise bc.refuse(f"degree of freedom {bc.string('dof')!r} is not supported")
     if bc.flag("relative"):
         raise bc.child("relative").refuse("relative displacements are not supported")
-    return COMPONENTS.index(dof), *_curved(_amount(bc), curves)
-
-
-def _curved(value: Node, curves: Mapping[int, Curve]) -> tuple[float, int]:
-    """Factor and load curve of an amount; 0 and no curve where it is nothing."""
-    factor, number = value.scalar(), value.attributes.get("lc", "")
-    if factor == 0.0:
-        return 0.0, 0
-    if not (number.isdecimal() and int(number) in curves):
-        raise value.refuse(f"there is no load curve {number!r}" if number else "needs a load curve")
-    return factor, int(number)
+    return COMPONENTS.index(dof), *curved(amount(bc), curves)
 
 
 def _pressures(
@@ -205,71 +205,17 @@ def _pressures(
         name = load.attribute("surface")
         if name not in geometry.surfaces:
             raise load.refuse(f"there is no surface {name!r}")
-        factor, curve = _curved(load.child("pressure"), curves)
+        factor, curve = curved(load.child("pressure"), curves)
         if factor != 0.0:
             yield PressureLoad(name, factor, curve, load.line)
 
 
-def _amount(bc: Node) -> Node:
-    """What a prescribed motion amounts to; FEBio 3 calls it a scale."""
-    value = bc.find("value")
-    return bc.child("scale") if value is None else value
-
-
 def _tied(section: Node | None, rigid: Mapping[str, RigidBody]) -> list[tuple[str, Node]]:
     """Sets of nodes that are tied to a rigid body: its name, and the condition."""
-    return [(_body_of(bc, rigid), bc) for bc in section or () if bc.attributes.get("type") == "rigid"]
+    return [(body_of(bc, rigid), bc) for bc in section or () if bc.attributes.get("type") == "rigid"]
 
 
-def _body_of(condition: Node, rigid: Mapping[str, RigidBody]) -> str:
-    """The name of the rigid body that a condition is about; it gives its name or its number."""
-    names = {str(body.number): name for name, body in rigid.items()}
-    name = names.get(condition.string("rb"), condition.string("rb"))
-    if name not in rigid:
-        raise condition.refuse(f"there is no rigid body {name!r}")
-    return name
-
-
-def _rigid_motions(
-    root: Node, rigid: Mapping[str, RigidBody], geometry: Geometry, curves: Mapping[int, Curve]
-) -> tuple[Motion, ...]:
-    """Displacements of rigid bodies; what is not displaced must be held, since limbfit solves for no body."""
-    nothing, motions = np.zeros(0, np.int64), list[Motion]()
-    free = {name: set(FREEDOMS) for name in rigid}
-    for bc in root.find("Rigid") or ():
-        kind = bc.attribute("type")
-        if bc.tag not in ("rigid_bc", "rigid_constraint"):
-            raise bc.refuse(f"{kind!r} is not supported", "limbfit moves rigid bodies as prescribed only")
-        name = _body_of(bc, rigid)
-        if kind in ("rigid_fixed", "fix"):
-            free[name] -= fixed_freedoms(bc)
-            continue
-        if kind not in ("rigid_displacement", "rigid_rotation", "prescribe"):
-            raise bc.refuse(f"rigid condition {kind!r} is not supported")
-        dof = bc.string("dof").lower().removeprefix("r")
-        free[name].discard(dof)
-        if dof in FREEDOMS[3:]:
-            if _amount(bc).scalar() != 0.0:
-                raise bc.refuse("the rotation of a rigid body is not supported")
-            continue
-        motions.append(Motion(name, nothing, *_driven(bc, curves), bc.line))
-    for material in root.child("Material"):
-        name = material.attributes.get("name", "")
-        left = [f"R{letter}" for letter in FREEDOMS if letter in free.get(name, ())]
-        if left and any(part.material == name for part in geometry.parts.values()):
-            raise material.refuse(
-                f"the rigid body {name!r} is neither fixed nor displaced in {', '.join(left)}",
-                "limbfit solves for no rigid body: fix it there with rigid_fixed",
-            )
-    return tuple(motions)
-
-
-def _contact(section: Node | None, geometry: Geometry) -> Contact | None:
-    if section is None or not len(section):
-        return None
-    if len(section) > 1:
-        raise section[1].refuse("more than one contact is not supported")
-    node = section[0]
+def _contact(node: Node, geometry: Geometry) -> Contact:
     rule, pair = node.attribute("type"), node.attribute("surface_pair")
     if rule not in CONTACTS:
         raise node.refuse(f"contact {rule!r} is not supported", "limbfit has " + ", ".join(CONTACTS))

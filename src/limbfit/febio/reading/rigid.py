@@ -1,4 +1,4 @@
-"""Rigid bodies of a FEBio input: where their mass lies, how they are held, which tissue they carry."""
+"""Rigid bodies of a FEBio input: where their mass lies, which tissue they carry."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ProblemError
-from ..fe import ELEMENTS
-from ..fe.kernel.elements import reference_gradients
+from ...errors import ProblemError
+from ...fe import ELEMENTS
+from ...fe.kernel.elements import reference_gradients
 from .geometry import Geometry, Indices, Part, node_set, nodes_of, triangles
 from .tree import Node
 
 Array = NDArray[np.float64]
-FREEDOMS = "xyzuvw"  # of a rigid body: along the axes, about them
 _PRISM = ([0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3])  # three tetrahedra of a penta6
 
 
@@ -46,12 +45,6 @@ def _lumps(points: Array, part: Part) -> tuple[Array, Array]:
     flat = points[triangles(corners)]
     area = 0.5 * np.linalg.norm(np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]), axis=1)
     return part.thickness * area, flat.mean(axis=1)
-
-
-def fixed_freedoms(condition: Node) -> set[str]:
-    """What a ``rigid_fixed`` (FEBio 3: ``fix``) holds, of `FREEDOMS`."""
-    listed = [dof.strip().lower().removeprefix("r") for dof in condition.string("dofs", "").split(",")]
-    return {letter for letter in FREEDOMS if letter in listed or condition.flag(f"R{letter}_dof")}
 
 
 def carried_nodes(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ProblemError
+from ...errors import ProblemError
 from .tree import Node
 
 Array = NDArray[np.float64]
@@ -272,6 +273,14 @@ def boundary(parts: Iterable[Part]) -> list[Indices]:
                 if single.pop(key, None) is None:
                     single[key] = face
     return list(single.values())
+
+
+def closed(faces: Iterable[Indices]) -> bool:
+    """Whether every edge of the faces belongs to two of them."""
+    edges = Counter(
+        frozenset(pair) for face in faces for pair in zip(face.tolist(), np.roll(face, -1).tolist())
+    )
+    return bool(edges) and set(edges.values()) == {2}
 
 
 _TET = ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])

@@ -1,0 +1,166 @@
+"""What drives a problem, as FEBio's load curves, rigid conditions and steps of the analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from ..fe import Motion, Problem
+from .reading.motions import agrees_in_turning, straight
+
+Array = NDArray[np.float64]
+AXES, TURNS = "xyz", "uvw"
+HELD = "held"
+
+
+@dataclass
+class Curves:
+    """The load curves of a file; `add` gives a curve its number."""
+
+    all: list[tuple[str, str, Array]] = field(default_factory=list)
+
+    def add(self, name: str, points: Array, interpolate: str = "LINEAR") -> int:
+        """Points (n, 2): time, s, and value."""
+        self.all.append((name, interpolate, points))
+        return len(self.all)
+
+    def lines(self) -> Iterator[str]:
+        yield "<LoadData>"
+        for i, (name, interpolate, points) in enumerate(self.all, 1):
+            yield f'<load_controller id="{i}" name={quoteattr(name)} type="loadcurve">'
+            yield f"<interpolate>{interpolate}</interpolate><extend>CONSTANT</extend><points>"
+            yield from (f"<pt>{row(point)}</pt>" for point in points)
+            yield "</points></load_controller>"
+        yield "</LoadData>"
+
+
+def row(values: Iterable[float]) -> str:
+    """Numbers with commas, as they are."""
+    return ",".join(repr(float(value)) for value in values)
+
+
+def in_space(name: str, motion: Motion, frame: Array) -> Motion:
+    """A body's motion along and about the axes of space, from that in its ``frame (3, 3)``.
+
+    Raises
+    ------
+    ProblemError
+        Where a force drives it along, or about, an axis that lies askew: FEBio holds and drives along its
+        own; and where it turns about several axes.
+    """
+    turn, forced = np.kron(np.eye(2), frame), np.asarray(motion.forced)
+    own = forced.copy()
+    for block in (slice(0, 3), slice(3, 6)):
+        mixed = forced[:, block].any(axis=1) & ~forced[:, block].all(axis=1)
+        if not mixed.any():
+            continue
+        main = np.abs(frame).argmax(axis=0)  # of each axis of space, that of the frame
+        if not np.allclose(np.abs(frame[main, range(3)]), 1.0, atol=1e-12):
+            raise ProblemError(
+                f"{name}: a force along an axis that lies between x, y and z is not written for FEBio",
+                remedy="turn the problem first (limbfit.febio.in_indenter_frame)",
+            )
+        own[:, block] = forced[:, block][:, main]
+    values = motion.values @ turn
+    values[:, :3] = np.where(np.abs(values[:, :3]) < 1e-15 * np.abs(values).max(), 0.0, values[:, :3])
+    if not agrees_in_turning(values, own):
+        raise ProblemError(
+            f"{name}: a turn about several axes is not written for FEBio, which adds it up another way"
+        )
+    return Motion(motion.times, values, own)
+
+
+def step_ends(motions: Iterable[Motion], end: float) -> list[float]:
+    """Where FEBio must begin another step, s, and the end: where what drives changes."""
+    found = {end}
+    for motion in motions:
+        times = np.asarray(motion.times)
+        found |= {float(t) for t in times[1:][np.diff(times) == 0.0] if t < end}
+    return sorted(found)
+
+
+def conditions(name: str, motion: Motion, ends: list[float], curves: Curves) -> list[list[str]]:
+    """The conditions of a rigid body in every step, of its motion in space."""
+    words: list[list[str]] = []
+    for begin, end in pairwise([0.0, *ends]):
+        times, values, forced = _part(motion, begin, end)
+        label = name if len(ends) == 1 else f"{name}_{len(words) + 1}"
+        words.append(list(_conditions(name, label, times, values, forced, curves)))
+    return words
+
+
+def _part(motion: Motion, begin: float, end: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Times (k,), values (k, 6) and drives of a motion between two ends of steps."""
+    times = np.asarray(motion.times)
+    inner = times[(times > begin) & (times < end)]
+    # Of two values at the start of a step the later one holds, at its end the earlier.
+    last = int(np.searchsorted(times, begin, side="right")) - 1
+    first = motion.values[last] if times[last] == begin else motion.at(begin)[0]
+    values = np.array([first, *(motion.at(t)[0] for t in inner), motion.at(end)[0]])
+    return np.array([begin, *inner, end]), values, motion.at(end)[1]
+
+
+def _conditions(
+    name: str, label: str, times: Array, values: Array, forced: NDArray[np.bool_], curves: Curves
+) -> Iterator[str]:
+    moving = np.asarray(values.any(axis=0))
+    free = forced | moving
+    held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(AXES + TURNS))
+    yield f'<rigid_bc name="{label}_guide" type="rigid_fixed"><rb>{name}</rb>{held}</rigid_bc>'
+    on_line = None if forced.any() else straight(Motion(times - times[0], values))
+    if on_line is not None:  # one curve, and its share along each axis
+        direction, advance = on_line
+        number = curves.add(f"{label}_advance", np.column_stack([times, advance]))
+        for i in np.flatnonzero(direction):
+            yield _driven(label, name, "rigid_displacement", AXES[i], number, direction[i])
+        return
+    for i in np.flatnonzero(moving):
+        turn, letter = i > 2, (AXES + TURNS)[i]
+        kind = ("rigid_displacement", "rigid_rotation", "rigid_force", "rigid_moment")[2 * forced[i] + turn]
+        number = curves.add(f"{label}_{kind[6:]}_{letter}", np.column_stack([times, values[:, i]]))
+        yield _driven(label, name, kind, letter, number, 1.0)
+
+
+def _driven(label: str, name: str, kind: str, letter: str, curve: int, factor: float) -> str:
+    force = kind in ("rigid_force", "rigid_moment")
+    tag, dof = (
+        ("rigid_load", f"R{letter}") if force else ("rigid_bc", letter if letter in AXES else f"R{letter}")
+    )
+    more = "<load_type>LOAD</load_type>" if force else ""
+    return (
+        f'<{tag} name="{label}_{letter}" type="{kind}"><rb>{name}</rb><dof>{dof}</dof>'
+        f'<value lc="{curve}">{float(factor)!r}</value>{more}<relative>0</relative></{tag}>'
+    )
+
+
+def boundary_lines(problem: Problem, curves: Curves) -> Iterator[str]:
+    """Nodes held, and those that follow the history."""
+    if len(problem.fixed):
+        yield f'<bc name="held" node_set="{HELD}" type="zero displacement">'
+        yield "<x_dof>1</x_dof><y_dof>1</y_dof><z_dof>1</z_dof></bc>"
+    history, number = problem.history, 0
+    for i, support in enumerate(problem.supports, 1):
+        named = f'name="support_{i}" node_set="support_{i}"'
+        if support.factor == 0.0:
+            held = "".join(f"<{x}_dof>{support.component == k:d}</{x}_dof>" for k, x in enumerate(AXES))
+            yield f'<bc {named} type="zero displacement">{held}</bc>'
+            continue
+        number = number or curves.add("history", np.column_stack([history.times, history.driver]))
+        yield f'<bc {named} type="prescribed displacement"><dof>{AXES[support.component]}</dof>'
+        yield f'<value lc="{number}">{support.factor!r}</value><relative>0</relative></bc>'
+
+
+def pressure_lines(problem: Problem, curves: Curves) -> Iterator[str]:
+    """Follower pressures."""
+    for i, one in enumerate(problem.pressures, 1):
+        times = np.asarray(one.times)
+        number = curves.add(f"pressure_{i}", np.column_stack([times, np.asarray(one.values)]))
+        yield f'<surface_load name="pressure_{i}" type="pressure" surface="pressed_{i}">'
+        yield f'<pressure lc="{number}">1.0</pressure><linear>0</linear>'
+        yield "<symmetric_stiffness>0</symmetric_stiffness></surface_load>"

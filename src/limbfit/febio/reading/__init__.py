@@ -1,0 +1,1 @@
+"""Inputs of FEBio as arrays, laws and conditions; nothing is solved here."""

@@ -1,0 +1,269 @@
+"""Rigid bodies of any motion, both ways: read from an input, written, and read back with the same forces."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from febfiles import written
+
+from limbfit.bench.blocks import punched_block
+from limbfit.errors import ProblemError
+from limbfit.fe import (
+    History,
+    Indenter,
+    Motion,
+    NeoHookean,
+    OpenSurface,
+    Pressure,
+    RigidBody,
+    StepControl,
+    Support,
+    solve,
+)
+from limbfit.febio import FebSettings, in_indenter_frame, read_feb, read_log, run_feb, to_problem, write_feb
+
+STEPS = StepControl(times=(0.5, 1.0, 1.5, 2.0), stress="linear", penalty=20.0, penetration=1.0)
+TIMES, END = [0.0, 1.0, 2.0], History(np.array([0.0, 2.0]), np.zeros(2))
+SIDE = np.array([[x, y, 0.2] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 8.0)])
+# Four triangles, counter-clockwise seen from below.
+SHEET = OpenSurface(SIDE, np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]]))
+
+
+def block(**changes):
+    problem = punched_block("hex8", 6)
+    soft = {name: NeoHookean(0.006, kappa_ratio=100.0) for name in ("skin", "muscle")}
+    return replace(problem.with_materials(soft), indenter=None, history=END, **changes)
+
+
+def sheet(motion, **changes):
+    faces = punched_block("hex8", 6).mesh.face_sets["skin"]
+    return RigidBody(SHEET, faces, motion, 0.3, pivot=(1.0, 2.0, 4.0), name="sheet", **changes)
+
+
+def back(problem, folder):
+    """The problem, written and read."""
+    write_feb(problem, folder / "model.feb", FebSettings(force_file="forces.txt"))
+    return to_problem(read_feb(folder / "model.feb"))
+
+
+MOTIONS = {
+    "moved": Motion.of(TIMES, x=[0.0, 0.0, 2.0], z=[0.0, -1.5, -1.5]),
+    "turned": Motion.of(TIMES, z=[0.0, -1.5, -1.5], turn_y=[0.0, 0.0, 0.1]),
+    "pressed": Motion.of(TIMES, x=[0.0, 0.0, 1.0], force={"z": [0.0, -0.5, -0.5]}),
+    "tipped": Motion.of(TIMES, z=[0.0, -1.5, -1.5], force={"turn_x": [0.0, 0.0, 4.0]}),
+    "let go": Motion.of(TIMES[:2], z=[0.0, -1.5]).then(Motion.of([0.0, 1.0], force={"z": [-0.6, -0.2]})),
+}
+
+
+@pytest.mark.parametrize("case", MOTIONS)
+def test_a_body_is_read_back_as_it_was(tmp_path, case):
+    """An open sheet with friction, beside a pressure: every number, and hence the forces."""
+    problem = block(bodies=(sheet(MOTIONS[case]),))
+    problem = replace(
+        problem,
+        supports=(Support(problem.fixed[:3], 1),),
+        pressures=(Pressure(problem.mesh.face_sets["skin"][:4], [0.0, 1.5, 2.0], [0.0, 1e-3, 0.0]),),
+    )
+    found = back(problem, tmp_path)
+    assert found.indenter is None
+    (mine,), (theirs,) = problem.bodies, found.bodies
+    assert (theirs.name, theirs.friction) == ("sheet", 0.3)
+    np.testing.assert_array_equal(theirs.pivot, mine.pivot)
+    np.testing.assert_array_equal(theirs.faces, mine.faces)
+    np.testing.assert_array_equal(theirs.shape.points[theirs.shape.faces], SIDE[SHEET.faces])
+    for t in (0.0, 0.4, 1.0, 1.3, 2.0):
+        (values, forced), (expected, under) = theirs.motion.at(t), mine.motion.at(t)
+        np.testing.assert_allclose(values, expected, atol=1e-14)
+        np.testing.assert_array_equal(forced, under)
+    (pressed,) = found.pressures
+    np.testing.assert_array_equal(pressed.faces, problem.pressures[0].faces)
+    assert [pressed.at(t) for t in (0.7, 1.8)] == pytest.approx([7e-4 / 1.5, 4e-4])
+    runs = [solve(one, STEPS, store="none") for one in (problem, found)]
+    assert runs[0].completed, runs[0].reason
+    assert np.abs(runs[0].reactions).max() > 0.1
+    size = np.abs(runs[0].reactions).max()
+    np.testing.assert_allclose(runs[1].reactions, runs[0].reactions, atol=3e-4 * size)
+    np.testing.assert_allclose(runs[1].coordinates, runs[0].coordinates, atol=1e-4)
+
+
+def test_several_bodies_push_as_hard_when_read_back(tmp_path):
+    """A punch under a force, and a ball with friction that is dragged: their facets are all that differs."""
+    faces = block().contact_faces
+    down = History(np.array([0.0, 1.0, 2.0]), force=np.array([0.0, 1.5, 1.0]))
+    punch = Indenter("square", 12.0, 2.0, (-10.0, 0.0, 0.3), (0.0, 0.0, -1.0), edge=(1.0, 0.0, 0.0))
+    ball = Indenter("sphere", 16.0, centre=(14.0, 0.0, 0.3), axis=(0.0, 0.0, -1.0), edge=(1.0, 0.0, 0.0))
+    dragged = RigidBody(ball, faces, Motion.of(TIMES, x=[0.0, 0.0, 1.0], z=[0.0, 2.0, 2.0]), 0.4, name="ball")
+    problem = replace(block(bodies=(dragged,)), indenter=punch, history=down, start="as-given")
+    found = back(problem, tmp_path)
+    assert [body.name for body in found.rigid_bodies] == ["indenter", "ball"]
+    assert [body.friction for body in found.rigid_bodies] == ["frictionless", 0.4]
+    one, other = (solve(p, STEPS, store="none") for p in (problem, found))
+    assert one.completed
+    assert other.completed
+    forces, depths = [], []
+    for run in (one, other):
+        kept = [int(np.abs(run.times - t).argmin()) for t in STEPS.times]  # others were cut
+        frames = [body.shape.frame for body in run.problem.rigid_bodies]
+        forces.append(np.einsum("nbi,bij->nbj", run.reactions[kept, :, :3], frames))
+        depths.append(run.coordinates[kept, 0, 2])
+    assert abs(forces[0][-1, 1, 0]) > 0.05  # the ball is held back
+    np.testing.assert_allclose(forces[1], forces[0], atol=0.02 * np.abs(forces[0]).max())
+    np.testing.assert_allclose(depths[1], depths[0], atol=0.02 * depths[0].max())
+
+
+def test_the_table_of_a_body_that_turns(tmp_path):
+    """Place, rotation vector, force and moment about the centre of mass, which is not where it is pressed."""
+    write_feb(block(bodies=(sheet(MOTIONS["turned"]),)), tmp_path / "model.feb", FebSettings())
+    text = (tmp_path / "model.feb").read_text()
+    table = "x;y;z;thx;thy;thz;Fx;Fy;Fz;Mx;My;Mz"
+    nodes = '<node_data data="x;y;z" file="nodes.txt" delim=","></node_data></logfile>'
+    text = text.replace("Fx;Fy;Fz;x;y;z", table).replace("</logfile>", nodes)
+    run = run_feb(written(tmp_path, text, "asked.feb"), tmp_path / "out", **{"times": STEPS.times})
+    assert run.result.completed
+    log, nodes = read_log(tmp_path / "out" / "forces.txt"), read_log(tmp_path / "out" / "nodes.txt")
+    np.testing.assert_allclose(log.values[-1, 0, :6], [1.0, 2.0, 2.5, 0.0, 0.1, 0.0], atol=1e-12)
+    force, moment = log.values[-1, 0, 6:9], log.values[-1, 0, 9:]
+    np.testing.assert_allclose(force, run.result.reactions[-1, 0, :3], rtol=1e-9)
+    # Pressed at x = 0 on average and turned down at x > 0: about (1, 2, 2.5) the reaction turns it back.
+    arm = moment[1] / -force[2]
+    assert -8.0 - 1.0 < -arm < 8.0
+    corner = nodes.values[-1, -1]
+    c, s = np.cos(0.1), np.sin(0.1)
+    x, z = SIDE[-1, 0] - 1.0, SIDE[-1, 2] - 4.0
+    np.testing.assert_allclose(corner, [1.0 + c * x + s * z, 8.0, 2.5 - s * x + c * z], atol=1e-9)
+
+
+def test_moments_are_about_the_centre_of_mass(tmp_path):
+    """The same body with its centre elsewhere: the moment changes by the arm times the force."""
+    tables = []
+    for pivot in ((1.0, 2.0, 4.0), (-3.0, 5.0, 1.0)):
+        body = replace(sheet(MOTIONS["moved"]), pivot=pivot)
+        write_feb(block(bodies=(body,)), tmp_path / "model.feb", FebSettings())
+        text = (tmp_path / "model.feb").read_text().replace("Fx;Fy;Fz;x;y;z", "Fx;Fy;Fz;Mx;My;Mz")
+        run_feb(written(tmp_path, text, "asked.feb"), tmp_path / "out", times=STEPS.times)
+        tables.append(read_log(tmp_path / "out" / "forces.txt").values[-1, 0])
+    np.testing.assert_allclose(tables[1][:3], tables[0][:3], rtol=1e-9)
+    arm = np.array([4.0, -3.0, 3.0])  # from the second centre to the first
+    change = np.cross(arm, tables[0][:3])
+    np.testing.assert_allclose(tables[1][3:] - tables[0][3:], change, rtol=1e-7, atol=1e-9)
+
+
+def test_a_pressure_alone_is_read_back(tmp_path):
+    problem = block()
+    faces = problem.mesh.face_sets["skin"][:9]
+    problem = replace(problem, pressures=(Pressure(faces, TIMES, [0.0, 2e-3, 0.0]),))
+    found = back(problem, tmp_path)
+    np.testing.assert_array_equal(found.pressures[0].faces, faces)
+    assert not found.rigid_bodies
+    assert found.pressures[0].at(0.5) == pytest.approx(1e-3)
+
+
+def test_a_force_between_the_axes_is_refused_and_can_be_turned(tmp_path):
+    problem = punched_block("tet4", 4)
+    oblique = replace(problem.indenter, axis=(0.1, 0.0, -1.0))
+    history = History(np.array([0.0, 1.0]), force=np.array([0.0, 1.0]))
+    faces = problem.contact_faces
+    problem = replace(problem, indenter=oblique, history=history)
+    with pytest.raises(ProblemError, match=r"between x, y and z.*in_indenter_frame"):
+        write_feb(problem, tmp_path / "model.feb", FebSettings())
+    ball = RigidBody(replace(oblique, centre=(5.0, 4.0, 1.0)), faces, history.motion, name="b")
+    turned = in_indenter_frame(replace(problem, bodies=(ball,)))
+    points = problem.mesh.points[:50]
+    before = [body.shape.signed_distance(points) for body in (problem.rigid_bodies[0], ball)]
+    after = [body.shape.signed_distance(turned.mesh.points[:50]) for body in turned.rigid_bodies]
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    found = back(turned, tmp_path)
+    assert [body.motion.free.tolist() for body in found.rigid_bodies] == [
+        [False, False, True] + 3 * [False]
+    ] * 2
+
+
+TWICE = Motion.of(TIMES, turn_x=[0.0, 0.1, 0.1], turn_y=[0.0, 0.0, 0.1])
+NAMED = "".join(f"<R{x}_dof>1</R{x}_dof>" for x in "xyzuvw")
+
+
+def test_turns_that_febio_adds_up_another_way_are_refused(tmp_path):
+    with pytest.raises(ProblemError, match="sheet: a turn about several axes"):
+        write_feb(block(bodies=(sheet(TWICE),)), tmp_path / "model.feb", FebSettings())
+    write_feb(block(bodies=(sheet(MOTIONS["turned"]),)), tmp_path / "model.feb", FebSettings())
+    text = (tmp_path / "model.feb").read_text()
+    more = '<rigid_bc type="rigid_rotation"><rb>sheet</rb><dof>Ru</dof><value lc="1">1</value></rigid_bc>'
+    with pytest.raises(
+        ProblemError, match=r"line \d+: the rigid body 'sheet' turns about more than one axis"
+    ):
+        to_problem(read_feb(written(tmp_path, text.replace("</Rigid>", more + "</Rigid>"))))
+
+
+def changed(text, pattern, by):
+    found, count = re.subn(pattern, by, text, count=1)
+    assert count == 1
+    return found
+
+
+REFUSED = {
+    "follows": (
+        lambda text: changed(text, "<load_type>LOAD<", "<load_type>FOLLOW<"), "a force that follows the body",
+    ),
+    "relative": (
+        lambda text: changed(text, "</load_type><relative>0", "</load_type><relative>1"),
+        "relative displacements",
+    ),
+    "held after": (
+        lambda text: changed(text, r"(?s)(<step id=\"2\">.*?</Rigid>)", lambda m: m[1] + THIRD),
+        "the rigid body 'sheet' is held in Rz after it was free",
+    ),
+    "other friction": (
+        lambda text: changed(text, "</Contact>", SECOND + "</Contact>"),
+        "the contacts of the rigid body 'sheet' differ",
+    ),
+    "conditions of steps": (
+        lambda text: changed(text, r"<step id=\"1\">", '<step id="1"><Boundary/>'),
+        "only <Control> and <Rigid>",
+    ),
+}  # fmt: skip
+THIRD = (
+    '</step><step id="3"><Control><time_steps>1</time_steps><step_size>1</step_size></Control><Rigid>'
+    f'<rigid_bc type="rigid_fixed"><rb>sheet</rb>{NAMED}</rigid_bc></Rigid>'
+)
+SECOND = '<contact type="sliding-elastic" surface_pair="sheet_contact"><fric_coeff>0.1</fric_coeff></contact>'
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_limbfit_has_not_is_refused(tmp_path, case):
+    change, words = REFUSED[case]
+    write_feb(block(bodies=(sheet(MOTIONS["let go"]),)), tmp_path / "model.feb", FebSettings())
+    text = change((tmp_path / "model.feb").read_text())
+    with pytest.raises(ProblemError, match=words):
+        to_problem(read_feb(written(tmp_path, text)))
+
+
+SOCKET = Path(__file__).parents[3] / "shared" / "reference" / "socket"
+
+
+@pytest.mark.skipif(not SOCKET.is_dir(), reason="the FEBio reference results are not beside the repository")
+@pytest.mark.parametrize("case", ["slide", "cone-load", "tube"])
+def test_febios_own_inputs_are_written_anew(tmp_path, case):
+    """A dragged plate, a socket that goes over to a force, a tube under pressure: read, written, read."""
+    problem = to_problem(read_feb(SOCKET / f"{case}.feb"))
+    found = back(problem, tmp_path)
+    assert len(found.rigid_bodies) == len(problem.rigid_bodies)
+    for mine, theirs in zip(problem.rigid_bodies, found.rigid_bodies):
+        assert (theirs.name, theirs.friction) == (mine.name, mine.friction)
+        np.testing.assert_array_equal(theirs.pivot, mine.pivot)
+        np.testing.assert_array_equal(theirs.faces, mine.faces)
+        np.testing.assert_array_equal(theirs.shape.frame, mine.shape.frame)
+        near = problem.mesh.points[mine.faces].mean(axis=1)
+        np.testing.assert_allclose(theirs.shape.signed_distance(near), mine.shape.signed_distance(near))
+        for t in np.linspace(0.0, problem.history.times[-1], 43):
+            (values, forced), (expected, under) = theirs.motion.at(t), mine.motion.at(t)
+            np.testing.assert_allclose(values, expected, atol=1e-12)
+            np.testing.assert_array_equal(forced, under)
+    held = [(s.component, s.factor, s.nodes.tolist()) for s in problem.supports]
+    assert [(s.component, s.factor, s.nodes.tolist()) for s in found.supports] == held
+    for mine, theirs in zip(problem.pressures, found.pressures, strict=True):
+        np.testing.assert_array_equal(theirs.faces, mine.faces)
+        np.testing.assert_allclose([theirs.at(t) for t in mine.times], mine.values)
