@@ -30,8 +30,10 @@ Array = NDArray[np.float64]
 class SiteModel:
     """One indentation but for the material: mesh file, indenter and displacement history.
 
-    ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm`` are the piecewise linear
-    displacement since touch-down; ``indenter_digest`` is that of the indenter's file, where it has one.
+    ``name`` is that of the record, or of the site where it plans an indentation; ``site`` that of the site,
+    whose records share a mesh. ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm``
+    are the piecewise linear displacement since touch-down; ``indenter_digest`` is that of the indenter's
+    file, where it has one.
     """
 
     name: str
@@ -51,6 +53,7 @@ class SiteModel:
     law: str = OGDEN  # of all tissues
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     extensions_digest: str = ""
+    site: str = ""
 
     @property
     def history(self) -> History:

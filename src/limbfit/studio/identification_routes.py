@@ -50,7 +50,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "iterates": _iterates(folder, logs, state["state"], done),
         "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
-        "sites": [{"site": site.name, "fitted": site.fitted} for site in study.sites if site.trace],
+        "sites": [{"site": record.name, "fitted": record.fitted} for record in study.recorded],
         "answer": done and {**done, "state": state["state"]},
     }
 
@@ -61,7 +61,7 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
 
     Time in s from touch-down, displacement in mm, force in N; ``of`` is null where nothing is simulated yet.
     """
-    site = folder.load().site(name)
+    site = folder.load().indentation(name)
     states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
     live = _newest(folder, site.name) if states["calibrate"] != "done" else None
     stored = folder.results / "predict" / f"{site.name}.csv"

@@ -44,7 +44,7 @@ def force_figure(
     store: Results, rows: Iterable[Json], against: str, name: str, columns: int
 ) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
-    found = [(row, store.curves("predict", row["site"])) for row in rows]
+    found = [(row, store.curves("predict", row["record"])) for row in rows]
     pairs = [(row, curves) for row, curves in found if curves is not None]
     if not pairs:
         return None
@@ -59,7 +59,7 @@ def force_figure(
             if i % columns == 0:
                 ax.set_ylabel("Force (N)")
         legend_above(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
-    sites = ", ".join(f"{row['site']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
+    sites = ", ".join(f"{row['record']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words[against][1]}; site and error: {sites}"
     kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
     paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
@@ -71,7 +71,7 @@ def force_figure(
 
 def _site_title(store: Results, row: Json, columns: int) -> str:
     region = str(row.get("region") or "")
-    head = f"site {row['site']}" + (f", {region}" if region and columns < 3 else "")
+    head = f"site {row['record']}" + (f", {region}" if region and columns < 3 else "")
     return f"{_short(head, LONGEST_TITLE // (columns - 1 or 1))}: {fixed(row.get('error_percent'))} %"
 
 
@@ -214,14 +214,14 @@ def error_figure(store: Results) -> Figure | None:
         ax.invert_yaxis()
         ax.grid(visible=False, axis="y")
         ax.set_xlabel("Mean absolute error over largest force (%)")
-    sites = ", ".join(f"{row['site']} {fixed(row['error_percent'])} %" for row in rows)
+    sites = ", ".join(f"{row['record']} {fixed(row['error_percent'])} %" for row in rows)
     caption = "Force error of each site. Plain bars: sites that were fitted; hatched: held out."
     return Figure("errors", svg(drawing, "errors", f"Error of each site: {sites}"), caption)
 
 
 def _bar_label(row: Json) -> str:
     use = "fitted" if row.get("fitted") else "held out"
-    return f"{row['site']} ({use})"
+    return f"{row['record']} ({use})"
 
 
 def interval_figure(store: Results) -> Figure | None:

@@ -26,7 +26,7 @@ function forceCurves(curves, site, against) {
   ].filter((series) => series.y);
   const band = curves.force_low_N && against === "time_s"
     ? { label: "95 % interval", colour: "--simulated", x, low: curves.force_low_N, high: curves.force_high_N } : null;
-  return { label: `Force at site ${site}.`, x: AGAINST[against], y: FORCE, series: found, band };
+  return { label: `Force at site ${curves.record ?? site}.`, x: AGAINST[against], y: FORCE, series: found, band };
 }
 
 class Explorer {

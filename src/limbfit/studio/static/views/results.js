@@ -58,7 +58,8 @@ class ResultsView {
     } catch (error) {
       return this.context.warn(error.message);
     }
-    const { sites } = this.scene;
+    const sites = this.scene.sites.flatMap((site) => (site.records.length ? site.records.map((name) => ({ ...site, name })) : [site]));
+    this.indentations = sites;
     replace(this.site, ...sites.map((site) => el("option", { value: site.name }, [site.name, site.region, site.fitted ? "fitted" : "held out"].filter(Boolean).join(", "))));
     if (!sites.some((site) => site.name === this.chosen)) this.chosen = sites[0]?.name ?? null;
     this.showRuns();
@@ -82,7 +83,7 @@ class ResultsView {
     const mark = JSON.stringify([name, sources]);
     if (mark === this.opened) return;
     this.opened = mark;
-    await this.player.open(this.scene.sites.find((site) => site.name === name), sources, this.scene.frame);
+    await this.player.open(this.indentations.find((site) => site.name === name), sources, this.scene.frame);
   }
 
   showSite({ sources, downloads, simulating, failure }) {
@@ -135,7 +136,7 @@ class ResultsView {
   async readCurves() {
     const name = this.chosen, path = `results/curves/${encodeURIComponent(name)}`;
     const read = (more) => this.context.api.get(path + more).catch(() => null);
-    const has = (run) => run?.sites.some((row) => row.site === name);
+    const has = (run) => run?.sites.some((row) => row.record === name);
     const [ours, theirs] = await Promise.all([has(this.outcome) ? read("") : null, has(this.beside) ? read(`?kept=${encodeURIComponent(this.other)}`) : null]);
     if (name !== this.chosen) return;
     this.curves = { ours, theirs };
@@ -216,9 +217,9 @@ class ResultsView {
   siteTable() {
     const { sites, means } = this.outcome;
     if (!sites.length) return el("p", { class: "hint" }, "No predictions are stored yet: run the study (view Identification).");
-    const other = new Map((this.beside?.sites ?? []).map((row) => [row.site, row]));
-    const rows = sites.map((row) => [row.site, row.region, row.fitted ? "fitted" : "held out", shortNumber(row.peak_force_N),
-      shortNumber(row.error_one_material_percent), shortNumber(row.error_percent), ...(this.beside ? [shortNumber(other.get(row.site)?.error_percent)] : [])]);
+    const other = new Map((this.beside?.sites ?? []).map((row) => [row.record, row]));
+    const rows = sites.map((row) => [row.record, row.region, row.fitted ? "fitted" : "held out", shortNumber(row.peak_force_N),
+      shortNumber(row.error_one_material_percent), shortNumber(row.error_percent), ...(this.beside ? [shortNumber(other.get(row.record)?.error_percent)] : [])]);
     const mean = (from, kind) => shortNumber(from?.[`mean_error_${kind}_percent`]);
     for (const [kind, text] of [["fitted", "mean, fitted"], ["heldout", "mean, held out"]]) {
       rows.push([text, "", "", "", "", mean(means, kind), ...(this.beside ? [mean(this.beside.means, kind)] : [])]);
