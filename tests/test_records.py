@@ -8,15 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.errors import StudyError
+from limbfit.errors import StudyError, TraceError
 from limbfit.identify.checks.crossvalidation import Fold, by_site, choices_of, expanded
 from limbfit.identify.checks.first_order import Sites
+from limbfit.identify.checks.outliers import _pairs
 from limbfit.identify.checks.plausibility import RecordFacts, implausible
 from limbfit.identify.fit.objective import Measured, SiteResponse
+from limbfit.identify.fit.prediction import Known
+from limbfit.identify.uncertainty.noise import record_noise
 from limbfit.identify.uncertainty.sources import Gain
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.mesh import mesh_job, mesh_settings
+from limbfit.pipeline.stages.traces import read_record
 from limbfit.pipeline.verbs.run import keys
 from limbfit.report.site_tables import site_table
 from limbfit.report.store import load_store
@@ -97,6 +101,12 @@ WRONG = {
     "neither": ("depth_mm = 5.0\n", "", r"sites\.2: give either trace .* \[\[records\]\]\) or depth_mm"),
     "plan and record": ('site = "2"', 'site = "3"', r"sites\.1: give either trace"),
     "a missing file": ('"d.csv"', '"e.csv"', r"records\.1-ball\.trace: e\.csv does not exist"),
+    "no force": ('indenter = "ball"', 'control = "strength"', "records.2.control: Input should be"),
+    "paper": (
+        'indenter = "ball"',
+        'control = "force"\n[calibration]\nobjective = "paper"',
+        '1-ball: control = "force" compares depths',
+    ),
     "times": ("peak_s = 4.0", "peak_s = 4.0\ntouch_down_s = 5.0", "touch_down_s must come before peak_s"),
 }  # fmt: skip
 
@@ -190,3 +200,86 @@ def test_table_2_has_a_row_of_each_record_and_means_over_sites(tmp_path: Path) -
     assert mean.cells[1].text == "2 sites"
     assert mean.cells[5].text == "6.0"
     assert "means are over sites" in table.caption
+
+
+def creep(seconds: float = 6.0, rate: float = 200.0) -> np.ndarray:
+    """Time, displacement and force of an approach, a ramp to 2 N in 0.5 s, a hold and its release."""
+    time = np.arange(0.0, 2.0 + seconds, 1 / rate)
+    since = time - 1.0
+    force = np.interp(since, [0.0, 0.5, 0.5 + seconds, 0.9 + seconds], [0.0, 2.0, 2.0, 0.0])
+    depth = 1.5 * force * (1.0 + 0.5 * (1.0 - np.exp(-np.maximum(since, 0.0) / 1.5)))
+    moved = np.where(since < 0.0, 0.8 * since, depth)
+    random = np.random.default_rng(3)
+    noise = random.normal(0.0, 0.004, (2, time.size))
+    return np.column_stack([time, 0.8 + moved + noise[0], force + noise[1]])
+
+
+def under_force(folder: Path, table: np.ndarray) -> Study:
+    head = "time_s,displacement_mm,force_N"
+    np.savetxt(folder / "d.csv", table, delimiter=",", header=head, comments="")
+    return read(folder, STUDY.replace('name = "ball"', 'name = "ball"\ncontrol = "force"'))
+
+
+def test_a_record_under_force_is_ramps_of_force_and_smooth_depths(folder: Path) -> None:
+    study = under_force(folder, creep())
+    record = study.indentation("1-ball")
+    assert isinstance(record, Record)
+    assert (record.forced, record.unit) == (True, "mm")
+    _, smooth, facts = read_record(study, record)
+    assert facts["touch_down_s"] == pytest.approx(1.0, abs=0.02)
+    assert facts["touch_down_mm"] == pytest.approx(0.8, abs=0.03)
+    held = next(phase for phase in facts["phases"] if phase["kind"] == "hold" and phase["end_s"] > 5.0)
+    assert held["start_s"] == pytest.approx(1.5, abs=0.03)
+    assert held["end_s"] == pytest.approx(7.5, abs=0.03)
+    assert held["end_mm"] == pytest.approx(1.5 * 2.0 * 1.5, rel=0.02)  # creep, so a hold that goes deeper
+    assert facts["peak_force_N"] == pytest.approx(2.0, rel=0.01)
+    assert facts["depth_mm"] == pytest.approx(4.46, rel=0.02)
+    assert smooth.noise_mm == pytest.approx(0.004, rel=0.2)
+    assert facts["knots_N"][0] == 0.0
+    assert facts["knots_N"][-1] == pytest.approx(0.05 * 2.0, abs=0.02)
+    even = smooth.resample(81)
+    true = creep()
+    expected = np.interp(even.time_s + facts["touch_down_s"], true[:, 0], true[:, 1]) - facts["touch_down_mm"]
+    assert even.displacement_mm == pytest.approx(expected, abs=0.03)
+    assert even.force_N == pytest.approx(np.interp(even.time_s, facts["knots_s"], facts["knots_N"]))
+
+
+def test_a_force_that_never_rises_is_refused_in_one_line(folder: Path) -> None:
+    table = creep()
+    table[:, 2] = np.random.default_rng(4).normal(0.0, 0.004, len(table))
+    study = under_force(folder, table)
+    with pytest.raises(TraceError, match=r"d\.csv: force_N: no contact: the force rises by") as caught:
+        read_record(study, study.recorded[2])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_touch_down_shifts_all_depths() -> None:
+    times = np.linspace(0.0, 5.0, 40)
+    white = np.random.default_rng(5).normal(0.0, 0.004, 4000)
+    found = record_noise("1", times, white, np.full(40, 3.0), None, 0.02)
+    assert found.unit == "mm"
+    assert np.linalg.eigvalsh(found.covariance)[-1] == pytest.approx(40 * 0.02**2, rel=0.05)
+
+
+def test_an_interval_takes_the_noise_of_what_is_compared() -> None:
+    rows = {"1": ("N", 0.1), "2": ("N", 0.3), "2-creep": ("mm", 0.02)}
+    sites = {
+        name: {"unit": unit, "compared_noise_sd_N": sd, "misfit_share": 0.0}
+        for name, (unit, sd) in rows.items()
+    }
+    known = Known(np.zeros((1, 1)), sites, 0.01, 50.0)
+    assert known.residual("3")[0] == pytest.approx(0.2)
+    assert known.residual("3-creep", "mm")[0] == pytest.approx(0.02)
+    del sites["2-creep"]
+    assert known.residual("3-creep", "mm") == (0.0, 0.01)
+
+
+def test_records_of_force_and_depth_are_never_exchanged() -> None:
+    curve = np.linspace(0.1, 1.0, 20)
+    measured = [
+        Measured("1", curve),
+        Measured("2", curve),
+        Measured("2-creep", curve, site="2", unit="mm"),
+        Measured("3", curve, unit="mm"),
+    ]
+    assert _pairs(measured, [3, 0, 1, 2]) == [(0, 1), (2, 3)]

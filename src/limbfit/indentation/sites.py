@@ -32,8 +32,9 @@ class SiteModel:
 
     ``name`` is that of the record, or of the site where it plans an indentation; ``site`` that of the site,
     whose records share a mesh. ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm``
-    are the piecewise linear displacement since touch-down; ``indenter_digest`` is that of the indenter's
-    file, where it has one.
+    are the piecewise linear displacement since touch-down, or ``knots_N`` the force that drives it instead
+    (``knots_mm``: as deep as it then was); ``indenter_digest`` is that of the indenter's file, where it has
+    one.
     """
 
     name: str
@@ -54,10 +55,18 @@ class SiteModel:
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     extensions_digest: str = ""
     site: str = ""
+    knots_N: tuple[float, ...] = ()
+
+    @property
+    def forced(self) -> bool:
+        """Whether a force drives the indenter."""
+        return bool(self.knots_N)
 
     @property
     def history(self) -> History:
-        """The advance of the indenter."""
+        """The advance of the indenter, or the force that presses it."""
+        if self.forced:
+            return History(np.array(self.knots_s), force=np.array(self.knots_N))
         return History(np.array(self.knots_s), np.array(self.knots_mm))
 
     def curve_times(self, points: int) -> Array:

@@ -101,6 +101,11 @@ class Results:
         return next((file for file in files if file.is_file()), None)
 
 
+def compared_of(curves: Curves) -> tuple[str, str]:
+    """What curves compare, and its unit: force, or displacement where a force was stated."""
+    return ("displacement", "mm") if "displacement_measured_mm" in curves else ("force", "N")
+
+
 def load_store(results: Path) -> Results:
     """Read what is below ``results``.
 

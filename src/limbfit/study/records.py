@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from .tables import Positive, TomlTable, Vector
 
+Control = Literal["displacement", "force"]
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
@@ -16,7 +18,8 @@ class _Stated(TomlTable):
     """What is stated of a record, at its site or in a table of its own.
 
     ``touch_down_s`` and ``peak_s`` are times of the record, where it is not to be left to limbfit to find
-    them. ``indenter`` is a name in ``[indenters]``; None: the one of ``[indenter]``.
+    them. ``indenter`` is a name in ``[indenters]``; None: the one of ``[indenter]``. ``control`` is what was
+    stated to the machine, and drives the model; the other is compared.
     """
 
     name: str = Field(pattern=_NAME)
@@ -24,6 +27,7 @@ class _Stated(TomlTable):
     touch_down_s: float | None = None
     peak_s: float | None = None
     indenter: str | None = None
+    control: Control = "displacement"
 
     @model_validator(mode="after")
     def _in_order(self) -> _Stated:
@@ -90,7 +94,18 @@ class Record:
     touch_down_s: float | None = None
     peak_s: float | None = None
     indenter: str | None = None
+    control: Control = "displacement"
     of_site: int = 1
+
+    @property
+    def forced(self) -> bool:
+        """Whether a force drove the indenter, so that depths are compared."""
+        return self.control == "force"
+
+    @property
+    def unit(self) -> Literal["N", "mm"]:
+        """Of what is compared."""
+        return "mm" if self.forced else "N"
 
     @property
     def fitted(self) -> bool:
@@ -119,7 +134,9 @@ def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...
             name = f"{site.name}-{table.name}"
             stated.append((name, f"records.{name}", table))
     return tuple(
-        Record(name, site, one.trace, key, one.touch_down_s, one.peak_s, one.indenter, len(stated))
+        Record(
+            name, site, one.trace, key, one.touch_down_s, one.peak_s, one.indenter, one.control, len(stated)
+        )
         for name, key, one in stated
         if one.trace is not None
     )

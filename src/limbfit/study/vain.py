@@ -169,6 +169,7 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
         lambda s, site: bool(s.records_at(site)),
         "the record says how fast the indenter was",
     ),
+    VainOfSite("control", lambda s, site: site.trace is None, "it is of the site's trace, and there is none"),
     VainOfSite(
         "indenter",
         lambda s, site: site.trace is None and bool(s.records_at(site)),

@@ -258,6 +258,16 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
+    def _forces_beside_depths(self) -> Study:
+        forced = [record.name for record in self.recorded if record.forced]
+        if forced and self.calibration.objective == "paper":
+            raise ValueError(
+                f'{forced[0]}: control = "force" compares depths, and objective = "paper" adds squares of '
+                'forces; use "pointwise"'
+            )
+        return self
+
+    @model_validator(mode="after")
     def _indenters_of_records(self) -> Study:
         named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
         named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]

@@ -164,7 +164,8 @@ def best_correction(
     if before.max() <= ERROR / 2:
         return None  # nothing to explain
     worst = sorted(_worst(as_is, before))
-    units = [converted(simulate, measured, start, i, unit, before) for i in worst for unit in FORCE_UNITS]
+    forces = [i for i in worst if measured[i].unit == "N"]
+    units = [converted(simulate, measured, start, i, unit, before) for i in forces for unit in FORCE_UNITS]
     pairs = _pairs(measured, worst)
     swaps = [exchanged(simulate, measured, start, pair, exchange, before) for pair in pairs]
     if exactly is not None:
@@ -180,8 +181,9 @@ def _number_of_sites(measured: Sequence[Measured]) -> int:
 
 
 def _pairs(measured: Sequence[Measured], some: Sequence[int]) -> list[tuple[int, int]]:
-    """Pairs of records that are of two sites."""
-    return [(i, j) for i, j in combinations(sorted(some), 2) if measured[i].where != measured[j].where]
+    """Pairs of records that are of two sites and compare the same, force or depth."""
+    pairs = [(i, j, measured[i], measured[j]) for i, j in combinations(sorted(some), 2)]
+    return [(i, j) for i, j, one, two in pairs if one.where != two.where and one.unit == two.unit]
 
 
 def _exchanged(measured: Sequence[Measured], i: int, j: int) -> list[Measured]:
@@ -265,7 +267,7 @@ def _flags(
             corrected = _exchanged(corrected, i, j)
         flags.append(flag_of_correction(found, [site.name for site in measured]))
     singles, odd = suspects(respond, corrected, start)
-    flags += [flag_of(singles[i]) for i in odd if not _named(flags, measured[i].name)]
+    flags += [flag_of(singles[i], measured[i].unit) for i in odd if not _named(flags, measured[i].name)]
     return tuple(flags)
 
 
@@ -326,8 +328,11 @@ def _correction(
     )
 
 
-def flag_of(found: LeftOut) -> Flag:
-    """The flag of a site that does not belong, with the unit that its force ratio is near."""
+def flag_of(found: LeftOut, of: str = "N") -> Flag:
+    """The flag of a site that does not belong, with the unit that its force ratio is near.
+
+    ``of`` is the unit of what is compared: a depth of another unit was seen before.
+    """
     numbers = {
         "prediction_error_percent": 100 * found.error,
         "expected_error_percent": 100 * found.expected,
@@ -339,7 +344,7 @@ def flag_of(found: LeftOut) -> Flag:
         f"predicted from the other sites it is off by {100 * found.error:.0f} % of its peak, "
         f"{found.standardised:.1f} times what other sites are (measured {found.ratio:.2f} times predicted)"
     )
-    unit = unit_of(found.ratio)
+    unit = unit_of(found.ratio) if of == "N" else ""
     if unit:
         return Flag((found.site,), "unit", what, numbers, unit, "convert the force to N")
     cause = "another place, axis, limb or name, or tissue that differs there"

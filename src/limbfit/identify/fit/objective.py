@@ -26,13 +26,15 @@ _EXACT = 1e-4  # of the largest force: where all residuals vanish, equation 8 sq
 class Measured:
     """A record at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost.
 
-    ``site`` is where it is from, the same for all records of a site; by default its own.
+    ``site`` is where it is from, the same for all records of a site; by default its own. Under a stated
+    force the depth is compared: ``force_N`` is that, and ``unit`` mm.
     """
 
     name: str
     force_N: Array
     weight: float = 1.0
     site: str = ""
+    unit: str = "N"
 
     def __post_init__(self) -> None:
         if self.force_N.size < 2 or not np.all(np.isfinite(self.force_N)) or self.force_N.max() <= 0:

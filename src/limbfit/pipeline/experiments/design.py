@@ -44,12 +44,13 @@ def run_design(
     if not 0 < sites <= len(study.sites):
         raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
     for site in study.sites:
-        if len(study.records_at(site)) > 1:
+        records = study.records_at(site)
+        if len(records) > 1 or any(record.forced for record in records):
             raise InputError(
-                "a site of which one indentation is to be chosen has several records",
+                "of each site one indentation is chosen, under a stated displacement, and this has others",
                 file=study.file,
                 place=f"sites.{site.name}",
-                remedy="leave one of them in a study for the design",
+                remedy="leave one of that kind in a study for the design",
             )
     vector = study.vector(parameters)
     models, left_out = _candidate_models(context, depths_mm)

@@ -80,12 +80,12 @@ def _stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> li
 
 
 def _derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
-    """At every recorded site: change of the largest force in percent for one percent more of a modulus.
+    """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
 
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
-    own = [site_record(context, record) for record in study.recorded]
+    own = [site_record(context, record) for record in study.recorded if not record.forced]
     records, best = as_searched(context, own), study.vector(identified)
     cache = experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []

@@ -229,7 +229,8 @@ def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
     if one.noise is None:
         return facts | dict.fromkeys(("inside_percent", "half_width_percent", *_SHARES.values()))
     parameters = found.known.parameters
-    force, measured = one.response.force_N, record.force_N
+    force, measured = one.response.force_N, record.compared
+    what, unit = ("displacement" if record.record.forced else "force"), record.record.unit
     peak = float(force.max())
     names = [noise.name for noise in model.noise]
     share = model.misfit[names.index(record.name)] if record.name in names else model.misfit_elsewhere
@@ -248,10 +249,10 @@ def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
     write_curves(
         folder / "predictions" / f"{record.name}.csv",
         time_s=record.times_s,
-        force_measured_N=measured,
-        force_predicted_N=force,
-        force_low_N=low,
-        force_high_N=high,
+        **{
+            f"{what}_{which}_{unit}": curve
+            for which, curve in (("measured", measured), ("predicted", force), ("low", low), ("high", high))
+        },
     )
     inside = (measured >= low) & (measured <= high)
     return facts | {

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
 from ...mesh import read_vtu
-from ...study import Indentation, Site
+from ...study import Indentation, Record, Site
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
 from ..stages.traces import write_curves
@@ -78,9 +78,17 @@ def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
         For a site or record that the study does not have, and a site with several.
     """
     study = context.study
+    chosen = [study.indentation(name) for name in names] or list(study.indentations)
+    driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
+    if not driven or (names and len(driven) < len(chosen)):
+        raise InputError(
+            'forces are compared, and a record with control = "force" has none of its own',
+            file=study.file,
+            remedy="name records under a stated displacement",
+        )
+    every = [_chosen(context, one) for one in driven]
     if names:
-        return [_chosen(context, study.indentation(name)) for name in names]
-    every = [_chosen(context, one) for one in study.indentations]
+        return every
     thin, thick = min(every, key=_tissue), max(every, key=_tissue)
     if thin is thick:
         return [thin]

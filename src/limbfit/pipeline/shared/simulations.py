@@ -138,8 +138,9 @@ def site_model(
     knots_s: Sequence[float],
     knots_mm: Sequence[float],
     searched: bool = False,
+    knots_N: Sequence[float] = (),
 ) -> SiteModel:
-    """The stored mesh and place of an indentation's site with a displacement history.
+    """The stored mesh and place of an indentation's site with a history of displacement, or of force.
 
     ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
     than ``calibration.search_radius_mm``.
@@ -159,6 +160,7 @@ def site_model(
         axis=tuple(placed["axis"]),
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
+        knots_N=tuple(knots_N),
         edge=site.edge,
         indenter=indenter,
         indenter_digest="" if indenter.file is None else file_digest(indenter.file),
@@ -175,7 +177,8 @@ def site_model(
 def recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:
     """A site driven by one of its records, from touch-down; ``searched``: see `site_model`."""
     facts = context.stored("traces", "traces.json")["sites"][record.name]
-    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched)
+    force = facts["knots_N"] if record.forced else ()
+    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:

@@ -207,7 +207,7 @@ class Laboratory:
                 told = f"warning: site {simulation.site}: the error of its mesh is not known: {found.reason}"
             self.context.tell(self.title, 0, 0, told)
             usable = found.completed and known.completed
-            lacking.append(share * (known.force_N - found.force_N) if usable else 0.0 * record.force_N)
+            lacking.append(share * (known.force_N - found.force_N) if usable else 0.0 * record.compared)
         return tuple(lacking)
 
     def _facts(self, state: SearchState) -> dict[str, Any]:

@@ -99,6 +99,7 @@ def _driven_by(site: SiteRecord, other: SiteRecord, parameters: Array) -> Simula
         site.model,
         knots_s=driven.knots_s,
         knots_mm=driven.knots_mm,
+        knots_N=driven.knots_N,
         indenter=driven.indenter,
         indenter_digest=driven.indenter_digest,
     )

@@ -173,19 +173,20 @@ def _write_fields(context: Context, folder: Path, jobs: Sequence[SimulationJob],
 def _write_curves(folder: Path, site: SitePrediction, best: Array, known: Known) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
     record, ours, missing = site.record, site.ours, site.missing
-    columns = {
-        "time_s": record.times_s,
-        "displacement_mm": record.displacement_mm,
-        "force_measured_N": record.force_N,
-    }
+    name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
+    columns = {"time_s": record.times_s}
+    columns |= (
+        {"force_N": record.force_N} if record.record.forced else {"displacement_mm": record.displacement_mm}
+    )
+    columns[f"{name}_measured_{unit}"] = record.compared
     if "force" not in missing:
-        columns["force_simulated_N"] = site.own.force_N
+        columns[f"{name}_simulated_{unit}"] = site.own.force_N
     if site.one is not None and "one_material" not in missing:
-        columns["force_one_material_N"] = site.one.force_N
+        columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
-        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name)
-        columns["force_low_N"] = np.maximum(ours.force_N - half, 0.0)
-        columns["force_high_N"] = ours.force_N + half
+        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name, unit)
+        columns[f"{name}_low_{unit}"] = np.maximum(ours.force_N - half, 0.0)
+        columns[f"{name}_high_{unit}"] = ours.force_N + half
     write_curves(folder / f"{record.name}.csv", **columns)
 
 
@@ -195,11 +196,12 @@ def _row(site: SitePrediction) -> dict[str, Any]:
     def error(found: Simulation | SiteResponse | None) -> float | None:
         if found is None or not found.completed:
             return None
-        return error_percent(found.force_N, record.force_N)
+        return error_percent(found.force_N, record.compared)
 
     return {
         "site": record.site.name,
         "record": record.name,
+        "control": record.record.control,
         "region": record.site.region,
         "fitted": record.site.fitted,
         "peak_force_N": float(record.force_N.max()),

@@ -15,7 +15,16 @@ from ...identify.fit.objective import Measured, SiteResponse
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...phases import Phase, in_words
 from ...study import Record, Site, Study
-from ...traces import Regularised, TouchDown, Trace, read_trace, regularise, understand
+from ...traces import (
+    Creep,
+    Regularised,
+    TouchDown,
+    Trace,
+    read_trace,
+    regularise,
+    regularise_creep,
+    understand,
+)
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, recorded_model
 from ..shared.store import write_json
@@ -30,13 +39,15 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
     file = study.path(record.trace)
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
     try:
-        known = understand(trace, record.touch_down_s)
+        known = understand(trace, record.touch_down_s, forced=record.forced)
         trace, touch = known.trace, known.touch_down
-        smooth = regularise(trace, touch, table.smoothing, record.peak_s)
+        made = regularise_creep if record.forced else regularise
+        smooth = made(trace, touch, table.smoothing, record.peak_s)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
     facts = {
         "site": record.site.name,
+        "control": record.control,
         "touch_down_s": touch.time_s,
         "touch_down_mm": touch.displacement_mm,
         "touch_down_uncertainty_mm": touch.uncertainty_mm,
@@ -50,6 +61,7 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
         "phases_in_words": in_words(smooth.phases),
         "knots_s": smooth.knots_s.tolist(),
         "knots_mm": smooth.knots_mm.tolist(),
+        "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
         "remarks": [asdict(remark) for remark in known.remarks],
     }
     return trace, smooth, facts
@@ -103,7 +115,7 @@ def read_curves(file: Path) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class SiteRecord:
-    """A record at its site: what a simulation needs, and the forces it is compared with.
+    """A record at its site: what a simulation needs, and the forces, or depths, it is compared with.
 
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
@@ -132,7 +144,12 @@ class SiteRecord:
     @property
     def measured(self) -> Measured:
         """What the calibration compares with."""
-        return Measured(self.name, self.force_N, self.record.weight, self.site.name)
+        return Measured(self.name, self.compared, self.record.weight, self.site.name, self.record.unit)
+
+    @property
+    def compared(self) -> Array:
+        """What is compared: force (n,) N, or displacement, mm, under a stated force."""
+        return self.displacement_mm if self.record.forced else self.force_N
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""

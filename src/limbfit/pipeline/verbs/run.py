@@ -32,8 +32,12 @@ from ..stages.traces import run_traces
 from .journal import journal
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
-_RECORD = ("trace", "touch_down_s", "peak_s")
-_UNSEEN: dict[str, Any] = {"region": "", **dict.fromkeys((*_RECORD, "axis", "edge", "indenter"))}
+_RECORD = ("trace", "touch_down_s", "peak_s", "control")
+_UNSEEN: dict[str, Any] = {
+    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter")),
+    "region": "",
+    "control": "displacement",
+}
 _NAMED = ("site", "name")
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation")),

@@ -110,7 +110,7 @@ def simulate_site(
     write_curves(
         curve,
         time_s=times,
-        displacement_mm=model.history.at(times),
+        displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
         force_N=result.force_at(times),
     )
     summary = _summary(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
@@ -134,7 +134,7 @@ def _summary(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
         "parameters": found.parameters,
         "parameters_from": found.origin,
         "peak_force_N": result.peak_force,
-        "depth_mm": max(found.model.knots_mm),
+        "depth_mm": float(result.displacement.max()) if found.model.forced else max(found.model.knots_mm),
         "penetration_mm": float(result.penetration.max(initial=0.0)) if own else None,
         "completed": result.completed,
         "reason": result.reason,

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..formats import fixed, number, symbol, unit_of
 from ..page import Figure
-from ..store import Curves, Json, Results
+from ..store import Curves, Json, Results, compared_of
 from ..tables import interval
 from .ink import (
     FITTED,
@@ -45,7 +45,7 @@ def force_figure(
 ) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
     found = [(row, store.curves("predict", row["record"])) for row in rows]
-    pairs = [(row, curves) for row, curves in found if curves is not None]
+    pairs = [(row, curves) for row, curves in found if curves is not None and against in curves]
     if not pairs:
         return None
     drawing, axes = panels(len(pairs), columns, 2.6 if columns < 3 else 2.1)
@@ -56,8 +56,9 @@ def force_figure(
             ax.set_title(_site_title(store, row, columns))
             if i + columns >= len(pairs):
                 ax.set_xlabel(words[against][0])
-            if i % columns == 0:
-                ax.set_ylabel("Force (N)")
+            quantity, unit = compared_of(curves)
+            if i % columns == 0 or quantity != "force":
+                ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
         legend_above(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
     sites = ", ".join(f"{row['record']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words[against][1]}; site and error: {sites}"
@@ -80,16 +81,17 @@ def _short(text: str, most: int) -> str:
 
 
 def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None:
-    x = curves[against]
-    if "force_low_N" in curves and against == "time_s":
-        low, high = curves["force_low_N"], curves["force_high_N"]
+    x, (quantity, unit) = curves[against], compared_of(curves)
+    kinds = ("low", "high", "measured", "one_material", "simulated")
+    low, high, measured, one, simulated = (curves.get(f"{quantity}_{kind}_{unit}") for kind in kinds)
+    if low is not None and high is not None and against == "time_s":
         ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
-    if "force_measured_N" in curves:
-        ax.plot(x, curves["force_measured_N"], color=MEASURED, lw=2.6, alpha=0.55, label="measured")
-    if "force_one_material_N" in curves:
-        ax.plot(x, curves["force_one_material_N"], color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
-    if "force_simulated_N" in curves:
-        ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label=materials)
+    if measured is not None:
+        ax.plot(x, measured, color=MEASURED, lw=2.6, alpha=0.55, label="measured")
+    if one is not None:
+        ax.plot(x, one, color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
+    if simulated is not None:
+        ax.plot(x, simulated, color=SIMULATED, label=materials)
     ax.margins(x=0.01)
 
 

@@ -156,6 +156,11 @@ _COLUMNS = (
     "force_low_N",
     "force_high_N",
     "force_N",
+    "displacement_measured_mm",
+    "displacement_simulated_mm",
+    "displacement_one_material_mm",
+    "displacement_low_mm",
+    "displacement_high_mm",
 )
 
 

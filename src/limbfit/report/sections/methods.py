@@ -346,7 +346,8 @@ def _uncertainty(store: Results) -> str:
         return ""
     sites = residuals.get("sites") or {}
     words = ", ".join(
-        f"{name} {fixed(one.get('noise_sd_N'), 3)} N and {fixed(one.get('misfit_sd_N'), 3)} N"
+        f"{name} {fixed(one.get('noise_sd_N'), 3)} and {fixed(one.get('misfit_sd_N'), 3)} "
+        + str(one.get("unit", "N"))
         for name, one in sites.items()
     )
     return (

@@ -157,19 +157,22 @@ class ResultsView {
   }
 
   curveContent(ours, theirs) {
-    const x = ours[this.against];
+    const against = ours[this.against] ? this.against : "time_s";
+    const x = ours[against];
+    const y = ours.displacement_measured_mm ? { title: "Displacement", unit: "mm" } : { title: "Force", unit: "N" };
+    const of = (kind, curves = ours) => curves?.[`${y.title.toLowerCase()}_${kind}_${y.unit}`];
     const one = (label, colour, y, more = {}) => ({ label, colour, x, y, ...more });
     const series = [
-      one("measured", "--measured", ours.force_measured_N, { width: 3 }),
-      one("one material", "--second", ours.force_one_material_N, { dash: "dashed" }),
-      one("this run", "--simulated", ours.force_simulated_N),
+      one("measured", "--measured", of("measured"), { width: 3 }),
+      one("one material", "--second", of("one_material"), { dash: "dashed" }),
+      one("this run", "--simulated", of("simulated")),
     ].filter((line) => line.y);
-    if (theirs?.force_simulated_N) series.push({ label: this.other, colour: "--third", dash: "dashdot", x: theirs[this.against], y: theirs.force_simulated_N });
-    if (this.time !== null && this.against === "time_s" && this.player.times.length > 1) {
-      series.push({ label: "moment shown", colour: "--soft", width: 1, dash: "dotted", x: [this.time, this.time], y: [0, Math.max(...ours.force_measured_N)] });
+    if (of("simulated", theirs)) series.push({ label: this.other, colour: "--third", dash: "dashdot", x: theirs[against], y: of("simulated", theirs) });
+    if (this.time !== null && against === "time_s" && this.player.times.length > 1) {
+      series.push({ label: "moment shown", colour: "--soft", width: 1, dash: "dotted", x: [this.time, this.time], y: [0, Math.max(...of("measured"))] });
     }
-    const band = this.against === "time_s" && ours.force_low_N ? { label: "95 % interval", colour: "--simulated", x, low: ours.force_low_N, high: ours.force_high_N } : null;
-    return { label: `Force at site ${this.chosen}.`, x: AXES[this.against], y: { title: "Force", unit: "N" }, series, band };
+    const band = against === "time_s" && of("low") ? { label: "95 % interval", colour: "--simulated", x, low: of("low"), high: of("high") } : null;
+    return { label: `${y.title} at site ${this.chosen}.`, x: AXES[against], y, series, band };
   }
 
   /** The moment that the player shows, as a line in the curves. */
