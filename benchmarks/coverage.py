@@ -78,8 +78,8 @@ class Robot:
             true = true + off * depth_slope(record.times_s, record.displacement_mm, force)
             smooth, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
             curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
-            measured.append(Measured(record.site.name, curve))
-            site = record.site.name, record.times_s, residual, answer, record.displacement_mm, sd
+            measured.append(Measured(record.name, curve))
+            site = record.name, record.times_s, residual, answer, record.displacement_mm, sd
             noise.append(record_noise(*site, response))
         return measured, noise
 
@@ -161,7 +161,7 @@ def study_robot(
     context = Context(study, store, SerialExecutor(), lambda progress: None)
     found = store.read("uncertainty", "uncertainty.json")
     truth = np.array([row["calibrated"] for row in found["parameters"]])
-    records = tuple(site_record(context, site) for site in study.fitted)
+    records = tuple(site_record(context, record) for record in study.records_at(*study.fitted))
     emulator = read_emulator(store["uncertainty"] / EMULATOR)
     forces = tuple(response.force_N for response in emulator(truth))
     robot = Robot(records, forces, (), (), noise_N, autocorrelation, misfit, seed)

@@ -71,7 +71,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     for name in args.sites:
-        record = site_record(context, next(site for site in study.sites if site.name == name))
+        record = site_record(context, study.indentation(name))
         simulate(replace(record, model=replace(record.model, within_mm=40.0)).job(best))  # compiles
         whole = row(record, best, moved, None)
         print(

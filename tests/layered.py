@@ -31,15 +31,21 @@ TRUTH = {
 
 
 def layered_block(
-    thickness_mm: Sequence[float], tissues: Sequence[str] = TISSUES, half_mm: float = 24.0, divisions: int = 4
+    thickness_mm: Sequence[float],
+    tissues: Sequence[str] = TISSUES,
+    half_mm: float = 24.0,
+    divisions: int = 4,
+    height_mm: float = 8.0,
 ) -> Mesh:
     """A block of quadratic tetrahedra whose top is z = 0; ``thickness_mm`` of each tissue, outermost first.
+
+    ``divisions`` of its sides, of ``2 half_mm``; elements are about ``height_mm`` high.
 
     Node set ``fixed_bottom``, face set ``skin`` (the whole top).
     """
     side = np.linspace(-half_mm, half_mm, divisions + 1)
     ends = -np.concatenate([[0.0], np.cumsum(thickness_mm)])
-    lines = [np.linspace(a, b, max(round((a - b) / 8.0), 1), endpoint=False) for a, b in pairwise(ends)]
+    lines = [np.linspace(a, b, max(round((a - b) / height_mm), 1), endpoint=False) for a, b in pairwise(ends)]
     z = np.concatenate([*lines, ends[-1:]])[::-1]
     points, corners = boxes(side, side, z)
     cells = upright(points, corners[:, SIX_TETS].reshape(-1, 4))

@@ -198,7 +198,7 @@ def test_what_is_wrong_names_its_key(study, old, new, what):
 
 def test_the_experiment_compares_it_with_the_others(study):
     own = load_study(study).indenter
-    rows = other_indenters(own, own)
+    rows = other_indenters(own)
     assert [label for label, _, _ in rows] == [
         "tapered of the study", "square", "square, rounded edge", "sphere", "cylinder", "tapered",
     ]  # fmt: skip

@@ -103,7 +103,7 @@ def test_a_sphere_pushes_less_than_the_square(context, tmp_path):
 
 def test_other_indenters_have_the_studys_width_and_are_not_its_own():
     own = IndenterTable(shape="sphere", width_mm=12.0)
-    found = other_indenters(own, own)
+    found = other_indenters(own)
     assert [label for label, _, base in found if base] == ["sphere of the study"]
     assert [label for label, _, base in found if not base] == ["square", "square, rounded edge", "cylinder"]
     assert {table.width_mm for _, table, _ in found} == {12.0}

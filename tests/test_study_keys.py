@@ -37,7 +37,12 @@ IMAGED: dict[str, Any] = {
     "calibration": {"prior": {"skin.c_kPa": {"median": 5.0, "factor": 2.0}}, "starts": 2},
     "sites": [
         {"name": "1", "fitted": True, "trace": "1.csv", "near": [0.0, -50.0, 10.0]},
-        {"name": "2", "trace": "2.csv", "near": [0.0, 50.0, 10.0]},
+        {"name": "2", "trace": "2.csv", "near": [0.0, 50.0, 10.0], "indenter": "ball"},
+    ],
+    "indenters": {"ball": {}},
+    "records": [
+        {"site": "2", "name": "fast", "trace": "2.csv"},
+        {"site": "2", "name": "slow", "trace": "2.csv"},
     ],
 }
 GIVEN: dict[str, Any] = {
@@ -97,6 +102,18 @@ ACTS: dict[str, tuple[str, Any]] = {
     "indenter.width_mm": ("sites", 18.0),
     "indenter.edge_radius_mm": ("calibrate", 1.0),
     "indenter.friction": ("calibrate", "sticky"),
+    "indenters.ball.shape": ("calibrate", "cylinder"),
+    "indenters.ball.width_mm": ("sites", 18.0),
+    "indenters.ball.edge_radius_mm": ("calibrate", 1.0),
+    "indenters.ball.friction": ("calibrate", 0.3),
+    "records.0.site": ("calibrate", "1"),
+    "records.0.name": ("traces", "quick"),
+    "records.0.trace": ("traces", "3.csv"),
+    "records.0.touch_down_s": ("traces", 1.0),
+    "records.0.peak_s": ("traces", 2.0),
+    "records.1.indenter": ("sites", "ball"),
+    "records.1.control": ("traces", "force"),
+    "sites.0.control": ("traces", "force"),
     "traces.time_s": ("traces", "t"),
     "traces.displacement_mm": ("traces", "d"),
     "traces.force_N": ("traces", "F"),
@@ -106,6 +123,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "sites.1.fitted": ("calibrate", True),
     "sites.0.weight": ("calibrate", 2.0),
     "sites.0.trace": ("traces", "3.csv"),
+    "sites.0.indenter": ("calibrate", "ball"),
     "sites.0.touch_down_s": ("traces", 1.0),
     "sites.0.peak_s": ("traces", 2.0),
     "sites.0.near": ("sites", [0.0, -51.0, 10.0]),
@@ -186,6 +204,7 @@ READ: dict[str, str] = {
 OTHER_NAMES = {
     "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
     "indenter.file": "indenter",
+    "indenters.file": "indenters.ball",
     "calibration.prior.median": "calibration.prior.skin.c_kPa.median",
     "calibration.prior.factor": "calibration.prior.skin.c_kPa.factor",
 }
@@ -213,7 +232,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         "segmentation.bias_correction",
     ),
     (IMAGED, {"image.path": "labels.nrrd", "image.series": "1.2"}, "image.series"),
-    (IMAGED, {"sites": GIVEN["sites"]}, "image.markers"),
+    (IMAGED, {"sites": GIVEN["sites"], "records": []}, "image.markers"),
     (GIVEN, {"geometry.surface_edge_mm": 3.0}, "geometry.surface_edge_mm"),
     (GIVEN, {"geometry.amputation_pad_mm": 15.0}, "geometry.amputation_pad_mm"),
     (GIVEN, {"surfaces": {"skin": "skin.stl"}, "geometry.bone_policy": "trim-bone"}, "geometry.bone_policy"),
@@ -295,6 +314,35 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         {"socket": {"loads": [{"name": "1", "force_N": [0, 0, 9]}], "body_weight_N": 700.0}},
         "socket.body_weight_N",
     ),
+    (GIVEN, {"indenters.ball.width_mm": 10.0}, "indenters.ball"),
+    (
+        GIVEN,
+        {
+            "indenters.ball": {"shape": "sphere", "edge_radius_mm": 1.0},
+            "sites.0.indenter": "ball",
+        },
+        "indenters.ball.edge_radius_mm",
+    ),
+    (
+        GIVEN,
+        {
+            "indenters.ball.width_mm": 10.0,
+            "sites.0.indenter": "ball",
+            "sites.1.indenter": "ball",
+            "indenter.width_mm": 9.0,
+        },
+        "indenter",
+    ),
+    (
+        GIVEN,
+        {
+            "indenters.ball.width_mm": 10.0,
+            "sites.0": {"name": "1", "position": [0.0, -50.0, 10.0], "indenter": "ball"},
+            "records": [{"site": "1", "name": "fast", "trace": "1.csv", "indenter": "ball"}],
+        },
+        "sites.indenter",
+    ),
+    (GIVEN, {"sites.1.control": "force"}, "sites.control"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
     (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),
@@ -358,7 +406,7 @@ def before(folder: Path, imaged: bool) -> dict[str, str]:
 def plain(key: str) -> str:
     """A key of the tables above as KEYS has it: sites and layers without numbers, no tissue."""
     parts = [part for part in key.replace("skin.c_kPa.", "").split(".") if not part.isdecimal()]
-    return ".".join(parts).replace("tissues.fat.", "tissues.")
+    return ".".join(parts).replace("tissues.fat.", "tissues.").replace("indenters.ball.", "indenters.")
 
 
 def test_every_key_acts_or_is_refused() -> None:
@@ -414,7 +462,8 @@ def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: An
 def test_every_refusal_is_tried() -> None:
     tried = {key for _, _, key in IN_VAIN}
     stated = {key for rule in VAIN for key in rule.keys}
-    assert stated | {f"sites.{rule.key}" for rule in VAIN_OF_SITE} | {"mesh.accuracy"} == tried
+    by_name = {"mesh.accuracy", "indenters.ball", "indenters.ball.edge_radius_mm"}
+    assert stated | {f"sites.{rule.key}" for rule in VAIN_OF_SITE} | by_name == tried
 
 
 def test_what_an_amputation_takes_is_not_in_vain(folder: Path) -> None:

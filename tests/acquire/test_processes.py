@@ -28,7 +28,7 @@ from limbfit.acquire.messages import SetLimits
 from limbfit.acquire.phases import Phase
 from limbfit.acquire.wire import Encoder
 from limbfit.errors import RunError
-from limbfit.pipeline.stages.traces import read_site_trace
+from limbfit.pipeline.stages.traces import read_record
 from limbfit.study import load_study
 
 
@@ -51,13 +51,13 @@ def test_both_sites_are_acquired_into_the_study(ready) -> None:
         assert again[0] == 2
         assert "--again" in again[2]
     study = load_study(ready)
-    for site, row in zip(study.sites, found["sites"], strict=True):
+    for one, row in zip(study.recorded, found["sites"], strict=True):
         assert row["completed"]
         assert row["verdict"]["good"]
         assert row["lost"] == 0
         assert sum(row["refused"].values()) == 0
         assert row["depth_mm"] == pytest.approx(4.0, abs=0.15)
-        trace, _, facts = read_site_trace(study, site)
+        trace, _, facts = read_record(study, one)
         assert 3.0 < facts["depth_mm"] < 4.1  # after a short pause the tissue is not quite back
         assert facts["speed_load_mm_s"] == pytest.approx(1.4, abs=0.01)
         assert np.allclose(np.diff(trace.time_s), 0.002)

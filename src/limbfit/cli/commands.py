@@ -246,7 +246,7 @@ def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     """What is doubtful about the simulations of the sites."""
     for site in sites:
         for text in site["warnings"]:
-            STDERR.print(f"warning: site {site['site']}: {text}", soft_wrap=True)
+            STDERR.print(f"warning: site {site['record']}: {text}", soft_wrap=True)
 
 
 def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:
@@ -272,7 +272,7 @@ def show_sites(summary: dict[str, Any]) -> None:
     for site in summary["sites"]:
         used = "fitted" if site["fitted"] else "held out"
         error = "-" if site["error_percent"] is None else f"{site['error_percent']:.2f}"
-        table.add_row(site["site"], site["region"], used, f"{site['peak_force_N']:.2f}", error)
+        table.add_row(site["record"], site["region"], used, f"{site['peak_force_N']:.2f}", error)
     STDOUT.print(table)
     for kind, key in (("fitted", "mean_error_fitted_percent"), ("held-out", "mean_error_heldout_percent")):
         if summary.get(key) is not None:

@@ -66,6 +66,8 @@ class SimulationJob:
 class Simulation:
     """What came back: force (n,) N and its derivatives (n, p) at the job's times.
 
+    Where a force drives the indenter, ``force_N`` is what answers to it: the displacement, mm.
+
     Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
     """
 
@@ -126,8 +128,9 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         penalty = control.penalty
         if penalty is None:
             near = problem
-            if model.within_mm is None or model.within_mm > _REFERENCE_MM:
-                near = build_problem(replace(usual, within_mm=_REFERENCE_MM), mesh, reference)
+            if model.within_mm is None or model.within_mm > _REFERENCE_MM or model.forced:
+                within = min(model.within_mm or _REFERENCE_MM, _REFERENCE_MM)
+                near = build_problem(replace(usual, within_mm=within, knots_N=()), mesh, reference)
             penalty = _reference_penalty(near, control, system)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
@@ -232,7 +235,7 @@ def simulate(job: SimulationJob) -> Simulation:
     times = np.array(job.times_s)
     return Simulation(
         site=model.name,
-        force_N=result.force_at(times),
+        force_N=result.response_at(times),
         jacobian=_in_user_units(result, job, times) if job.sensitivities else None,
         completed=result.completed,
         reason=result.reason,
@@ -276,7 +279,7 @@ def _in_user_units(result: Result, job: SimulationJob, times: Array) -> Array:
     A tissue that does not reach the site is no region of its mesh: the force does not depend on it.
     """
     order = {name: i for i, name in enumerate(result.parameter_names)}
-    found = result.sensitivity_at(times)
+    found = result.response_sensitivity_at(times)
     wanted = [(tissue, p) for tissue in job.tissues for p in LAWS[job.model.law].parameters]
     columns = np.zeros((len(times), len(wanted)))
     for i, (tissue, parameter) in enumerate(wanted):

@@ -30,8 +30,11 @@ Array = NDArray[np.float64]
 class SiteModel:
     """One indentation but for the material: mesh file, indenter and displacement history.
 
-    ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm`` are the piecewise linear
-    displacement since touch-down; ``indenter_digest`` is that of the indenter's file, where it has one.
+    ``name`` is that of the record, or of the site where it plans an indentation; ``site`` that of the site,
+    whose records share a mesh. ``position``, ``axis`` and ``edge`` in LPS mm; ``knots_s`` and ``knots_mm``
+    are the piecewise linear displacement since touch-down, or ``knots_N`` the force that drives it instead
+    (``knots_mm``: as deep as it then was); ``indenter_digest`` is that of the indenter's file, where it has
+    one.
     """
 
     name: str
@@ -51,10 +54,19 @@ class SiteModel:
     law: str = OGDEN  # of all tissues
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     extensions_digest: str = ""
+    site: str = ""
+    knots_N: tuple[float, ...] = ()
+
+    @property
+    def forced(self) -> bool:
+        """Whether a force drives the indenter."""
+        return bool(self.knots_N)
 
     @property
     def history(self) -> History:
-        """The advance of the indenter."""
+        """The advance of the indenter, or the force that presses it."""
+        if self.forced:
+            return History(np.array(self.knots_s), force=np.array(self.knots_N))
         return History(np.array(self.knots_s), np.array(self.knots_mm))
 
     def curve_times(self, points: int) -> Array:

@@ -47,7 +47,12 @@ class Results:
 
     @property
     def predicted(self) -> tuple[Json, ...]:
-        return tuple(self.predict.get("sites", ()))
+        """A row of each record; ``record`` is its name, the site's where that states one only."""
+        return tuple({"record": row["site"], **row} for row in self.predict.get("sites", ()))
+
+    def records_of(self, site: str) -> tuple[str, ...]:
+        """Names of the records of a site that are stored."""
+        return tuple(name for name, facts in self.traces.items() if facts.get("site", name) == site)
 
     @property
     def fitted(self) -> tuple[str, ...]:
@@ -91,8 +96,14 @@ class Results:
         return _read_csv(file) if file.is_file() else None
 
     def vtu(self, stage: str, site: str) -> Path | None:
-        file = self.folder / stage / f"{site}.vtu"
-        return file if file.is_file() else None
+        """The mesh or fields of a site; of several records' fields the first."""
+        files = (self.folder / stage / f"{name}.vtu" for name in (site, *self.records_of(site)))
+        return next((file for file in files if file.is_file()), None)
+
+
+def compared_of(curves: Curves) -> tuple[str, str]:
+    """What curves compare, and its unit: force, or displacement where a force was stated."""
+    return ("displacement", "mm") if "displacement_measured_mm" in curves else ("force", "N")
 
 
 def load_store(results: Path) -> Results:

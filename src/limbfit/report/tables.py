@@ -76,74 +76,6 @@ def _parameter_row(store: Results, tissue: str, name: str) -> Row:
     return Row(tuple(cells))
 
 
-def site_table(store: Results) -> Table:
-    """Table 2: largest force and errors of each site, fitted sites marked."""
-    head = (
-        "Site",
-        "Region",
-        "Use",
-        "Largest force (N)",
-        "Depth (mm)",
-        "Error, one material (%)",
-        f"Error, {store.materials} (%)",
-    )
-    return Table(
-        name="sites",
-        caption="Table 2. Force error at every site: the mean absolute error over the trace divided by the "
-        "largest measured force. Sites that the identification used are marked.",
-        head=head,
-        rows=tuple(_site_row(store, row) for row in store.predicted),
-        foot=tuple(_mean_rows(store)),
-    )
-
-
-def _site_row(store: Results, row: Json) -> Row:
-    fitted = bool(row.get("fitted"))
-    depth = store.traces.get(row["site"], {}).get("depth_mm")
-    return Row(
-        (
-            heading(str(row["site"])),
-            Cell(str(row.get("region") or NOTHING)),
-            Cell("fitted" if fitted else "held out"),
-            numeric(fixed(row.get("peak_force_N"), 2)),
-            numeric(fixed(depth, 2)),
-            numeric(_error(row, "error_one_material_percent", "one_material")),
-            numeric(_error(row, "error_percent", "force")),
-        ),
-        marked=fitted,
-    )
-
-
-def _error(row: Json, key: str, what: str) -> str:
-    return "not predicted" if what in row.get("not_predicted", ()) else fixed(row.get(key))
-
-
-def _mean_rows(store: Results) -> Iterable[Row]:
-    for word, key in (("fitted", "fitted"), ("held out", "heldout")):
-        chosen = [row for row in store.predicted if bool(row.get("fitted")) == (key == "fitted")]
-        errors = [row.get("error_one_material_percent") for row in chosen]
-        one = [error for error in errors if error is not None]
-        if chosen:
-            yield Row(
-                (
-                    heading(f"Mean, {word}"),
-                    Cell(_number_of_sites(chosen)),
-                    Cell(word),
-                    numeric(""),
-                    numeric(""),
-                    numeric(fixed(sum(one) / len(one)) if one else NOTHING),
-                    numeric(mean_and_deviation(store, key)),
-                )
-            )
-
-
-def mean_and_deviation(store: Results, which: str) -> str:
-    """``4.5 ± 1.0``: stored mean and standard deviation of the errors at ``fitted`` or ``heldout`` sites."""
-    mean = store.predict.get(f"mean_error_{which}_percent")
-    deviation = store.predict.get(f"sd_error_{which}_percent")
-    return fixed(mean) if deviation is None else f"{fixed(mean)} ± {fixed(deviation)}"
-
-
 def correlation_table(store: Results) -> Table | None:
     """The correlation of every pair of parameters, coloured."""
     correlation = (store.calibration.get("uncertainty") or {}).get("correlation") or {}
@@ -248,12 +180,6 @@ def _mesh_row(site: str, facts: Json, marked: bool) -> Row:
     return Row(cells, marked)
 
 
-def _number_of_sites(rows: list[Json]) -> str:
-    """How many, and how many of them the mean lacks."""
-    lacking = sum(row.get("error_percent") is None for row in rows)
-    return f"{len(rows)} site{'s' if len(rows) > 1 else ''}" + (f", without {lacking}" if lacking else "")
-
-
 def _layers(facts: Json) -> str:
     """Thickness of the layer, or of each by its name."""
     each = facts.get("layer_thickness_mm") or {}
@@ -274,7 +200,7 @@ def solver_table(store: Results) -> Table:
     rows = tuple(
         Row(
             (
-                heading(str(row["site"])),
+                heading(str(row["record"])),
                 Cell(str(row.get("element", NOTHING))),
                 numeric(_count(row.get("steps"))),
                 numeric(fixed(row.get("penetration_mm"), 3)),

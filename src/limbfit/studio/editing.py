@@ -16,7 +16,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from ..errors import StudyError
-from ..study import Study, load_study
+from ..study import Record, Study, load_study
 
 POSITION_DIGITS = 2  # of a place in mm
 
@@ -62,6 +62,19 @@ def set_site(file: Path, site: str, values: Mapping[str, Any]) -> Study:
     A new place removes ``near``, and the other way round: a site has one of them.
     """
     return edit_study(file, lambda document: _assign(_table_of(document, site, file), values))
+
+
+def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> Study:
+    """Set keys of a record where the study file states it, such as ``touch_down_s``; None removes one."""
+    if record.name == record.site.name:
+        return set_site(file, record.name, values)
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        for table in document["records"]:
+            if f"{table['site']}-{table['name']}" == record.name:
+                _assign(table, values)
+
+    return edit_study(file, change)
 
 
 def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[str, Any]) -> Study:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from ..pipeline import STAGE_NAMES
 from ..pipeline.shared.simulations import newest_simulations
 from ..pipeline.stages.traces import read_curves
+from ..study import Record
 from .folder import StudyFolder
 from .processes import running, start_run, starting, stop_run
 from .study_routes import Folder, stages_of_folder
@@ -50,26 +51,30 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "iterates": _iterates(folder, logs, state["state"], done),
         "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
-        "sites": [{"site": site.name, "fitted": site.fitted} for site in study.sites if site.trace],
+        "sites": [{"site": record.name, "fitted": record.fitted} for record in study.recorded],
         "answer": done and {**done, "state": state["state"]},
     }
 
 
 @router.get("/curves/{name}")
 def get_curves(folder: Folder, name: str) -> dict[str, Any]:
-    """A site's measured force, and the simulated ones: of the prediction, or the newest while it is searched.
+    """A record's measured force, and the simulated ones: predicted, or the newest while it is searched.
 
-    Time in s from touch-down, displacement in mm, force in N; ``of`` is null where nothing is simulated yet.
+    Time in s from touch-down, displacement in mm, force in N; under a stated force it is the displacements
+    that are measured and simulated. ``of`` is null where nothing is simulated yet.
     """
-    site = folder.load().site(name)
+    site = folder.load().indentation(name)
     states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
     live = _newest(folder, site.name) if states["calibrate"] != "done" else None
     stored = folder.results / "predict" / f"{site.name}.csv"
     measured = folder.results / "traces" / f"{site.name}.csv"
     if live is not None and measured.is_file():
         curves = {key: values.tolist() for key, values in read_curves(measured).items()}
-        curves["force_measured_N"] = curves.pop("force_N")
-        return {"site": site.name, "of": "the newest simulation of the search", **curves, **live}
+        forced = isinstance(site, Record) and site.forced
+        what, unit, old = ("displacement", "mm", "displacement_mm") if forced else ("force", "N", "force_N")
+        curves[f"{what}_measured_{unit}"] = curves.pop(old)
+        curves[f"{what}_simulated_{unit}"] = live
+        return {"site": site.name, "of": "the newest simulation of the search", **curves}
     if stored.is_file():
         of = "the prediction" if states["predict"] == "done" else "the last prediction, which is stale"
         return {"site": site.name, "of": of, **{k: v.tolist() for k, v in read_curves(stored).items()}}
@@ -157,9 +162,9 @@ def _events(log: Path) -> list[dict[str, Any]]:
     return events
 
 
-def _newest(folder: StudyFolder, site: str) -> dict[str, Any] | None:
+def _newest(folder: StudyFolder, site: str) -> list[float] | None:
     for runs in sorted(folder.results.glob(".work-calibrate-*/runs")):
         found = newest_simulations(runs, (site,)).get(site)
         if found is not None and found.completed:
-            return {"force_simulated_N": found.force_N.tolist()}
+            return list(map(float, found.force_N))
     return None

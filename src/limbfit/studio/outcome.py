@@ -13,6 +13,7 @@ from ..errors import InputError, RunError
 from ..pipeline import export_study
 from ..pipeline.shared.store import write_json
 from ..pipeline.stages.traces import read_curves
+from ..study import Record
 from .folder import StudyFolder, stored
 from .study_routes import stages_of_folder
 
@@ -48,7 +49,7 @@ def outcome_of(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
         "intervals_95": uncertainty.get("intervals_95") or {},
         "verdict": uncertainty.get("verdict") or {},
         "sites": [
-            {key: row.get(key) for key in ("site", "region", "fitted", *_COLUMNS)}
+            {key: row.get(key) for key in ("site", "record", "region", "fitted", *_COLUMNS)}
             for row in predicted.get("sites", [])
         ],
         "means": {key: value for key, value in predicted.items() if key.endswith("_percent")},
@@ -146,14 +147,16 @@ def downloads_of(folder: StudyFolder) -> list[dict[str, str]]:
 
 def site_downloads(folder: StudyFolder, site: str) -> list[dict[str, str]]:
     """The same for one site: curves, fields, the FEBio input where it was written."""
-    name = folder.load().site(site).name
+    study = folder.load()
+    one = study.indentation(site)
+    name, place = one.name, one.site.name if isinstance(one, Record) else one.name
     wanted = [
         ("predict", f"{name}.csv", "predicted curves (CSV)"),
         ("traces", f"{name}.csv", "regularised record (CSV)"),
         ("predict", f"{name}.vtu", "fields at the deepest point (VTU)"),
         ("simulate", f"{name}.csv", "simulated curve (CSV)"),
         ("simulate", f"{name}.vtu", "simulated fields (VTU)"),
-        ("mesh", f"{name}.vtu", "mesh (VTU)"),
+        ("mesh", f"{place}.vtu", "mesh (VTU)"),
         ("export", f"{name}.feb", "FEBio input (.feb)"),
     ]
     return [
@@ -172,7 +175,7 @@ def write_feb_of(folder: StudyFolder, site: str) -> dict[str, str]:
         Where meshes are missing or stale: making them is a run.
     """
     study = folder.load()
-    name = study.site(site).name
+    name = study.indentation(site).name
     states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
     if states.get("mesh") != "done":
         raise RunError("the meshes are not up to date; run the study until mesh first")

@@ -105,7 +105,8 @@ def _deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
 
 def _peak_time(curve: Path) -> float:
     columns = read_curves(curve)
-    loading = loading_end(find_phases(columns["time_s"], columns["displacement_mm"]))
+    stated = columns["displacement_mm"] if "displacement_mm" in columns else columns["force_N"]
+    loading = loading_end(find_phases(columns["time_s"], stated))
     return 0.0 if loading is None else loading.end_s
 
 

@@ -38,7 +38,7 @@ def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
 def get_site(folder: Folder, site: str) -> dict[str, Any]:
     """What can be shown of a site, its files, and how a simulation of it goes."""
     return {
-        "sources": playback.sources_of(folder, folder.load().site(site).name),
+        "sources": playback.sources_of(folder, folder.load().indentation(site).name),
         "downloads": outcome.site_downloads(folder, site),
         "simulating": simulating.simulating(folder),
         "failure": simulating.failure_of(folder, site),

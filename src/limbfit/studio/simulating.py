@@ -42,7 +42,7 @@ def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
     RunError
         Where the study is being run or a simulation goes on.
     """
-    name = folder.load().site(site).name
+    name = folder.load().indentation(site).name
     holder = running(folder) or simulating(folder)
     if holder is not None:
         raise RunError(f"process {holder['process']} works on this study; stop it first, or wait for it")
@@ -74,7 +74,7 @@ def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
 
 def failure_of(folder: StudyFolder, site: str) -> str | None:
     """The error with which the last simulation of a site ended; None where it ended well or goes on."""
-    file = _said_file(folder, folder.load().site(site).name)
+    file = _said_file(folder, folder.load().indentation(site).name)
     if not file.is_file():
         return None
     lines = [line.strip() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]

@@ -45,10 +45,22 @@ def get_study(folder: Folder) -> dict[str, Any]:
         "sites": [
             {
                 **site.model_dump(mode="json", exclude={"trace"}),
-                "has_trace": site.trace is not None,
+                "has_trace": bool(study.records_at(site)),
                 "is_recorded": study.is_recorded(site),
             }
             for site in study.sites
+        ],
+        "indentations": [
+            {
+                "name": one.name,
+                "region": one.region,
+                "fitted": one.fitted,
+                "has_trace": one.trace is not None,
+                "is_recorded": one.trace is not None and study.path(one.trace).is_file(),
+                "touch_down_s": one.touch_down_s,
+                "peak_s": one.peak_s,
+            }
+            for one in study.indentations
         ],
         "notes": list(study.notes),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,10 @@ from pydantic import BaseModel, ConfigDict
 from ..anatomy.surfaces.surfaces import load_anatomy
 from ..errors import InputError
 from ..pipeline.stages.plausible import record_flags
-from ..pipeline.stages.traces import read_site_trace
-from ..study import Site, Study
+from ..pipeline.stages.traces import read_record
+from ..study import Record, Study
 from ..traces.numerics import bins
-from .editing import set_site
+from .editing import set_record
 from .folder import StudyFolder, fingerprint
 from .study_routes import Folder, stages_of_folder
 
@@ -35,20 +36,23 @@ class Times(BaseModel):
 
 @router.get("")
 def get_records(folder: Folder) -> dict[str, Any]:
-    """Every site with what its record says, and the flags on the records."""
+    """Every record, and every planned indentation, with what the record says, and the flags on the records.
+
+    ``site`` is the name of the record, or of the site.
+    """
     study = folder.load()
     rows: list[dict[str, Any]] = []
     records: dict[str, dict[str, Any]] = {}
-    for site in study.sites:
-        row: dict[str, Any] = {"site": site.name, "region": site.region, "fitted": site.fitted, "error": None}
-        if study.is_recorded(site):
+    for one in study.indentations:
+        row: dict[str, Any] = {"site": one.name, "region": one.region, "fitted": one.fitted, "error": None}
+        if isinstance(one, Record) and study.path(one.trace).is_file():
             try:
-                records[site.name] = _read(study, site)
+                records[one.name] = _read(study, one)
             except InputError as error:
                 row["error"] = str(error)
-        found = records.get(site.name, {})
+        found = records.get(one.name, {})
         row |= {
-            "has_trace": site.trace is not None,
+            "has_trace": one.trace is not None,
             "facts": found.get("facts"),
             "stated": found.get("stated"),
         }
@@ -74,45 +78,44 @@ def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
 def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
     study = folder.load()
-    site = _with_times(_recorded(study, name), times)
-    found = _read(study, site)
-    set_site(folder.file, name, {"touch_down_s": site.touch_down_s, "peak_s": site.peak_s})
+    record = _with_times(_recorded(study, name), times)
+    found = _read(study, record)
+    set_record(folder.file, record, {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s})
     return found
 
 
-def _recorded(study: Study, name: str) -> Site:
-    site = study.site(name)
-    if site.trace is None:
+def _recorded(study: Study, name: str) -> Record:
+    one = study.indentation(name)
+    if not isinstance(one, Record):
         raise InputError(f"site {name} has no record", file=study.file, place=f"sites.{name}")
-    return site
+    return one
 
 
-def _with_times(site: Site, times: Times) -> Site:
+def _with_times(record: Record, times: Times) -> Record:
     rounded = {key: None if at is None else round(at, 4) for key, at in times.model_dump().items()}
-    return site.model_copy(update=rounded)
+    return replace(record, touch_down_s=rounded["touch_down_s"], peak_s=rounded["peak_s"])
 
 
-def _read(study: Study, site: Site) -> dict[str, Any]:
+def _read(study: Study, record: Record) -> dict[str, Any]:
     """A record with its curves, for as long as neither its file nor what is stated of it changes."""
-    assert site.trace is not None
-    file = study.path(site.trace)
-    key = repr((str(file), fingerprint([file]), study.traces, site.touch_down_s, site.peak_s))
+    file = study.path(record.trace)
+    key = repr((str(file), fingerprint([file]), study.traces, record.touch_down_s, record.peak_s))
     if key not in _kept:
         if len(_kept) >= _MOST_KEPT:
             _kept.clear()
-        _kept[key] = _record(study, site)
-    return {"site": site.name, **_kept[key]}
+        _kept[key] = _record(study, record)
+    return {"site": record.name, **_kept[key]}
 
 
-def _record(study: Study, site: Site) -> dict[str, Any]:
-    trace, smooth, facts = read_site_trace(study, site)
+def _record(study: Study, record: Record) -> dict[str, Any]:
+    trace, smooth, facts = read_record(study, record)
     even = smooth.resample(CURVE_POINTS)
     time, force, _ = bins(trace.time_s, trace.force_N, MOST_POINTS)
     _, moved, _ = bins(trace.time_s, trace.displacement_mm, MOST_POINTS)
     start = facts["touch_down_s"]
     return {
         "facts": {key: value for key, value in facts.items() if not key.startswith("knots")},
-        "stated": {"touch_down_s": site.touch_down_s, "peak_s": site.peak_s},
+        "stated": {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s},
         "samples": len(trace.time_s),
         "step_s": float(np.median(np.diff(trace.time_s))),
         "raw": {
@@ -137,7 +140,7 @@ def _flags(folder: StudyFolder, study: Study, records: dict[str, dict[str, Any]]
     placed, anatomy = {}, None
     if (folder.results / "sites" / "sites.json").is_file():
         rows = folder.store.read("sites", "sites.json")["sites"]
-        placed = {row["site"]: row for row in rows if row["site"] in records}
+        placed = {row["site"]: row for row in rows}
         anatomy = load_anatomy(folder.results / "surfaces")
     facts = {name: one["facts"] for name, one in records.items()}
     steps = {name: one["step_s"] for name, one in records.items()}

@@ -6,12 +6,15 @@ Relative paths are relative to the study file and must stay inside its folder's 
 
 from .loading import load_study
 from .material import MaterialTable
-from .tables import IndenterTable, Site, SolverTable, Vector
+from .records import Indentation, Record, Site
+from .tables import IndenterTable, SolverTable, Vector
 from .whole import Study
 
 __all__ = [
+    "Indentation",
     "IndenterTable",
     "MaterialTable",
+    "Record",
     "Site",
     "SolverTable",
     "Study",

@@ -231,46 +231,6 @@ class TracesTable(TomlTable):
     smoothing: Annotated[float, Field(ge=0)] | None = None
 
 
-class Site(TomlTable):
-    """An indentation site.
-
-    ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
-    ``axis`` (into the limb) and ``edge`` (one edge direction of the square) are found when not given.
-    ``weight`` is how often the record of a fitted site counts. ``touch_down_s`` and ``peak_s`` are times of
-    the record, where it is not to be left to limbfit to find them.
-    Where there is no ``trace``, ``depth_mm`` and ``speed_mm_s`` plan an indentation to be simulated.
-    """
-
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$")
-    region: str = ""
-    fitted: bool = False
-    weight: Positive = 1.0
-    trace: Path | None = None
-    touch_down_s: float | None = None
-    peak_s: float | None = None
-    depth_mm: Positive | None = None
-    speed_mm_s: Positive = 0.96
-    position: Vector | None = None
-    near: Vector | None = None
-    axis: Vector | None = None
-    edge: Vector | None = None
-
-    @model_validator(mode="after")
-    def _one_place(self) -> Site:
-        if (self.position is None) == (self.near is None):
-            raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
-        if (self.trace is None) == (self.depth_mm is None):
-            raise ValueError("give either trace (a record) or depth_mm (an indentation to be simulated)")
-        if self.fitted and self.trace is None:
-            raise ValueError("a fitted site needs a trace")
-        for key in ("touch_down_s", "peak_s"):
-            if self.trace is None and getattr(self, key) is not None:
-                raise ValueError(f"{key} is a time of a record, and the site has no trace")
-        if None not in (self.touch_down_s, self.peak_s) and self.touch_down_s >= self.peak_s:  # type: ignore[operator]
-            raise ValueError("touch_down_s must come before peak_s")
-        return self
-
-
 class PriorTable(TomlTable):
     """What is known of a parameter beforehand: lognormal, ``factor`` is one standard deviation either way."""
 

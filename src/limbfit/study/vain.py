@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import StudyError
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
-from .tables import Site
+from .records import Site
 from .whole import Study
 
 
@@ -105,13 +105,18 @@ VAIN: tuple[Vain, ...] = (
         "edge_far_mm is shorter, and no edge longer",
     ),
     Vain(
+        ("indenter",),
+        lambda s: all(one.indenter is not None for one in s.indentations),
+        "every record and every planned indentation names another one",
+    ),
+    Vain(
         ("indenter.edge_radius_mm",),
         lambda s: not SHAPES[s.indenter.shape].has_edge,
         "the indenter has no edge to round",
     ),
     Vain(
         ("traces",),
-        lambda s: all(site.trace is None for site in s.sites),
+        lambda s: not s.recorded,
         "no site has a record",
         "give sites.trace, or leave it out",
     ),
@@ -150,7 +155,7 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("uncertainty.edge_radius_mm",),
-        lambda s: not SHAPES[s.indenter.shape].is_edge_doubted,
+        lambda s: not any(SHAPES[one.shape].is_edge_doubted for one in s.used_indenters.values()),
         "it is that of a square indenter",
     ),
     Vain(
@@ -194,15 +199,22 @@ VAIN: tuple[Vain, ...] = (
 )
 
 VAIN_OF_SITE: tuple[VainOfSite, ...] = (
-    VainOfSite("weight", lambda s, site: site.trace is None, "the site has no record to be weighted"),
+    VainOfSite("weight", lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
     VainOfSite(
         "speed_mm_s",
-        lambda s, site: site.trace is not None,
+        lambda s, site: bool(s.records_at(site)),
         "the record says how fast the indenter was",
+    ),
+    VainOfSite("control", lambda s, site: site.trace is None, "it is of the site's trace, and there is none"),
+    VainOfSite(
+        "indenter",
+        lambda s, site: site.trace is None and bool(s.records_at(site)),
+        "the site's records are stated in [[records]]",
+        "give it there",
     ),
     VainOfSite(
         "edge",
-        lambda s, site: SHAPES[s.indenter.shape].is_round,
+        lambda s, site: all(SHAPES[one.shape].is_round for one in s.indenters_at(site)),
         "the indenter is round",
     ),
 )
@@ -220,6 +232,17 @@ def refuse_vain(study: Study, content: Mapping[str, Any]) -> None:
         for key in rule.keys:
             if _states(content, key) and rule.when(study):
                 raise _error(study.file, key, rule.why, rule.remedy)
+    for name, indenter in study.indenters.items():
+        if name not in study.used_indenters:
+            raise _error(
+                study.file,
+                f"indenters.{name}",
+                "no record and no planned indentation names it",
+                "leave it out",
+            )
+        if "edge_radius_mm" in content["indenters"][name] and not SHAPES[indenter.shape].has_edge:
+            place = f"indenters.{name}.edge_radius_mm"
+            raise _error(study.file, place, "the indenter has no edge to round", "leave it out")
     if _has_every_edge(content.get("mesh", {})):
         raise _error(study.file, "mesh.accuracy", "all edge lengths are stated", "leave it or them out")
     for site, stated in zip(study.sites, content["sites"], strict=True):

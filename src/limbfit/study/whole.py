@@ -15,6 +15,7 @@ from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .material import MaterialTable
 from .meshing import MeshTable
+from .records import Indentation, Record, RecordTable, Site, records_of
 from .socket import SocketTable
 from .tables import (
     CalibrationTable,
@@ -26,7 +27,6 @@ from .tables import (
     MarkupsTable,
     PriorTable,
     SegmentationTable,
-    Site,
     SolverTable,
     StudyTable,
     SurfacesTable,
@@ -46,9 +46,11 @@ class Study(TomlTable):
     geometry: GeometryTable = GeometryTable()
     mesh: MeshTable = MeshTable()
     indenter: IndenterTable = IndenterTable()
+    indenters: dict[str, IndenterTable] = Field(default={})
     traces: TracesTable = TracesTable()
     markups: MarkupsTable | None = None
     sites: tuple[Site, ...]
+    records: tuple[RecordTable, ...] = ()
     material: MaterialTable = MaterialTable()
     calibration: CalibrationTable = CalibrationTable()
     uncertainty: UncertaintyTable = UncertaintyTable()
@@ -72,6 +74,23 @@ class Study(TomlTable):
     def fitted(self) -> tuple[Site, ...]:
         return tuple(site for site in self.sites if site.fitted)
 
+    def records_at(self, *sites: Site) -> tuple[Record, ...]:
+        """The records of some sites, site by site."""
+        return tuple(record for site in sites for record in records_of(site, self.records))
+
+    @property
+    def recorded(self) -> tuple[Record, ...]:
+        """The records of all sites, site by site."""
+        return self.records_at(*self.sites)
+
+    @property
+    def indentations(self) -> tuple[Indentation, ...]:
+        """Every record, and every site that plans an indentation instead, site by site."""
+        found: list[Indentation] = []
+        for site in self.sites:
+            found += self.records_at(site) or (site,)
+        return tuple(found)
+
     @property
     def tissues(self) -> tuple[str, ...]:
         """Names of the materials and of the mesh's regions: the layers, outermost first, and the core."""
@@ -88,10 +107,29 @@ class Study(TomlTable):
         return tuple(self.path(file) for file in self.study.extensions)
 
     @property
-    def indenter_here(self) -> IndenterTable:
-        """The indenter, its file as a path of this machine."""
-        file = self.indenter.file
-        return self.indenter.model_copy(update={"file": None if file is None else self.path(file)})
+    def all_indenters(self) -> dict[str | None, IndenterTable]:
+        """The study's indenters by name; that of ``[indenter]`` under None."""
+        named: dict[str | None, IndenterTable] = {None: self.indenter}
+        return named | dict(self.indenters)
+
+    def indenter_of(self, one: Indentation) -> IndenterTable:
+        """The indenter of a record or of a planned indentation, its file as a path of this machine."""
+        found = self.all_indenters[one.indenter]
+        return found.model_copy(update={"file": None if found.file is None else self.path(found.file)})
+
+    @property
+    def used_indenters(self) -> dict[str | None, IndenterTable]:
+        """Of `all_indenters` those that touch somewhere."""
+        used = {one.indenter for one in self.indentations}
+        return {name: one for name, one in self.all_indenters.items() if name in used}
+
+    def indenters_at(self, site: Site) -> tuple[IndenterTable, ...]:
+        """All that touch at a site."""
+        return tuple(self.all_indenters[one.indenter] for one in self.records_at(site) or (site,))
+
+    def width_at(self, site: Site) -> float:
+        """Width of the widest indenter that touches at a site, mm."""
+        return max(indenter.width_mm for indenter in self.indenters_at(site))
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
@@ -137,8 +175,9 @@ class Study(TomlTable):
             "segmentation.contours": self.segmentation.contours,
             "indenter.file": self.indenter.file,
             "socket.file": self.socket.file,
+            **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
-            **{f"sites.{site.name}.trace": site.trace for site in self.sites},
+            **{f"{record.key}.trace": record.trace for record in self.recorded},
         }
         if self.image is not None:
             named |= {"image.path": self.image.path, "image.markers": self.image.marked}
@@ -154,8 +193,9 @@ class Study(TomlTable):
         return self.folder / relative
 
     def is_recorded(self, site: Site) -> bool:
-        """Whether the record that a site names has been made."""
-        return site.trace is not None and self.path(site.trace).is_file()
+        """Whether all records that a site names have been made."""
+        records = self.records_at(site)
+        return bool(records) and all(self.path(record.trace).is_file() for record in records)
 
     def site(self, name: str) -> Site:
         for site in self.sites:
@@ -168,6 +208,22 @@ class Study(TomlTable):
             remedy="the study has " + ", ".join(s.name for s in self.sites),
         )
 
+    def indentation(self, name: str) -> Indentation:
+        """What was recorded or is planned under a name: a record's, or that of a site with one at most."""
+        for one in self.indentations:
+            if one.name == name:
+                return one
+        site = self.site(name)
+        records = self.records_at(site)
+        if len(records) == 1:
+            return records[0]
+        raise StudyError(
+            f"site {name} has several records",
+            file=self.file,
+            place="records",
+            remedy="name one of " + ", ".join(record.name for record in records),
+        )
+
     @field_validator("sites")
     @classmethod
     def _sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
@@ -178,6 +234,51 @@ class Study(TomlTable):
         if doubled:
             raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
         return sites
+
+    @model_validator(mode="after")
+    def _records_of_sites(self) -> Study:
+        names = [site.name for site in self.sites]
+        for table in self.records:
+            if table.site not in names:
+                raise ValueError(
+                    f"records.{table.name}: no site is named {table.site!r}; they are {', '.join(names)}"
+                )
+        names += [f"{table.site}-{table.name}" for table in self.records]
+        doubled = [name for name in names if names.count(name) > 1]
+        if doubled:
+            raise ValueError(
+                f"two records, or a record and a site, have the name {doubled[0]!r}; name one anew"
+            )
+        for number, site in enumerate(self.sites):
+            records, place = self.records_at(site), f"sites.{number}"
+            if site.fitted and not records:
+                raise ValueError(f"{place}: a fitted site needs a trace, or [[records]]")
+            if (not records) == (site.depth_mm is None):
+                raise ValueError(
+                    f"{place}: give either trace (a record; several: [[records]]) or depth_mm (an "
+                    "indentation to be simulated)"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _forces_beside_depths(self) -> Study:
+        forced = [record.name for record in self.recorded if record.forced]
+        if forced and self.calibration.objective == "paper":
+            raise ValueError(
+                f'{forced[0]}: control = "force" compares depths, and objective = "paper" adds squares of '
+                'forces; use "pointwise"'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _indenters_of_records(self) -> Study:
+        named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
+        named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]
+        for place, name in named:
+            if name is not None and name not in self.indenters:
+                known = ", ".join(self.indenters) or "none"
+                raise ValueError(f"{place}: no indenter is named {name!r}; those of [indenters] are {known}")
+        return self
 
     @model_validator(mode="after")
     def _materials_of_tissues(self) -> Study:

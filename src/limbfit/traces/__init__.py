@@ -4,11 +4,13 @@ A record starts clear of the skin (or on it); the indenter is pushed in along a 
 order, at any rates and in several cycles (see `phases`). ``read_trace`` checks it, ``understand`` mends
 or refuses it, ``find_touch_down`` tells where the skin was met, and ``regularise`` gives curves counted from
 there: piecewise straight for the displacement, a cubic smoothing spline for the force, each phase by itself
-so that the peak is not smoothed away (paper, section 2.1 and figure 3).
+so that the peak is not smoothed away (paper, section 2.1 and figure 3). Under a stated force it is the other
+way round (``regularise_creep``).
 
 Units: s, mm, N; force positive when pushing, displacement positive into the limb.
 """
 
+from .creep import Creep, regularise_creep
 from .reading import read_trace
 from .record import COLUMNS, Trace, check_trace
 from .regularise import Regularised, regularise
@@ -17,6 +19,7 @@ from .understanding import Remark, Understood, understand
 
 __all__ = [
     "COLUMNS",
+    "Creep",
     "Regularised",
     "Remark",
     "TouchDown",
@@ -26,6 +29,7 @@ __all__ = [
     "find_touch_down",
     "read_trace",
     "regularise",
+    "regularise_creep",
     "touch_down_at",
     "understand",
 ]

@@ -55,8 +55,16 @@ class BrokenLine:
         return float(np.interp(displacement, np.maximum.accumulate(u[last:]), t[last:]))
 
 
-def broken_line(time: Array, displacement: Array, peak_s: float | None = None) -> BrokenLine:
+def broken_line(
+    time: Array,
+    displacement: Array,
+    peak_s: float | None = None,
+    quantity: str = "displacement",
+    unit: str = "mm",
+) -> BrokenLine:
     """Fit as few straight pieces as describe the displacement to 0.3 % of the travel (or its noise).
+
+    So is a force that is stated instead: ``quantity`` and ``unit`` are for messages.
 
     Corners are added where the misfit is largest and all of them moved to their least-squares place;
     with ``peak_s`` the end of the way in is put there.
@@ -81,16 +89,16 @@ def broken_line(time: Array, displacement: Array, peak_s: float | None = None) -
         if len(knots) >= _MAX_KNOTS:
             worst = float(at[np.argmax(miss)])
             raise TraceError(
-                f"the displacement wanders: {len(knots) - 1} straight pieces leave {miss.max():.2g} mm at "
+                f"the {quantity} wanders: {len(knots) - 1} straight pieces leave {miss.max():.2g} {unit} at "
                 f"{worst:.2f} s",
-                place="displacement",
+                place=quantity,
                 remedy="a record is made of ramps and holds, in any number of cycles up to ten: "
                 "cut out the part that is",
             )
         knots = np.sort(np.append(knots, at[np.argmax(miss)]))
     line = BrokenLine(knots, values, tolerance)
     if way_in(line.phases) is None:
-        raise TraceError("the displacement never advances", place="displacement", remedy="check the column")
+        raise TraceError(f"the {quantity} never advances", place=quantity, remedy="check the column")
     return line if peak_s is None else _turning_at(peak_s, line, t, u)
 
 

@@ -116,7 +116,7 @@ def regularise(
     force = trace.force_N - touch_down.baseline_N
     if ((trace.time_s >= start) & (trace.time_s <= line.peak_s)).sum() < 8:
         raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
-    corners = _with_samples(boundaries(phases), trace.time_s - start)
+    corners = with_samples(boundaries(phases), trace.time_s - start)
     curve = SmoothCurve(trace.time_s - start, force, corners, smoothing)
     inside = (trace.time_s >= start) & (trace.time_s <= end)
     time = spread(phases, 1000, knots - start)
@@ -133,7 +133,7 @@ def regularise(
     )
 
 
-def _with_samples(corners: Array, time: Array) -> Array:
+def with_samples(corners: Array, time: Array) -> Array:
     """The corners between which there are samples enough for a spline: a shorter part belongs to its
     neighbour."""
     kept = list(corners)

@@ -36,6 +36,7 @@ _START_FORCE_SHARE = 0.25  # of the peak force, where there are too few samples 
 _START_SHARE = 0.03  # of the travel
 _START_SLOPE = 0.25  # of the mean slope of the way in
 _LEAST_START = 8  # samples
+_RISE_SHARE = 0.5  # of the largest force: the rise in which a stated force meets the skin
 _BINS = 200
 
 
@@ -59,8 +60,12 @@ class Understood:
     remarks: tuple[Remark, ...]
 
 
-def understand(trace: Trace, touch_down_s: float | None = None) -> Understood:
+def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool = False) -> Understood:
     """Mend a record and find its touch-down, unless ``touch_down_s`` states it.
+
+    Parameters
+    ----------
+    forced : a force was stated to the machine, not a displacement.
 
     Raises
     ------
@@ -72,15 +77,21 @@ def understand(trace: Trace, touch_down_s: float | None = None) -> Understood:
     line = broken_line(trace.time_s, trace.displacement_mm)
     _check_start(trace, line)
     level = _level_ends(trace, line)
-    touch = _touch_down(level, touch_down_s)
+    touch = _touch_down(level, touch_down_s, forced)
     straight, drift = _without_drift(trace, line, touch)
     if straight is not level:
-        touch = _touch_down(straight, touch_down_s)
+        touch = _touch_down(straight, touch_down_s, forced)
     return Understood(straight, touch, (*remarks, *drift, *_start_remark(touch, touch_down_s)))
 
 
-def _touch_down(trace: Trace, stated_s: float | None) -> TouchDown:
-    return find_touch_down(trace) if stated_s is None else touch_down_at(trace, stated_s)
+def _touch_down(trace: Trace, stated_s: float | None, forced: bool) -> TouchDown:
+    """Under a stated force from its rise alone: it turns where the skin is met, and creeps far beyond."""
+    if stated_s is not None:
+        return touch_down_at(trace, stated_s)
+    if not forced:
+        return find_touch_down(trace)
+    most = int(np.argmax(trace.force_N >= _RISE_SHARE * trace.force_N.max()))
+    return find_touch_down(Trace(trace.time_s[:most], trace.displacement_mm[:most], trace.force_N[:most]))
 
 
 def _without_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:

@@ -9,7 +9,7 @@ checked against the solver; its region of validity comes as the bounds of ``unkn
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 from typing import Any
@@ -96,6 +96,17 @@ def choices_of(sites: int, size: int, most: int | None = None, seed: int = 0) ->
     while len(drawn) < most:
         drawn.add(tuple(sorted(int(i) for i in rng.choice(sites, size, replace=False))))
     return sorted(drawn)
+
+
+def expanded(choice: Choice, groups: Sequence[Choice]) -> Choice:
+    """The records of a choice of sites; ``groups`` are the records of each site."""
+    return tuple(record for site in choice for record in groups[site])
+
+
+def by_site(fold: Fold, choice: Choice, groups: Sequence[Choice]) -> Fold:
+    """A fit to the records of a choice of sites as one to them: an error is the mean of a site's records."""
+    errors = tuple(float(np.mean([fold.errors_percent[i] for i in group])) for group in groups)
+    return replace(fold, fitted=choice, errors_percent=errors)
 
 
 def without_regions(regions: Sequence[str]) -> dict[str, Choice]:

@@ -95,7 +95,10 @@ class Correction:
 
 
 class Sites:
-    """All recorded sites with their simulation: regularised fits on some, errors on others."""
+    """All records with their simulation: regularised fits on some, errors on others.
+
+    A record is left out with all others of its site: these tell what it does.
+    """
 
     def __init__(self, simulate: Simulate, measured: Sequence[Measured], start: Array) -> None:
         self.simulate, self.measured, self.start = simulate, tuple(measured), start
@@ -103,11 +106,16 @@ class Sites:
         self._fits: dict[tuple[int, ...], Array] = {}
 
     def without(self, *left: int) -> Array:
-        """Forces of all sites, one flat vector each, from the fit without some."""
-        key = tuple(sorted(left))
+        """Parameters (p,) of the fit without the sites of some records."""
+        key = self._of_sites(left)
         if key not in self._fits:
-            self._fits[key] = self._fit([i for i in range(len(self.measured)) if i not in left])
+            self._fits[key] = self._fit([i for i in range(len(self.measured)) if i not in key])
         return self._fits[key]
+
+    def _of_sites(self, some: Sequence[int]) -> tuple[int, ...]:
+        """All records of the sites of some."""
+        sites = {self.measured[i].where for i in some}
+        return tuple(i for i, one in enumerate(self.measured) if one.where in sites)
 
     def _fit(self, chosen: Sequence[int]) -> Array:
         z = np.zeros(len(self.start))
@@ -125,7 +133,7 @@ class Sites:
         return self.start * np.exp(z)
 
     def _rows(self, i: int, response: SiteResponse, parameters: Array) -> tuple[Array, Array]:
-        weight = 1 / (_ASSUMED * self.peaks[i] * np.sqrt(response.force_N.size))
+        weight = np.sqrt(self.measured[i].weight / response.force_N.size) / (_ASSUMED * self.peaks[i])
         difference = response.force_N - self.measured[i].force_N
         # A record that is many times too strong must not drown the others (Huber's weight).
         size = float(np.sqrt(np.mean(difference**2))) / self.peaks[i]
@@ -151,6 +159,7 @@ class Sites:
 
     def expected(self, *left: int) -> float:
         """Root mean square of the errors with which sites are predicted without themselves and ``left``."""
-        rest = [j for j in range(len(self.measured)) if j not in left]
+        out = self._of_sites(left)
+        rest = [j for j in range(len(self.measured)) if j not in out]
         errors = [self.errors(self.without(*left, j))[j] for j in rest]
         return max(float(np.sqrt(np.mean(np.square(errors)))), _FLOOR)

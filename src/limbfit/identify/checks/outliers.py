@@ -76,14 +76,15 @@ def suspects(
 
     Fewer than four sites cannot tell who is wrong.
     """
-    if len(measured) < MIN_SITES:
+    number = _number_of_sites(measured)
+    if number < MIN_SITES:
         return (), ()
     sites = Sites(simulate, measured, start)
     singles = _left_out(sites)
     best = int(np.argmax([single.standardised for single in singles]))
     alone = singles[best].standardised if singles[best].error > ERROR else 0.0
     pair, together = _worst_pair(sites, singles)
-    if together > LARGE and together > 1.5 * alone and len(measured) > MIN_SITES:
+    if together > LARGE and together > 1.5 * alone and number > MIN_SITES:
         return tuple(singles), pair
     return tuple(singles), (best,) if alone > LARGE else ()
 
@@ -94,7 +95,7 @@ def _worst_pair(sites: Sites, singles: Sequence[LeftOut]) -> tuple[tuple[int, ..
     if max(everyone.max(), *(single.error for single in singles)) <= ERROR / 2:
         return (), 0.0
     found: tuple[tuple[int, ...], float] = ((), 0.0)
-    for i, j in combinations(sorted(_worst(sites, everyone)), 2):
+    for i, j in _pairs(sites.measured, _worst(sites, everyone)):
         errors = sites.errors(sites.without(i, j))[[i, j]]
         if errors.min() < ERROR:
             continue
@@ -163,8 +164,9 @@ def best_correction(
     if before.max() <= ERROR / 2:
         return None  # nothing to explain
     worst = sorted(_worst(as_is, before))
-    units = [converted(simulate, measured, start, i, unit, before) for i in worst for unit in FORCE_UNITS]
-    pairs = combinations(worst, 2)
+    forces = [i for i in worst if measured[i].unit == "N"]
+    units = [converted(simulate, measured, start, i, unit, before) for i in forces for unit in FORCE_UNITS]
+    pairs = _pairs(measured, worst)
     swaps = [exchanged(simulate, measured, start, pair, exchange, before) for pair in pairs]
     if exactly is not None:
         likely = sorted((s for s in swaps if s.gain > GAIN / 2), key=lambda s: -s.gain)[:_LOOKED_AT]
@@ -172,6 +174,24 @@ def best_correction(
         swaps = [exchanged(simulate, measured, start, pair, exactly, before) for pair in known]
     convincing = [found for found in (*units, *swaps) if found.convinces]
     return max(convincing, key=lambda found: found.gain, default=None)
+
+
+def _number_of_sites(measured: Sequence[Measured]) -> int:
+    return len({one.where for one in measured})
+
+
+def _pairs(measured: Sequence[Measured], some: Sequence[int]) -> list[tuple[int, int]]:
+    """Pairs of records that are of two sites and compare the same, force or depth."""
+    pairs = [(i, j, measured[i], measured[j]) for i, j in combinations(sorted(some), 2)]
+    return [(i, j) for i, j, one, two in pairs if one.where != two.where and one.unit == two.unit]
+
+
+def _exchanged(measured: Sequence[Measured], i: int, j: int) -> list[Measured]:
+    """Two records in each other's place."""
+    found = list(measured)
+    found[i] = replace(measured[j], site=measured[i].where)
+    found[j] = replace(measured[i], site=measured[j].where)
+    return found
 
 
 def _pair(found: Correction) -> tuple[int, int]:
@@ -216,7 +236,7 @@ def find_outliers(
     exchange : from the expansion of all sites to the exchange of two, approximately (``as_driven``).
     exactly : the same by simulation.
     """
-    if len(measured) < MIN_SITES:
+    if _number_of_sites(measured) < MIN_SITES:
         return Findings((), ())
     first = FirstOrder(start, simulate(start))
     named = leave_one_out(first, measured, start)
@@ -244,10 +264,10 @@ def _flags(
         else:
             i, j = found.sites
             respond = _renamed(respond, start, (i, j), exactly or exchange)
-            corrected[i], corrected[j] = corrected[j], corrected[i]
+            corrected = _exchanged(corrected, i, j)
         flags.append(flag_of_correction(found, [site.name for site in measured]))
     singles, odd = suspects(respond, corrected, start)
-    flags += [flag_of(singles[i]) for i in odd if not _named(flags, measured[i].name)]
+    flags += [flag_of(singles[i], measured[i].unit) for i in odd if not _named(flags, measured[i].name)]
     return tuple(flags)
 
 
@@ -286,9 +306,7 @@ def exchanged(
     before: Array,
 ) -> Correction:
     """The fit to all sites with the records of two exchanged; ``before`` are the errors without."""
-    i, j = pair
-    renamed = list(measured)
-    renamed[i], renamed[j] = measured[j], measured[i]
+    renamed = _exchanged(measured, *pair)
     sites = Sites(_renamed(simulate, start, pair, exchange), renamed, start)
     return _correction("swap", pair, "swapped site names", before, sites)
 
@@ -310,8 +328,11 @@ def _correction(
     )
 
 
-def flag_of(found: LeftOut) -> Flag:
-    """The flag of a site that does not belong, with the unit that its force ratio is near."""
+def flag_of(found: LeftOut, of: str = "N") -> Flag:
+    """The flag of a site that does not belong, with the unit that its force ratio is near.
+
+    ``of`` is the unit of what is compared: a depth of another unit was seen before.
+    """
     numbers = {
         "prediction_error_percent": 100 * found.error,
         "expected_error_percent": 100 * found.expected,
@@ -323,7 +344,7 @@ def flag_of(found: LeftOut) -> Flag:
         f"predicted from the other sites it is off by {100 * found.error:.0f} % of its peak, "
         f"{found.standardised:.1f} times what other sites are (measured {found.ratio:.2f} times predicted)"
     )
-    unit = unit_of(found.ratio)
+    unit = unit_of(found.ratio) if of == "N" else ""
     if unit:
         return Flag((found.site,), "unit", what, numbers, unit, "convert the force to N")
     cause = "another place, axis, limb or name, or tissue that differs there"

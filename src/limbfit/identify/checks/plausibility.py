@@ -96,12 +96,13 @@ def explained(found: Sequence[Flag], in_records: Sequence[Flag]) -> list[Flag]:
 
 @dataclass(frozen=True)
 class RecordFacts:
-    """A site and its record in numbers; what is not known (yet) is None.
+    """A record and its site in numbers; what is not known (yet) is None.
 
-    ``position_mm`` (LPS) is its place on the skin, ``step_s`` the time between samples, ``radius_mm`` that of
-    a circle of the punch's area, ``thickness_mm`` the soft tissue under the indenter along its axis,
-    ``axis_deg`` the angle between that axis and the skin's inward normal, ``hint_mm`` how far its marker is
-    from where the site was said to be.
+    ``site`` is the record's name, ``place`` the site's where it has several. ``position_mm`` (LPS) is where
+    that is on the skin, ``step_s`` the time between samples, ``radius_mm`` that of a circle of the punch's
+    area, ``thickness_mm`` the soft tissue under the indenter along its axis, ``axis_deg`` the angle between
+    that axis and the skin's inward normal, ``hint_mm`` how far its marker is from where the site was said to
+    be.
     """
 
     site: str
@@ -115,6 +116,12 @@ class RecordFacts:
     off_skin_mm: float | None = None
     hint_mm: float | None = None
     position_mm: tuple[float, float, float] | None = None
+    place: str = ""
+
+    @property
+    def where(self) -> str:
+        """What records of one site have in common."""
+        return self.place or self.site
 
     @property
     def modulus_kPa(self) -> float:
@@ -137,27 +144,31 @@ def implausible(facts: Sequence[RecordFacts]) -> tuple[Flag, ...]:
 
 
 def _places(facts: Sequence[RecordFacts]) -> list[Flag]:
-    flags = []
+    flags: list[Flag] = []
+    told: set[str] = set()  # of a site once, however many records it has
     for f in facts:
-        if f.axis_deg is not None and f.axis_deg > AXIS_DEG:
-            outward = f.axis_deg > 90
-            what = f"the axis is {f.axis_deg:.0f} degrees from the inward normal of the skin"
-            cause = "an axis that points out of the limb" if outward else "an axis of another site or frame"
-            remedy = "negate it" if outward else "check it, or leave axis out to take the skin's normal"
-            flags.append(Flag((f.site,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy))
-        if f.off_skin_mm is not None and f.off_skin_mm > OFF_SKIN_MM:
-            what = f"the stated position is {f.off_skin_mm:.1f} mm off the skin"
-            cause, remedy = "a wrong position or coordinate system", "give LPS millimetres on the skin"
-            flags.append(Flag((f.site,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy))
-        if f.hint_mm is not None and f.hint_mm > HINT_MM:
-            what = f"its marker lies {f.hint_mm:.1f} mm from where the study says the site is"
-            cause, remedy = "another site's marker", "check 'near' of this site and its neighbours"
-            flags.append(Flag((f.site,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy))
         share = f.depth_mm / f.thickness_mm if f.thickness_mm else 0.0
         if share > DEPTH_SHARE:
             what = f"it goes {f.depth_mm:.1f} mm deep where the soft tissue is {f.thickness_mm:.1f} mm thick"
             cause = "another place, another limb, or a wrong unit of displacement"
             flags.append(Flag((f.site,), "depth", what, {"depth_share": share}, cause, "check the record"))
+        if f.where in told:
+            continue
+        told.add(f.where)
+        if f.axis_deg is not None and f.axis_deg > AXIS_DEG:
+            outward = f.axis_deg > 90
+            what = f"the axis is {f.axis_deg:.0f} degrees from the inward normal of the skin"
+            cause = "an axis that points out of the limb" if outward else "an axis of another site or frame"
+            remedy = "negate it" if outward else "check it, or leave axis out to take the skin's normal"
+            flags.append(Flag((f.where,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy))
+        if f.off_skin_mm is not None and f.off_skin_mm > OFF_SKIN_MM:
+            what = f"the stated position is {f.off_skin_mm:.1f} mm off the skin"
+            cause, remedy = "a wrong position or coordinate system", "give LPS millimetres on the skin"
+            flags.append(Flag((f.where,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy))
+        if f.hint_mm is not None and f.hint_mm > HINT_MM:
+            what = f"its marker lies {f.hint_mm:.1f} mm from where the study says the site is"
+            cause, remedy = "another site's marker", "check 'near' of this site and its neighbours"
+            flags.append(Flag((f.where,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy))
     return flags
 
 
@@ -165,7 +176,7 @@ def _shared_places(facts: Sequence[RecordFacts]) -> list[Flag]:
     """Sites at one place whose records differ by more than repeats do."""
     flags = []
     for one, two in combinations(facts, 2):
-        if one.position_mm is None or two.position_mm is None:
+        if one.position_mm is None or two.position_mm is None or one.where == two.where:
             continue
         apart = float(np.linalg.norm(np.subtract(one.position_mm, two.position_mm)))
         ratio = one.modulus_kPa / two.modulus_kPa

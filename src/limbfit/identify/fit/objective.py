@@ -24,15 +24,26 @@ _EXACT = 1e-4  # of the largest force: where all residuals vanish, equation 8 sq
 
 @dataclass(frozen=True)
 class Measured:
-    """The record of a site at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost."""
+    """A record at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost.
+
+    ``site`` is where it is from, the same for all records of a site; by default its own. Under a stated
+    force the depth is compared: ``force_N`` is that, and ``unit`` mm.
+    """
 
     name: str
     force_N: Array
     weight: float = 1.0
+    site: str = ""
+    unit: str = "N"
 
     def __post_init__(self) -> None:
         if self.force_N.size < 2 or not np.all(np.isfinite(self.force_N)) or self.force_N.max() <= 0:
             raise TraceError("no measured force to compare with", place=self.name)
+
+    @property
+    def where(self) -> str:
+        """What records of one site have in common."""
+        return self.site or self.name
 
     @property
     def scale(self) -> float:

@@ -59,7 +59,7 @@ class Known:
     """
 
     covariance_log: Array
-    sites: dict[str, dict[str, float]]
+    sites: dict[str, dict[str, Any]]
     misfit_elsewhere: float
     known_scale: float
 
@@ -74,19 +74,27 @@ class Known:
             float(residuals["known_scale"]),
         )
 
-    def residual(self, site: str) -> tuple[float, float]:
-        """Noise (N) and misfit (over the largest force) of a site; of a typical one where not fitted."""
+    def residual(self, site: str, unit: str = "N") -> tuple[float, float]:
+        """Noise (N) and misfit (over the largest force) of a site; of a typical one where not fitted.
+
+        Where no fitted record compares what this one does (``unit``: forces, or depths in mm), its noise is
+        not known, and none.
+        """
         if site in self.sites:
             return self.sites[site]["compared_noise_sd_N"], self.sites[site]["misfit_share"]
-        noise = [found["compared_noise_sd_N"] for found in self.sites.values()]
-        return float(np.median(noise)), self.misfit_elsewhere
+        alike = [found for found in self.sites.values() if found.get("unit", "N") == unit]
+        noise = [found["compared_noise_sd_N"] for found in alike]
+        return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
-    def half_width_95(self, jacobian: Array, parameters: Array, peak_N: float, site: str) -> Array:
+    def half_width_95(
+        self, jacobian: Array, parameters: Array, peak_N: float, site: str, unit: str = "N"
+    ) -> Array:
         """Half the 95 % interval (n,) N of a new record at a site: parameters, misfit of the model, noise.
 
-        As few residuals as the misfit is known from widen it (Student; Satterthwaite's freedom).
+        In mm for one that compares depths (``unit``). As few residuals as the misfit is known from widen it
+        (Student; Satterthwaite's freedom).
         """
-        noise_N, misfit = self.residual(site)
+        noise_N, misfit = self.residual(site, unit)
         misfit_N = misfit * peak_N
         sd = prediction_sd(jacobian, parameters, self.covariance_log, float(np.hypot(noise_N, misfit_N)))
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2

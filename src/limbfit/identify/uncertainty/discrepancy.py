@@ -56,10 +56,11 @@ class ResidualModel:
         return float(np.sqrt(np.mean(self.misfit**2)))
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like values; forces in N, misfits over the largest force."""
+        """JSON-like values; forces in N (depths of a record under force in mm), misfits over the largest."""
         return {
             "sites": {
                 noise.name: {
+                    "unit": noise.unit,
                     "noise_sd_N": noise.sd_N,
                     "noise_autocorrelation": noise.autocorrelation,
                     "touch_down_sd_mm": noise.touch_down_mm,

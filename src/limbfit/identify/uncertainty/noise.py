@@ -26,6 +26,7 @@ class SiteNoise:
 
     ``covariance`` (n, n) N^2; ``sd_N`` and ``autocorrelation`` of neighbours are those of the samples as
     recorded; ``touch_down_mm`` is the standard deviation of the touch-down that is part of the covariance.
+    ``unit`` is mm, and all of it, where depths are compared.
     """
 
     name: str
@@ -34,6 +35,7 @@ class SiteNoise:
     sd_N: float
     autocorrelation: float
     touch_down_mm: float = 0.0
+    unit: str = "N"
 
 
 def record_noise(
@@ -41,7 +43,7 @@ def record_noise(
     times_s: Array,
     residual_N: Array,
     force_N: Array,
-    displacement_mm: Array,
+    displacement_mm: Array | None,
     touch_down_sd_mm: float = 0.0,
     smoothing: Array | None = None,
 ) -> SiteNoise:
@@ -49,7 +51,8 @@ def record_noise(
 
     Parameters
     ----------
-    times_s, force_N, displacement_mm : the compared curve (n,).
+    times_s, force_N, displacement_mm : the compared curve (n,); no displacement where that is what is
+        compared, in place of the force: a wrong touch-down is then off by the same everywhere.
     touch_down_sd_mm : a depth counted from elsewhere moves the whole curve along its own slope.
     smoothing : (n, n) of the curve, which that slope passes too; by default none.
     """
@@ -57,12 +60,15 @@ def record_noise(
     sd = float(residual.std())
     lag = lag_one(residual)
     samples = _samples_of_points(times_s, residual.size)
-    slope = touch_down_sd_mm * depth_slope(times_s, displacement_mm, force_N)
+    slope = touch_down_sd_mm * (
+        np.ones(len(times_s)) if displacement_mm is None else depth_slope(times_s, displacement_mm, force_N)
+    )
     slope = slope if smoothing is None else smoothing @ slope
     floor = (_LEAST_SHARE * force_N.max()) ** 2
     covariance = block_covariance(sd, lag, samples) + np.outer(slope, slope)
     covariance += floor * np.eye(len(times_s))
-    return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm)
+    unit = "mm" if displacement_mm is None else "N"
+    return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm, unit)
 
 
 def curve_noise(name: str, times_s: Array, residual_N: Array, force_N: Array) -> SiteNoise:

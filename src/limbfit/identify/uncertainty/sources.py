@@ -44,7 +44,15 @@ class Gain:
         """Change (p,) of the logarithms where the force rises by ``changes`` (n,) at all sites at once."""
         return np.sum([G @ change for G, change in zip(self.matrices, changes, strict=True)], axis=0)
 
-    def covariance(self, changes: Sequence[Array], shared: bool) -> Array:
-        """Covariance (p, p) of one deviation of ``changes``: the same at all sites, or each site's own."""
-        parts = [self.shift(changes)] if shared else [G @ c for G, c in zip(self.matrices, changes)]
+    def covariance(self, changes: Sequence[Array], shared: bool, sites: Sequence[str] = ()) -> Array:
+        """Covariance (p, p) of one deviation of ``changes``: the same at all sites, or each site's own.
+
+        ``sites`` names the site of each change, where several are of one; by default each is another.
+        """
+        if shared:
+            parts = [self.shift(changes)]
+        else:
+            moved = [G @ c for G, c in zip(self.matrices, changes)]
+            of = list(sites) or [str(i) for i in range(len(moved))]
+            parts = [np.sum([m for m, s in zip(moved, of) if s == one], axis=0) for one in dict.fromkeys(of)]
         return np.sum([np.outer(part, part) for part in parts], axis=0)

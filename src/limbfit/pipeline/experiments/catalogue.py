@@ -43,6 +43,7 @@ class Experiment(Stage):
 
 
 _SIMULATED = ("sites", "traces", "mesh", "calibrate")
+_INDENTERS, _RECORD = ("indenter", "indenters"), ("site", "name", "indenter")
 
 
 def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) -> Experiment:
@@ -50,8 +51,9 @@ def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) 
         f"sensitivity-{name}",
         run,
         needs=_SIMULATED,
-        tables=("material", "solver", "indenter"),
-        site_keys=("name", "region", "edge", "depth_mm", "speed_mm_s"),
+        tables=("material", "solver", *_INDENTERS),
+        site_keys=("name", "region", "edge", "depth_mm", "speed_mm_s", "indenter"),
+        record_keys=_RECORD,
         options={"sites": [], **options},
     )
 
@@ -68,8 +70,9 @@ _OWN: tuple[Experiment, ...] = (
         "regions",
         run_regions,
         needs=_SIMULATED,
-        tables=("material", "calibration", "solver", "indenter"),
-        site_keys=("name", "region", "fitted", "weight", "edge"),
+        tables=("material", "calibration", "solver", *_INDENTERS),
+        site_keys=("name", "region", "fitted", "weight", "edge", "indenter"),
+        record_keys=_RECORD,
         options={"sites": "all"},
     ),
     _sensitivity("c", run_stiffness),
@@ -81,23 +84,26 @@ _OWN: tuple[Experiment, ...] = (
         "uncertainty",
         run_uncertainty,
         needs=(*_SIMULATED, "predict"),
-        tables=("material", "calibration", "solver", "indenter", "uncertainty"),
-        site_keys=("name", "fitted", "weight", "edge"),
+        tables=("material", "calibration", "solver", *_INDENTERS, "uncertainty"),
+        site_keys=("name", "fitted", "weight", "edge", "indenter"),
+        record_keys=_RECORD,
     ),
     Experiment(
         "crossvalidate",
         run_crossvalidate,
         needs=_SIMULATED,
-        tables=("material", "calibration", "solver", "indenter"),
-        site_keys=("name", "region", "fitted", "weight", "edge"),
+        tables=("material", "calibration", "solver", *_INDENTERS),
+        site_keys=("name", "region", "fitted", "weight", "edge", "indenter"),
+        record_keys=_RECORD,
         options={"fit": 0, "choices": 200, "seed": 0, "runs": 12},
     ),
     Experiment(
         "design",
         run_design,
         needs=("sites", "traces", "mesh"),
-        tables=("material", "solver", "indenter"),
-        site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s"),
+        tables=("material", "solver", *_INDENTERS),
+        site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter"),
+        record_keys=_RECORD,
         options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
     ),
     Experiment(

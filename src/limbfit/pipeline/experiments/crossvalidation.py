@@ -7,7 +7,8 @@ from those too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import comb
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,11 @@ from ...errors import StudyError
 from ...identify.checks.crossvalidation import (
     Choice,
     Fold,
+    by_site,
     choices_of,
     cross_validate,
     errors_by_site,
-    fit_sites,
+    expanded,
     standing,
     without_regions,
 )
@@ -48,13 +50,13 @@ _MARGIN = 0.02  # of the emulator's box, in the logarithm, that fits may go beyo
 def run_crossvalidate(
     context: Context, folder: Path, *, fit: int, choices: int, seed: int, runs: int
 ) -> dict[str, Any]:
-    """Held-out errors over choices of ``fit`` sites (0: as many as the study fits).
+    """Held-out errors over choices of ``fit`` sites, with all their records (0: as many as the study fits).
 
     At most ``choices`` of them are drawn with ``seed``; ``runs`` more simulations of all sites make the
     emulator.
     """
     study = context.study
-    recorded = [site for site in study.sites if site.trace is not None]
+    recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
     if not 0 < size < len(recorded):
         raise StudyError(
@@ -63,7 +65,9 @@ def run_crossvalidate(
             place="sites",
             remedy="record more sites, or fit fewer (--fit)",
         )
-    laboratory = Laboratory(context, experiment_cache(context, folder), recorded, "crossvalidate")
+    laboratory = Laboratory(
+        context, experiment_cache(context, folder), study.records_at(*recorded), "crossvalidate"
+    )
     bench = _Bench(context, laboratory, seed, runs)
     own_choice = tuple(i for i, site in enumerate(recorded) if site.fitted)
     chosen = choices_of(len(recorded), size, choices, seed)
@@ -101,6 +105,10 @@ class _Bench:
         self.best = study.vector(stored["stages"][-1]["parameters"])
         self.bounds = unknowns(study).from_start(self.best)
         self.measured = laboratory.measured
+        of_site: dict[str, list[int]] = {}
+        for i, one in enumerate(self.measured):
+            of_site.setdefault(one.where, []).append(i)
+        self.sites, self.groups = tuple(of_site), tuple(map(tuple, of_site.values()))
         covariance = np.array(stored["uncertainty"]["covariance_log"])
         # Where nothing is known, fits go anywhere; the emulator must not.
         drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
@@ -139,28 +147,36 @@ class _Bench:
         def tell(done: int, total: int) -> None:
             self.context.tell("crossvalidate", done, total, f"{done} of {total} choices fitted")
 
-        return _Found(
-            fit_sites(*given, own, settings),
-            cross_validate(*given, chosen, settings, tell),
-            cross_validate(*given, regions, settings),
-        )
+        def fitted(
+            choices: dict[str, Choice], told: Callable[[int, int], None] = lambda done, total: None
+        ) -> tuple[Fold, ...]:
+            records = {label: expanded(choice, self.groups) for label, choice in choices.items()}
+            folds = cross_validate(*given, records, settings, told)
+            pairs = zip(folds, choices.values(), strict=True)
+            return tuple(by_site(fold, choice, self.groups) for fold, choice in pairs)
+
+        (alone,) = fitted({"": own})
+        numbered = fitted({str(i): choice for i, choice in enumerate(chosen)}, tell)
+        return _Found(alone, tuple(replace(fold, label="") for fold in numbered), fitted(regions))
 
     def check(self, folds: Sequence[Fold], number: int) -> list[dict[str, Any]]:
         """The solver's errors at the optima of some fits beside the emulator's, which then learns them."""
-        names = [site.name for site in self.measured]
         emulated = [self.emulator(fold.parameters) for fold in folds]
         runs = self.learn([fold.parameters for fold in folds])
         rows = []
         for fold, cheap, run in zip(folds, emulated, runs):
             if _failed(run):
                 continue
-            held = fold.heldout
-            solved = [error_percent(run[i].force_N, self.measured[i].force_N) for i in held]
+            held = [self.groups[site] for site in fold.heldout]
+            solved = [
+                np.mean([error_percent(run[i].force_N, self.measured[i].force_N) for i in of_site])
+                for of_site in held
+            ]
             away = [error_percent(cheap[i].force_N, run[i].force_N) for i in range(len(run))]
             rows.append(
                 {
                     "round": number,
-                    "fitted": [names[i] for i in fold.fitted],
+                    "fitted": [self.sites[i] for i in fold.fitted],
                     "heldout_emulated_percent": fold.mean_heldout,
                     "heldout_solved_percent": float(np.mean(solved)),
                     "emulator_error_percent": float(np.mean(away)),
@@ -179,7 +195,7 @@ def _content(
     context: Context, bench: _Bench, found: _Found, size: int, possible: int, checks: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """What ``crossvalidate.json`` holds."""
-    names, sites = bench.bounds.names, [site.name for site in bench.measured]
+    names, sites = bench.bounds.names, bench.sites
     regions = {site.name: site.region for site in context.study.sites}
     place = standing(found.own, found.folds)
     by_site = errors_by_site(found.folds, len(sites))

@@ -19,7 +19,7 @@ from ...identify.fit.objective import SiteResponse
 from ...indentation import Parameters, SimulationJob, SiteModel
 from ...study import Study
 from ..shared.context import Context
-from ..shared.simulations import CURVE_POINTS, experiment_cache, planned_model, recorded_model
+from ..shared.simulations import CURVE_POINTS, experiment_cache, model_of
 from ..shared.store import write_json
 from ..shared.tabular import write_table
 from ..stages.laboratory import unknowns
@@ -43,6 +43,15 @@ def run_design(
     study = context.study
     if not 0 < sites <= len(study.sites):
         raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
+    for site in study.sites:
+        records = study.records_at(site)
+        if len(records) > 1 or any(record.forced for record in records):
+            raise InputError(
+                "of each site one indentation is chosen, under a stated displacement, and this has others",
+                file=study.file,
+                place=f"sites.{site.name}",
+                remedy="leave one of that kind in a study for the design",
+            )
     vector = study.vector(parameters)
     models, left_out = _candidate_models(context, depths_mm)
     cache = experiment_cache(context, folder)
@@ -56,7 +65,7 @@ def run_design(
             left_out.append(f"site {model.name} at {depth:.1f} mm: {simulation.reason}")
             continue
         response = SiteResponse(simulation.force_N, simulation.jacobian)
-        found.append((candidate(model.name, depth, response, vector, model_noise), simulation.force_N.max()))
+        found.append((candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max()))
     content = _content(context, found, sites, vector, left_out)
     content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
     write_json(folder / "design.json", content)
@@ -68,15 +77,15 @@ def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[lis
     """Each site as recorded or planned, or at each depth that its tissue allows; and what was left out."""
     study, models, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"]) if depths_mm else None
-    for site in study.sites:
-        own = planned_model(context, site) if site.trace is None else recorded_model(context, site)
+    for one in study.indentations:
+        own = model_of(context, one)
         if anatomy is None:
             models.append(own)
             continue
-        thickness = tissue_under(anatomy, own.position, own.axis, study.indenter.width_mm)
+        thickness = tissue_under(anatomy, own.position, own.axis, own.indenter.width_mm)
         for depth in depths_mm:
             if depth > DEEPEST_SHARE * thickness:
-                left_out.append(f"site {site.name} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
+                left_out.append(f"site {own.site} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
             else:
                 models.append(_at_depth(own, depth))
     if not models:

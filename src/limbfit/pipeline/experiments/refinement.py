@@ -37,7 +37,7 @@ def run_refinement(
             replace(one.model, mesh=file, mesh_digest=file_digest(file)),
             parameters,
             f"edge x {factor:g}",
-            facts[one.site.name, factor],
+            facts[one.name, factor],
             base=factor == 1.0,
         )
         for one in chosen
@@ -67,7 +67,7 @@ def _meshes(
     settings = mesh_settings(study)
     pairs = [(one, factor) for one in chosen for factor in factors]
     jobs = {
-        (one.site.name, factor): mesh_job(
+        (one.name, factor): mesh_job(
             context,
             one.site.name,
             one.model.position,
@@ -82,14 +82,14 @@ def _meshes(
         for one, factor in pairs
         if factor != 1.0
     }
-    missing = [job for job in jobs.values() if not job.file.with_suffix(".json").is_file()]
+    missing = [job for job in dict.fromkeys(jobs.values()) if not job.file.with_suffix(".json").is_file()]
     for i, made in enumerate(context.executor.map(make_mesh, missing)):
         context.tell("sensitivity-mesh", i + 1, len(missing), f"mesh of {made['nodes']} nodes")
     found = {}
     for one, factor in pairs:
-        job = jobs.get((one.site.name, factor))
+        job = jobs.get((one.name, factor))
         known = stored[one.site.name] if job is None else read_json(job.file.with_suffix(".json"))
-        found[one.site.name, factor] = {
+        found[one.name, factor] = {
             "factor": factor,
             "edge_near_mm": factor * settings.edge_near_mm,
             "element": settings.element,

@@ -37,7 +37,10 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     stages = context.stored("calibrate", "calibration.json")["stages"]
     whole = study.vector(stages[-1]["parameters"])
     cache = experiment_cache(context, folder)
-    benches = {name: Laboratory(context, cache, fitted, "regions") for name, (fitted, _) in members.items()}
+    benches = {
+        name: Laboratory(context, cache, study.records_at(*fitted), "regions")
+        for name, (fitted, _) in members.items()
+    }
     made = {name: _region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
     found = fit_regions(made, unknowns(study), whole)
     rows = [_row(context, name, benches[name], members[name], fit, folder) for name, fit in found.items()]
@@ -63,7 +66,7 @@ def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[S
     if sites not in CHOICES:
         raise InputError(f"{sites!r} is no choice of sites", place="sites", remedy="use all or fitted")
     study = context.study
-    recorded = [site for site in study.sites if site.trace is not None]
+    recorded = [site for site in study.sites if study.records_at(site)]
     names = list(dict.fromkeys(site.region for site in recorded if site.region))
     if not names:
         raise StudyError(
@@ -83,7 +86,7 @@ def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[S
 
 def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
     """What no region's model is judged on, in words."""
-    recorded = [site for site in context.study.sites if site.trace is not None]
+    recorded = [site for site in context.study.sites if context.study.records_at(site)]
     without = [site.name for site in recorded if not site.region]
     regions = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
     words = [f"region {name}: none of its sites is fitted" for name in regions]
@@ -91,7 +94,7 @@ def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
 
 
 def _region(context: Context, cache: SimulationCache, laboratory: Laboratory, mine: Sequence[Site]) -> Region:
-    records = [site_record(context, site) for site in mine]
+    records = [site_record(context, record) for record in context.study.records_at(*mine)]
     stage = groupings(context.study)[-1:]
 
     def identify(start: Unknowns) -> Calibration:

@@ -80,12 +80,12 @@ def _stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> li
 
 
 def _derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
-    """At every recorded site: change of the largest force in percent for one percent more of a modulus.
+    """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
 
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
-    own = [site_record(context, site) for site in study.sites if site.trace is not None]
+    own = [site_record(context, record) for record in study.recorded if not record.forced]
     records, best = as_searched(context, own), study.vector(identified)
     cache = experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []
@@ -98,7 +98,7 @@ def _derivatives(context: Context, folder: Path, identified: Parameters) -> list
         relative = found.jacobian[peak] * best / found.force_N[peak]
         rows.append(
             {
-                "site": record.site.name,
+                "site": record.name,
                 "region": record.site.region,
                 "tissue_mm": tissue_over_bone(record.model),
                 "completed": found.completed,
@@ -138,8 +138,7 @@ def run_kappa(
 
 def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
     """Force where the skin slips freely under the indenter, and where it sticks to it."""
-    identified, own = identified_parameters(context), context.study.indenter.friction
-    chosen = choose_sites(context, sites)
+    identified, chosen = identified_parameters(context), choose_sites(context, sites)
     variants = [
         Variant(
             one,
@@ -147,20 +146,23 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict
             identified,
             friction if isinstance(friction, str) else f"coefficient {friction:g}",
             {"friction": friction},
-            base=friction == own,
+            base=friction == one.model.indenter.friction,
         )
         for one in chosen
-        for friction in dict.fromkeys((own, "frictionless", "sticky"))
+        for friction in dict.fromkeys((one.model.indenter.friction, "frictionless", "sticky"))
     ]
     content = _run(context, folder, "sensitivity-contact", chosen, variants)
-    store_runs(folder, "sensitivity-contact", content | {"parameters": identified, "friction": own})
+    store_runs(
+        folder,
+        "sensitivity-contact",
+        content | {"parameters": identified, "friction": chosen[0].model.indenter.friction},
+    )
     return {}
 
 
 def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
-    """Force and effort with the study's indenter, and with others of its width: a sphere before all."""
-    identified, own = identified_parameters(context), context.study.indenter
-    chosen = choose_sites(context, sites)
+    """Force and effort with the indenter as it is, and with others of its width: a sphere before all."""
+    identified, chosen = identified_parameters(context), choose_sites(context, sites)
     variants = [
         Variant(
             one,
@@ -171,20 +173,17 @@ def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dic
             base=base,
         )
         for one in chosen
-        for label, table, base in other_indenters(own, one.model.indenter)
+        for label, table, base in other_indenters(one.model.indenter)
     ]
     content = _run(context, folder, "sensitivity-indenter", chosen, variants)
     store_runs(folder, "sensitivity-indenter", content | {"parameters": identified})
     return {}
 
 
-def other_indenters(own: IndenterTable, placed: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
-    """(label, indenter, is the study's): its own, and those of its width that it is not.
-
-    ``placed`` is the study's with its file's whole path.
-    """
+def other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
+    """(label, indenter, is the study's): its own, and those of its width that it is not."""
     width = own.width_mm
-    found = [(f"{own.shape} of the study", placed, True)]
+    found = [(f"{own.shape} of the study", own, True)]
     for shape in dict.fromkeys((*OWN, SHAPES[own.shape])):
         for label, rounding in shape.variants.items():
             table = IndenterTable(

@@ -44,7 +44,8 @@ class FittedSites(Laboratory):
         earlier: Mapping[tuple[float, ...], Sequence[Array]],
     ) -> None:
         """``earlier``: parameters that the calibration simulated, and where it started them from."""
-        super().__init__(context, experiment_cache(context, folder), context.study.fitted, NAME)
+        records = context.study.records_at(*context.study.fitted)
+        super().__init__(context, experiment_cache(context, folder), records, NAME)
         self.best, self.earlier = best, earlier
         self.at_best = self.anchored(best)
 
@@ -133,7 +134,7 @@ def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evi
 def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
     """Every recorded site at the identified parameters, from what the stage ``predict`` has simulated."""
     study = context.study
-    records = [site_record(context, site) for site in study.sites if site.trace is not None]
+    records = [site_record(context, record) for record in study.recorded]
     searched = as_searched(context, records)
     answer = Answer.of(context.stored("calibrate", "calibration.json")["stages"][-1], study)
     jobs = answer_jobs(records, searched, answer)

@@ -55,7 +55,7 @@ class Found:
     def source_covariance(self) -> Array:
         """Of the logarithms (p, p), by all counted sources."""
         counted = [change for change in self.changes if change.variant.counted]
-        parts = [self.gain.covariance(c.force_N, c.variant.shared) for c in counted]
+        parts = [self.gain.covariance(c.force_N, c.variant.shared, c.variant.sites) for c in counted]
         return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
 
 
@@ -202,7 +202,7 @@ def _source(found: Found, change: Change) -> dict[str, Any]:
     if variant.shared:
         shift = found.gain.shift(change.force_N)
     else:
-        shift = np.sqrt(np.diag(found.gain.covariance(change.force_N, False)))
+        shift = np.sqrt(np.diag(found.gain.covariance(change.force_N, False, variant.sites)))
     return {
         "source": variant.source,
         "change": variant.change,
@@ -220,16 +220,20 @@ def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
     Of a site whose prediction failed there is the reason only.
     """
     model, record = found.known.residual_model, one.record
-    facts = {"site": record.site.name, "fitted": record.site.fitted, "reason": one.response.reason}
+    facts = {
+        "site": record.site.name,
+        "record": record.name,
+        "fitted": record.site.fitted,
+        "reason": one.response.reason,
+    }
     if one.noise is None:
         return facts | dict.fromkeys(("inside_percent", "half_width_percent", *_SHARES.values()))
     parameters = found.known.parameters
-    force, measured = one.response.force_N, record.force_N
+    force, measured = one.response.force_N, record.compared
+    what, unit = ("displacement" if record.record.forced else "force"), record.record.unit
     peak = float(force.max())
     names = [noise.name for noise in model.noise]
-    share = (
-        model.misfit[names.index(record.site.name)] if record.site.name in names else model.misfit_elsewhere
-    )
+    share = model.misfit[names.index(record.name)] if record.name in names else model.misfit_elsewhere
     scaled = one.response.jacobian * parameters
     variances = {
         "parameters": np.einsum("ni,ij,nj->n", scaled, found.explored.posterior.covariance, scaled),
@@ -243,12 +247,12 @@ def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
     half = stdtrit(freedom, 0.975) * np.sqrt(total)
     low, high = np.maximum(force - half, 0.0), force + half
     write_curves(
-        folder / "predictions" / f"{record.site.name}.csv",
+        folder / "predictions" / f"{record.name}.csv",
         time_s=record.times_s,
-        force_measured_N=measured,
-        force_predicted_N=force,
-        force_low_N=low,
-        force_high_N=high,
+        **{
+            f"{what}_{which}_{unit}": curve
+            for which, curve in (("measured", measured), ("predicted", force), ("low", low), ("high", high))
+        },
     )
     inside = (measured >= low) & (measured <= high)
     return facts | {
@@ -299,7 +303,10 @@ def _verdict(
     counted = [change for change in found.changes if change.variant.counted]
     if counted:
         largest = max(
-            counted, key=lambda c: float(np.trace(found.gain.covariance(c.force_N, c.variant.shared)))
+            counted,
+            key=lambda c: float(
+                np.trace(found.gain.covariance(c.force_N, c.variant.shared, c.variant.sites))
+            ),
         )
         words.append(
             f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
@@ -308,7 +315,7 @@ def _verdict(
     coverage = _coverage(rows)["coverage_heldout_percent"]
     if coverage is not None:
         words.append(f"{coverage:.0f} % of the held-out records lies inside the 95 % prediction intervals.")
-    words += [f"Site {row['site']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
+    words += [f"Site {row['record']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
     words += _of_profiles(found.explored)
     if not found.explored.good_enough:
         words.append("The emulator is not as good as the records: raise uncertainty.runs.")

@@ -52,6 +52,11 @@ class Variant:
     counted: bool
     scale: float = 1.0
 
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """The site of each job: what is a site's own is the same for all its records."""
+        return tuple(job.model.site for job in self.jobs)
+
 
 @dataclass(frozen=True)
 class Change:
@@ -97,15 +102,26 @@ def variants(
 def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[Variant]:
     """Edge radius, friction and bulk modulus; the last two are alternatives, no spreads."""
     radius = study.uncertainty.edge_radius_mm
-    indenter, found = study.indenter, []
-    if SHAPES[indenter.shape].is_edge_doubted and radius > 0:
-        rounded = [_with_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius) for m in models]
+    found = []
+    if radius > 0 and any(SHAPES[m.indenter.shape].is_edge_doubted for m in models):
+        rounded = [
+            _with_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius)
+            if SHAPES[m.indenter.shape].is_edge_doubted
+            else m
+            for m in models
+        ]
         found.append(vary("indenter edge", f"radius {radius:g} mm larger", rounded, True, True))
-    other = "sticky" if indenter.friction == "frictionless" else "frictionless"
-    found.append(vary("friction", other, [_with_indenter(m, friction=other) for m in models], True, False))
+    others = [_other_friction(m) for m in models]
+    word = " or ".join(dict.fromkeys(str(m.indenter.friction) for m in others))
+    found.append(vary("friction", word, others, True, False))
     softer = [replace(m, kappa_ratio=m.kappa_ratio / 2) for m in models]
     found.append(vary("bulk modulus", "half", softer, True, False))
     return found
+
+
+def _other_friction(model: SiteModel) -> SiteModel:
+    other = "sticky" if model.indenter.friction == "frictionless" else "frictionless"
+    return _with_indenter(model, friction=other)
 
 
 def _with_indenter(model: SiteModel, **changes: object) -> SiteModel:
@@ -132,7 +148,7 @@ def _moved(context: Context, model: SiteModel, number: int, distance_mm: float) 
     axis = np.array(model.axis)
     wanted = np.array(model.position) + distance_mm * _tangents(axis)[number]
     point, _ = project_to_skin(anatomy, wanted)
-    width = context.study.indenter.width_mm
+    width = context.study.width_at(context.study.site(model.site))
     turned = indenter_axis(anatomy.skin, point, width) - indenter_axis(anatomy.skin, model.position, width)
     axis = axis + turned
     axis /= np.linalg.norm(axis)
@@ -181,7 +197,7 @@ def _of_mesh(
     study = context.study
     settings = searched_settings(study)
     if study.mesh.coarse is not None:
-        own = [site_record(context, record.site).model for record in records]
+        own = [site_record(context, record.record).model for record in records]
         models = [replace(model, within_mm=study.within_mm) for model in own]
         jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     else:

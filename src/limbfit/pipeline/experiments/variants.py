@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
 from ...mesh import read_vtu
-from ...study import Site
+from ...study import Indentation, Record, Site
 from ..shared.context import Context
-from ..shared.simulations import CURVE_POINTS, SimulationCache, planned_model, recorded_model
+from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
 from ..stages.traces import write_curves
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ChosenSite:
-    """A site that variants are simulated at; ``depth_mm`` is the tissue between it and the nearest bone."""
+    """An indentation that is varied; ``tissue_mm`` is between its site and the nearest bone."""
 
     site: Site
     model: SiteModel
@@ -31,10 +31,15 @@ class ChosenSite:
     role: str
 
     @property
+    def name(self) -> str:
+        """That of the record, or of the site that plans it."""
+        return self.model.name
+
+    @property
     def facts(self) -> dict[str, Any]:
         """What is stored of it."""
         return {
-            "site": self.site.name,
+            "site": self.name,
             "region": self.site.region,
             "role": self.role,
             "tissue_mm": self.tissue_mm,
@@ -65,18 +70,25 @@ class Variant:
 
 
 def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
-    """The named sites; none named: where the tissue over the bone is thinnest and thickest.
+    """The named indentations; none named: one where the tissue over the bone is thinnest, one where thickest.
 
     Raises
     ------
     InputError
-        For a site that the study does not have.
+        For a site or record that the study does not have, and a site with several.
     """
     study = context.study
-    every = [_chosen(context, site) for site in study.sites]
+    chosen = [study.indentation(name) for name in names] or list(study.indentations)
+    driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
+    if not driven or (names and len(driven) < len(chosen)):
+        raise InputError(
+            'forces are compared, and a record with control = "force" has none of its own',
+            file=study.file,
+            remedy="name records under a stated displacement",
+        )
+    every = [_chosen(context, one) for one in driven]
     if names:
-        wanted = [study.site(name).name for name in names]
-        return [one for name in wanted for one in every if one.site.name == name]
+        return every
     thin, thick = min(every, key=_tissue), max(every, key=_tissue)
     if thin is thick:
         return [thin]
@@ -91,9 +103,9 @@ def _with_role(chosen: ChosenSite, role: str) -> ChosenSite:
     return ChosenSite(chosen.site, chosen.model, chosen.tissue_mm, role)
 
 
-def _chosen(context: Context, site: Site) -> ChosenSite:
-    model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
-    return ChosenSite(site, model, tissue_over_bone(model), "")
+def _chosen(context: Context, one: Indentation) -> ChosenSite:
+    model = model_of(context, one)
+    return ChosenSite(context.study.site(model.site), model, tissue_over_bone(model), "")
 
 
 def tissue_over_bone(model: SiteModel) -> float:
@@ -130,18 +142,18 @@ def compared(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> 
     They are None where a simulation is partial.
     """
     base = {
-        variant.chosen.site.name: simulation
+        variant.chosen.name: simulation
         for variant, simulation in zip(variants, simulations, strict=True)
         if variant.base
     }
     return [
         {
-            "site": variant.chosen.site.name,
+            "site": variant.chosen.name,
             "label": variant.label,
             "base": variant.base,
             **variant.facts,
             "peak_force_N": float(simulation.force_N.max()) if simulation.completed else None,
-            **_change(simulation, base[variant.chosen.site.name]),
+            **_change(simulation, base[variant.chosen.name]),
             "penetration_mm": simulation.penetration_mm,
             "steps": simulation.facts.get("steps"),
             "newton_iterations": simulation.facts.get("newton_iterations"),
@@ -166,8 +178,8 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
 
 def write_variants(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:
     """``<site>.csv``: time, displacement and the force of every variant that was completed."""
-    for name in dict.fromkeys(variant.chosen.site.name for variant in variants):
-        mine = [i for i, variant in enumerate(variants) if variant.chosen.site.name == name]
+    for name in dict.fromkeys(variant.chosen.name for variant in variants):
+        mine = [i for i, variant in enumerate(variants) if variant.chosen.name == name]
         first = variants[mine[0]]
         forces = {column(variants[i].label): simulations[i].force_N for i in mine if simulations[i].completed}
         write_curves(

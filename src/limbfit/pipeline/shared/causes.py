@@ -10,7 +10,7 @@ from typing import Any
 
 from ..._version import __version__
 from ...study import Study
-from .keys import Keys, Stage
+from .keys import Keys, Stage, records_read
 from .provenance import input_files
 from .sources import code_parts
 from .store import digest
@@ -25,6 +25,8 @@ def parts_of(stage: Stage, known: Keys, study: Study, keys: Mapping[str, str]) -
     settings = dict(_leaves({table: stated[table] for table in stage.tables}, ""))
     for site in stated["sites"]:
         settings |= dict(_leaves({key: site[key] for key in stage.site_keys}, f"sites.{site['name']}."))
+    for row, read in zip(stated["records"], records_read(stage, stated)):
+        settings |= dict(_leaves(read, f"records.{row['site']}-{row['name']}."))
     names = {path: key for key, path in study.inputs.items()}
     files = input_files(study).get(stage.name, [])
     return {

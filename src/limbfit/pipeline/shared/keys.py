@@ -17,13 +17,23 @@ from .store import digest, file_digest
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage: what it stands on and the study tables it reads; its code is that of `sources.sources_of`."""
+    """A stage: what it stands on, which tables it reads, and which keys of ``[[sites]]`` and ``[[records]]``.
+
+    Its code is that of `sources.sources_of`.
+    """
 
     name: str
     run: Callable[..., dict[str, Any]]
     needs: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     site_keys: tuple[str, ...] = ()
+    record_keys: tuple[str, ...] = ()
+
+
+def records_read(stage: Stage, stated: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What a stage reads of ``[[records]]``, one after the other; nothing where there are none."""
+    rows = stated["records"] if stage.record_keys else []
+    return [{key: row[key] for key in stage.record_keys} for row in rows]
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,7 @@ class Keys:
                 stage.name,
                 {table: stated[table] for table in stage.tables},
                 [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
+                *records_read(stage, stated),
                 None if read is None else {str(path): self.digests[path] for path in read},
                 code_digest(stage.run),
                 *([self.extensions] if self.extensions else []),

@@ -68,11 +68,12 @@ def input_files(study: Study) -> dict[str, list[Path]]:
         files["segment"] += [names] if study.path(names).is_file() else []
     if study.surfaces is not None:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
-    if study.indenter.file is not None:
-        files["calibrate"] = [study.indenter.file]
+    files_of_indenters = [one.file for one in study.all_indenters.values() if one.file is not None]
+    if files_of_indenters:
+        files["calibrate"] = files_of_indenters
     if study.socket.file is not None:
         files["socket"] = [study.socket.file]
-    files["traces"] += [site.trace for site in study.sites if site.trace is not None]
+    files["traces"] += [record.trace for record in study.recorded]
     return files
 
 

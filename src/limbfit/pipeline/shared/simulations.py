@@ -14,7 +14,7 @@ from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
 from ...indentation import Simulation, SimulationJob, SiteModel, simulate
-from ...study import Site, Study
+from ...study import Indentation, Record, Site, Study
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
@@ -133,26 +133,34 @@ def job_digest(job: SimulationJob) -> str:
 
 
 def site_model(
-    context: Context, site: Site, knots_s: Sequence[float], knots_mm: Sequence[float], searched: bool = False
+    context: Context,
+    one: Indentation,
+    knots_s: Sequence[float],
+    knots_mm: Sequence[float],
+    searched: bool = False,
+    knots_N: Sequence[float] = (),
 ) -> SiteModel:
-    """The stored mesh and place of a site with a displacement history.
+    """The stored mesh and place of an indentation's site with a history of displacement, or of force.
 
     ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
     than ``calibration.search_radius_mm``.
     """
     study: Study = context.study
+    site = one.site if isinstance(one, Record) else one
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
     folder = COARSE if searched and study.mesh.coarse is not None else ""
     mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
-    indenter = study.indenter_here
+    indenter = study.indenter_of(one)
     return SiteModel(
-        name=site.name,
+        name=one.name,
+        site=site.name,
         mesh=mesh,
         mesh_digest=file_digest(mesh),
         position=tuple(placed["position_mm"]),
         axis=tuple(placed["axis"]),
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
+        knots_N=tuple(knots_N),
         edge=site.edge,
         indenter=indenter,
         indenter_digest="" if indenter.file is None else file_digest(indenter.file),
@@ -166,10 +174,11 @@ def site_model(
     )
 
 
-def recorded_model(context: Context, site: Site, searched: bool = False) -> SiteModel:
-    """The site driven by its record, from touch-down; ``searched``: see `site_model`."""
-    facts = context.stored("traces", "traces.json")["sites"][site.name]
-    return site_model(context, site, facts["knots_s"], facts["knots_mm"], searched)
+def recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:
+    """A site driven by one of its records, from touch-down; ``searched``: see `site_model`."""
+    facts = context.stored("traces", "traces.json")["sites"][record.name]
+    force = facts["knots_N"] if record.forced else ()
+    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:
@@ -177,6 +186,11 @@ def planned_model(context: Context, site: Site) -> SiteModel:
     assert site.depth_mm is not None
     ramp = site.depth_mm / site.speed_mm_s
     return site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+
+
+def model_of(context: Context, one: Indentation) -> SiteModel:
+    """An indentation as it was recorded, or as the study plans it."""
+    return recorded_model(context, one) if isinstance(one, Record) else planned_model(context, one)
 
 
 def experiment_cache(context: Context, folder: Path) -> SimulationCache:

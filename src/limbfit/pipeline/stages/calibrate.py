@@ -36,7 +36,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     for flag in stored_flags(context):
         context.tell("calibrate", 0, 0, f"warning: {flag.text}")
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    laboratory = Laboratory(context, cache, study.fitted)
+    laboratory = Laboratory(context, cache, study.records_at(*study.fitted))
     stages = groupings(study)
     rounds_of: dict[int, tuple[Round, ...]] = {}
 

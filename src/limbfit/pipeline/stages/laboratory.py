@@ -1,4 +1,4 @@
-"""The simulations of a calibration's sites, and what the study wants of their parameters."""
+"""The simulations of a calibration's records, and what the study wants of their parameters."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
 from ...identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob
-from ...study import Site, Study
+from ...study import Record, Study
 from ...study.meshing import MeshTable
 from ..shared.context import Context
 from ..shared.extrapolation import MESH_ORDERS, error_of_finer
@@ -58,16 +58,16 @@ class Anchored:
 
 
 class Laboratory:
-    """Simulates some sites: with derivatives as parameters are searched, without on their own whole meshes.
+    """Simulates some records: with derivatives as parameters are searched, without on their own whole meshes.
 
     ``title`` is the stage or experiment that is told of progress.
     """
 
     def __init__(
-        self, context: Context, cache: SimulationCache, sites: Sequence[Site], title: str = "calibrate"
+        self, context: Context, cache: SimulationCache, records: Sequence[Record], title: str = "calibrate"
     ) -> None:
         self.context, self.cache, self.title = context, cache, title
-        self.records = [site_record(context, site) for site in sites]
+        self.records = [site_record(context, record) for record in records]
         self.searched = as_searched(context, self.records)
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
@@ -207,7 +207,7 @@ class Laboratory:
                 told = f"warning: site {simulation.site}: the error of its mesh is not known: {found.reason}"
             self.context.tell(self.title, 0, 0, told)
             usable = found.completed and known.completed
-            lacking.append(share * (known.force_N - found.force_N) if usable else 0.0 * record.force_N)
+            lacking.append(share * (known.force_N - found.force_N) if usable else 0.0 * record.compared)
         return tuple(lacking)
 
     def _facts(self, state: SearchState) -> dict[str, Any]:
@@ -220,7 +220,7 @@ class Laboratory:
             "error_percent": float(np.mean(last.errors_percent)),
             "error_percent_by_site": dict(
                 zip(
-                    (record.site.name for record in self.records),
+                    (record.name for record in self.records),
                     map(float, last.errors_percent),
                     strict=True,
                 )

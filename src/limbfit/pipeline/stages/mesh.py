@@ -42,7 +42,13 @@ def mesh_job(
     settings: MeshSettings,
     file: Path,
 ) -> MeshJob:
-    """The mesh of a site of the study's surfaces, with any settings."""
+    """The mesh of a site of the study's surfaces, with any settings; wider where a wider indenter touches.
+
+    ``near_radius_mm`` is that of ``[indenter]``: it grows by as much as the site's widest one is wider.
+    """
+    study = context.study
+    wider = max(study.width_at(study.site(site)) - study.indenter.width_mm, 0.0)
+    settings = replace(settings, near_radius_mm=settings.near_radius_mm + wider / 2)
     key = str((context.store.stamp("surfaces") or {})["key"])
     surfaces = context.store["surfaces"]
     return MeshJob(site, surfaces, key, tuple(position), tuple(axis), settings, file)
@@ -50,7 +56,8 @@ def mesh_job(
 
 def make_mesh(job: MeshJob) -> dict[str, Any]:
     """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
-    anatomy, base = _base(job.surfaces, job.surfaces_key, job.settings)
+    shared = replace(job.settings, near_radius_mm=0.0)
+    anatomy, base = _base(job.surfaces, job.surfaces_key, shared)
     mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
     write_vtu(mesh, job.file)
     facts = {**asdict(report), "element": job.settings.element}
@@ -61,7 +68,7 @@ def make_mesh(job: MeshJob) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
-    """What all sites of a study share; a worker makes it once."""
+    """What all sites of a study share, whatever their ``near_radius_mm``; a worker makes it once."""
     anatomy = load_anatomy(surfaces)
     mapped = any(layer.thickness_mm is None for layer in settings.layers)
     depth = read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None

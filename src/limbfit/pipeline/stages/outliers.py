@@ -13,7 +13,7 @@ from ...identify.checks.first_order import FirstOrder
 from ...identify.checks.outliers import Exchange, as_driven, find_outliers
 from ...identify.checks.plausibility import explained
 from ...identify.fit.correction import CoarseToFine
-from ...identify.fit.objective import Measured, SiteResponse
+from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
@@ -65,7 +65,7 @@ def outlier_record(
 
     found = find_outliers(
         simulate,
-        [Measured(record.site.name, record.force_N) for record in records],
+        [replace(record.measured, weight=1.0 / record.record.of_site) for record in records],
         best,
         _exchange(records),
         exactly,
@@ -93,8 +93,16 @@ def _exchange(records: Sequence[SiteRecord]) -> Callable[[FirstOrder], Exchange]
 
 
 def _driven_by(site: SiteRecord, other: SiteRecord, parameters: Array) -> SimulationJob:
-    """The site driven by the record of another one."""
-    model = replace(site.model, knots_s=other.model.knots_s, knots_mm=other.model.knots_mm)
+    """The site driven by the record of another one, and indented by what made that."""
+    driven = other.model
+    model = replace(
+        site.model,
+        knots_s=driven.knots_s,
+        knots_mm=driven.knots_mm,
+        knots_N=driven.knots_N,
+        indenter=driven.indenter,
+        indenter_digest=driven.indenter_digest,
+    )
     return replace(site, model=model, times_s=other.times_s).job(parameters)
 
 

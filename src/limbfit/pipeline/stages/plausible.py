@@ -12,7 +12,7 @@ from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import Flag, RecordFacts, implausible
 from ...indentation import read_indenter
-from ...study import Site, Study
+from ...study import IndenterTable, Record, Study
 from ..shared.context import Context
 from .traces import read_curves
 
@@ -20,7 +20,7 @@ Placed = Mapping[str, Mapping[str, Any]]
 
 
 def stored_flags(context: Context) -> tuple[Flag, ...]:
-    """Flags on all recorded sites from the stages ``surfaces``, ``sites`` and ``traces``."""
+    """Flags on all records from the stages ``surfaces``, ``sites`` and ``traces``."""
     study = context.study
     traces = context.stored("traces", "traces.json")["sites"]
     rows = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}
@@ -37,22 +37,28 @@ def record_flags(
     placed: Placed,
     anatomy: Anatomy | None,
 ) -> tuple[Flag, ...]:
-    """Flags on the recorded sites.
+    """Flags on the records.
 
     Parameters
     ----------
     records : what ``traces.json`` says of each.
     steps_s : time between samples of each.
-    placed : what ``sites.json`` says of those whose place is known (yet).
+    placed : what ``sites.json`` says of the sites whose place is known (yet).
     anatomy : None while the surfaces are not known.
     """
-    recorded = [site for site in study.sites if site.name in records]
-    radius = _radius(study)
+    recorded = [record for record in study.recorded if record.name in records]
     facts = [
-        _facts(study, site, records[site.name], steps_s[site.name], radius, placed.get(site.name), anatomy)
-        for site in recorded
+        _facts(
+            one,
+            records[one.name],
+            steps_s[one.name],
+            _radius(study.indenter_of(one)),
+            placed.get(one.site.name),
+            anatomy,
+        )
+        for one in recorded
     ]
-    remarks = tuple(_flag(site.name, r) for site in recorded for r in records[site.name].get("remarks", ()))
+    remarks = tuple(_flag(one.name, r) for one in recorded for r in records[one.name].get("remarks", ()))
     return (*remarks, *implausible(facts))
 
 
@@ -61,15 +67,14 @@ def _flag(site: str, remark: Mapping[str, Any]) -> Flag:
     return Flag((site,), **remark)
 
 
-def _radius(study: Study) -> float:
+def _radius(indenter: IndenterTable) -> float:
     """Of a circle with the indenter's section, mm; a sphere touches with less."""
-    tool = read_indenter(study.indenter_here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
+    tool = read_indenter(indenter, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
     return float(np.sqrt(tool.body.section / np.pi))
 
 
 def _facts(
-    study: Study,
-    site: Site,
+    stated: Record,
     record: Mapping[str, Any],
     step_s: float,
     radius: float,
@@ -89,7 +94,8 @@ def _facts(
             "hint_mm": None if row["marker"] is None else row["marker"]["distance_to_hint_mm"],
         }
     return RecordFacts(
-        site=site.name,
+        site=stated.name,
+        place=stated.site.name,
         peak_N=record["peak_force_N"],
         depth_mm=record["depth_mm"],
         speed_mm_s=abs(record["speed_load_mm_s"]),

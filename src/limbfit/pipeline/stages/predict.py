@@ -41,7 +41,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     answers = [Answer.of(stage, study) for stage in calibration["stages"]]
     one, best = answers[0].parameters, answers[-1].parameters
     known = Known.of(calibration["uncertainty"])
-    records = [site_record(context, site) for site in study.sites if site.trace is not None]
+    records = [site_record(context, record) for record in study.recorded]
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
@@ -123,7 +123,7 @@ def _one_material_jobs(
 
 @dataclass(frozen=True)
 class SitePrediction:
-    """A recorded site at the answer: its own mesh's simulation, the same with derivatives, and with one
+    """A record at the answer: its own mesh's simulation, the same with derivatives, and with one
     material (None where that is the answer). Force and derivatives at the times of the record."""
 
     record: SiteRecord
@@ -173,20 +173,21 @@ def _write_fields(context: Context, folder: Path, jobs: Sequence[SimulationJob],
 def _write_curves(folder: Path, site: SitePrediction, best: Array, known: Known) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
     record, ours, missing = site.record, site.ours, site.missing
-    columns = {
-        "time_s": record.times_s,
-        "displacement_mm": record.displacement_mm,
-        "force_measured_N": record.force_N,
-    }
+    name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
+    columns = {"time_s": record.times_s}
+    columns |= (
+        {"force_N": record.force_N} if record.record.forced else {"displacement_mm": record.displacement_mm}
+    )
+    columns[f"{name}_measured_{unit}"] = record.compared
     if "force" not in missing:
-        columns["force_simulated_N"] = site.own.force_N
+        columns[f"{name}_simulated_{unit}"] = site.own.force_N
     if site.one is not None and "one_material" not in missing:
-        columns["force_one_material_N"] = site.one.force_N
+        columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
-        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.site.name)
-        columns["force_low_N"] = np.maximum(ours.force_N - half, 0.0)
-        columns["force_high_N"] = ours.force_N + half
-    write_curves(folder / f"{record.site.name}.csv", **columns)
+        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name, unit)
+        columns[f"{name}_low_{unit}"] = np.maximum(ours.force_N - half, 0.0)
+        columns[f"{name}_high_{unit}"] = ours.force_N + half
+    write_curves(folder / f"{record.name}.csv", **columns)
 
 
 def _row(site: SitePrediction) -> dict[str, Any]:
@@ -195,10 +196,12 @@ def _row(site: SitePrediction) -> dict[str, Any]:
     def error(found: Simulation | SiteResponse | None) -> float | None:
         if found is None or not found.completed:
             return None
-        return error_percent(found.force_N, record.force_N)
+        return error_percent(found.force_N, record.compared)
 
     return {
         "site": record.site.name,
+        "record": record.name,
+        "control": record.record.control,
         "region": record.site.region,
         "fitted": record.site.fitted,
         "peak_force_N": float(record.force_N.max()),
@@ -216,13 +219,17 @@ def _row(site: SitePrediction) -> dict[str, Any]:
 
 
 def _means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none."""
+    """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none.
+
+    A site's is the mean of its records'.
+    """
     found: dict[str, Any] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
-        errors = [
-            r["error_percent"] for r in rows if r["fitted"] == fitted and r["error_percent"] is not None
-        ]
-        summary = asdict(summarise(errors))
+        errors: dict[str, list[float]] = {}
+        for row in rows:
+            if row["fitted"] == fitted and row["error_percent"] is not None:
+                errors.setdefault(row["site"], []).append(row["error_percent"])
+        summary = asdict(summarise([float(np.mean(of_site)) for of_site in errors.values()]))
         for key in ("mean_percent", "sd_percent"):
             name = f"{key.removesuffix('_percent')}_error_{kind}_percent"
             found[name] = None if np.isnan(summary[key]) else summary[key]

@@ -7,26 +7,30 @@ from numpy.typing import NDArray
 
 from ...identify.uncertainty.noise import SiteNoise, record_noise
 from ...study import Study
-from .traces import SiteRecord, read_site_trace
+from .traces import SiteRecord, read_record
 
 Array = NDArray[np.float64]
 
 
 def site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
-    """Noise of a site's record at the times of comparison, its touch-down included.
+    """Noise of a record at the times of comparison, its touch-down included.
 
     ``force_N`` (n,) is the simulated one: what a wrong touch-down does is told by its slope, which is smooth.
+    Under a stated force it is the depth, mm, and so is the noise.
     """
-    trace, smooth, facts = read_site_trace(study, record.site)
+    trace, smooth, facts = read_record(study, record.record)
     since = trace.time_s - facts["touch_down_s"]
     inside = (since >= 0) & (since <= smooth.time_s[-1])
     residual = trace.force_N[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+    if record.record.forced:
+        moved = trace.displacement_mm[inside] - facts["touch_down_mm"]
+        residual = moved - np.interp(since[inside], smooth.time_s, smooth.displacement_mm)
     return record_noise(
-        record.site.name,
+        record.name,
         record.times_s,
         residual,
         force_N,
-        record.displacement_mm,
+        None if record.record.forced else record.displacement_mm,
         facts["touch_down_uncertainty_mm"],
         record.smoothing,
     )

@@ -22,10 +22,10 @@ def meshed_models(
     """
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [
-        mesh_job(context, model.name, model.position, model.axis, settings, folder / f"{model.name}.vtu")
+        mesh_job(context, model.site, model.position, model.axis, settings, folder / f"{model.site}.vtu")
         for model in models
     ]
-    missing = [job for job in jobs if not is_meshed(job)]
+    missing = [job for job in dict.fromkeys(jobs) if not is_meshed(job)]
     for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
     return [

@@ -49,7 +49,7 @@ def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[
     wanted = np.array(site.position) if marker is None else marker.position
     try:
         point, off = project_to_skin(anatomy, wanted)
-        axis = site.axis or indenter_axis(anatomy.skin, point, study.indenter.width_mm)
+        axis = site.axis or indenter_axis(anatomy.skin, point, study.width_at(site))
     except SiteError as error:
         raise SiteError(
             error.what, file=study.file, place=f"sites.{site.name}", remedy=error.remedy

@@ -1,4 +1,4 @@
-"""Records to regularised curves (the stage ``traces``), and a site with its record for what stands on it."""
+"""Records to regularised curves (the stage ``traces``), and a record with its model for what stands on it."""
 
 from __future__ import annotations
 
@@ -14,29 +14,40 @@ from ...errors import TraceError
 from ...identify.fit.objective import Measured, SiteResponse
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...phases import Phase, in_words
-from ...study import Site, Study
-from ...traces import Regularised, TouchDown, Trace, read_trace, regularise, understand
+from ...study import Record, Site, Study
+from ...traces import (
+    Creep,
+    Regularised,
+    TouchDown,
+    Trace,
+    read_trace,
+    regularise,
+    regularise_creep,
+    understand,
+)
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, recorded_model
 from ..shared.store import write_json
 
 Array = NDArray[np.float64]
-SMOOTHING = "{}-smoothing.npy"  # of a site's record, as a matrix
+SMOOTHING = "{}-smoothing.npy"  # of a record, as a matrix
 
 
-def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[str, Any]]:
-    """A site's record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
-    assert site.trace is not None
+def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
+    """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
     table = study.traces
-    file = study.path(site.trace)
+    file = study.path(record.trace)
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
     try:
-        known = understand(trace, site.touch_down_s)
+        known = understand(trace, record.touch_down_s, forced=record.forced)
         trace, touch = known.trace, known.touch_down
-        smooth = regularise(trace, touch, table.smoothing, site.peak_s)
+        made = regularise_creep if record.forced else regularise
+        smooth = made(trace, touch, table.smoothing, record.peak_s)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
     facts = {
+        "site": record.site.name,
+        "control": record.control,
         "touch_down_s": touch.time_s,
         "touch_down_mm": touch.displacement_mm,
         "touch_down_uncertainty_mm": touch.uncertainty_mm,
@@ -50,6 +61,7 @@ def read_site_trace(study: Study, site: Site) -> tuple[Trace, Regularised, dict[
         "phases_in_words": in_words(smooth.phases),
         "knots_s": smooth.knots_s.tolist(),
         "knots_mm": smooth.knots_mm.tolist(),
+        "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
         "remarks": [asdict(remark) for remark in known.remarks],
     }
     return trace, smooth, facts
@@ -66,25 +78,25 @@ def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dic
 
 def run_traces(context: Context, folder: Path) -> dict[str, Any]:
     """Records to regularised curves, counted from touch-down."""
-    recorded = [site for site in context.study.sites if site.trace is not None]
+    recorded = context.study.recorded
     facts = {}
-    for i, site in enumerate(recorded):
-        context.tell("traces", i, len(recorded), f"site {site.name}")
-        trace, smooth, facts[site.name] = read_site_trace(context.study, site)
+    for i, record in enumerate(recorded):
+        context.tell("traces", i, len(recorded), f"site {record.name}")
+        trace, smooth, facts[record.name] = read_record(context.study, record)
         write_curves(
-            folder / f"{site.name}-raw.csv",
+            folder / f"{record.name}-raw.csv",
             time_s=trace.time_s,
             displacement_mm=trace.displacement_mm,
             force_N=trace.force_N,
         )
         even = smooth.resample(CURVE_POINTS)
         write_curves(
-            folder / f"{site.name}.csv",
+            folder / f"{record.name}.csv",
             time_s=even.time_s,
             displacement_mm=even.displacement_mm,
             force_N=even.force_N,
         )
-        np.save(folder / SMOOTHING.format(site.name), smooth.curve.response(even.time_s))
+        np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
     write_json(folder / "traces.json", {"sites": facts})
     return {}
 
@@ -103,7 +115,7 @@ def read_curves(file: Path) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class SiteRecord:
-    """A site with its record: what a simulation needs, and the forces it is compared with.
+    """A record at its site: what a simulation needs, and the forces, or depths, it is compared with.
 
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
@@ -111,7 +123,7 @@ class SiteRecord:
     same mesh.
     """
 
-    site: Site
+    record: Record
     tissues: tuple[str, ...]
     model: SiteModel
     times_s: Array
@@ -121,9 +133,23 @@ class SiteRecord:
     nested_mm: float | None = None
 
     @property
+    def name(self) -> str:
+        """The record's."""
+        return self.record.name
+
+    @property
+    def site(self) -> Site:
+        return self.record.site
+
+    @property
     def measured(self) -> Measured:
         """What the calibration compares with."""
-        return Measured(self.site.name, self.force_N, self.site.weight)
+        return Measured(self.name, self.compared, self.record.weight, self.site.name, self.record.unit)
+
+    @property
+    def compared(self) -> Array:
+        """What is compared: force (n,) N, or displacement, mm, under a stated force."""
+        return self.displacement_mm if self.record.forced else self.force_N
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
@@ -158,17 +184,17 @@ def as_response(simulation: Simulation) -> SiteResponse:
     return SiteResponse.with_doubts(simulation.force_N, jacobian, *ended, simulation.site, doubts)
 
 
-def site_record(context: Context, site: Site) -> SiteRecord:
-    """The stored record of a site and its model, on the whole of its own mesh."""
-    curves = read_curves(context.store["traces"] / f"{site.name}.csv")
+def site_record(context: Context, record: Record) -> SiteRecord:
+    """A stored record and its site's model, on the whole of its own mesh."""
+    curves = read_curves(context.store["traces"] / f"{record.name}.csv")
     return SiteRecord(
-        site=site,
+        record=record,
         tissues=context.study.tissues,
-        model=recorded_model(context, site),
+        model=recorded_model(context, record),
         times_s=curves["time_s"],
         displacement_mm=curves["displacement_mm"],
         force_N=curves["force_N"],
-        smoothing=np.load(context.store["traces"] / SMOOTHING.format(site.name)),
+        smoothing=np.load(context.store["traces"] / SMOOTHING.format(record.name)),
         nested_mm=context.study.within_mm if context.study.mesh.coarse is None else None,
     )
 
@@ -177,4 +203,4 @@ def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[Sit
     """The records as parameters are searched (`site_model`); ``records`` itself where that is the same."""
     if not context.study.is_searched_apart:
         return records
-    return [replace(one, model=recorded_model(context, one.site, searched=True)) for one in records]
+    return [replace(one, model=recorded_model(context, one.record, searched=True)) for one in records]

@@ -40,8 +40,9 @@ RECORD, VERDICT = "record.csv", "verdict.json"
 
 
 def waiting_sites(study: Study) -> list[Site]:
-    """Sites whose record is yet to be made."""
-    return [site for site in study.sites if not study.is_recorded(site)]
+    """Sites whose record is yet to be made; one that states several in ``[[records]]`` is none of them."""
+    several = {record.site for record in study.records}
+    return [site for site in study.sites if site.name not in several and not study.is_recorded(site)]
 
 
 def acquire_site(
@@ -82,6 +83,13 @@ def acquire_site(
         Where the device does not answer, or the record cannot be written.
     """
     site = study.site(name)
+    if len(study.records_at(site)) > 1 or (site.trace is None and study.records_at(site)):
+        raise InputError(
+            "a session makes the record of a site that has one",
+            file=study.file,
+            place=f"sites.{name}",
+            remedy="state it as sites.trace, record it, and state it in [[records]] then",
+        )
     if site.trace is not None and study.path(site.trace).exists() and not replace_record:
         remedy = "give --again to record it once more; the old record is kept"
         raise InputError(f"{site.trace} exists", file=study.file, place=f"sites.{name}.trace", remedy=remedy)
@@ -285,7 +293,7 @@ def virtual_fitsocket(
 def stored_surrogates(study: Study) -> dict[str, Surrogate]:
     """Each site that has a stored simulation: of the prediction, else of `limbfit simulate`."""
     found = {}
-    for site in study.sites:
+    for site in study.indentations:
         for folder, column in (("predict", "force_simulated_N"), ("simulate", "force_N")):
             file = study.results / folder / f"{site.name}.csv"
             if file.is_file() and (folder == "simulate" or column in read_curves(file)):

@@ -17,7 +17,7 @@ from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
 from ..stages.surfaces import given_anatomy
-from ..stages.traces import read_site_trace
+from ..stages.traces import read_record
 from .run import keys
 
 
@@ -27,7 +27,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down per recorded site),
+        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down of each record),
         ``flags`` (what looks wrong about records and places, with the evidence).
 
     Raises
@@ -39,38 +39,44 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     listener(Progress("check", 0, 2, "geometry"))
     given, notes = given_anatomy(study) if study.surfaces is not None else (None, ())
     facts += _image_facts(study) if given is None else [*notes, *_surface_facts(study, given)]
-    if study.indenter.file is not None:
-        width = read_indenter(study.indenter_here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
-        facts.append(f"indenter: {study.indenter.file}, {width:.1f} mm wide")
+    for name, table in study.used_indenters.items():
+        if table.file is not None:
+            here = table.model_copy(update={"file": study.path(table.file)})
+            width = read_indenter(here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+            facts.append(f"indenter{'' if name is None else ' ' + name}: {table.file}, {width:.1f} mm wide")
     listener(Progress("check", 1, 2, "records"))
-    read = {site.name: read_site_trace(study, site) for site in study.sites if site.trace is not None}
-    sites = {name: record for name, (_, _, record) in read.items()}
-    for name, record in sites.items():
+    read = {record.name: read_record(study, record) for record in study.recorded}
+    records = {name: record for name, (_, _, record) in read.items()}
+    for name, record in records.items():
         facts.append(
             f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
             f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} "
             f"mm; {record['phases_in_words']}"
             + ("" if record["speed_unload_mm_s"] is not None else "; loading only, no unloading")
         )
-    facts.append(f"{len(study.fitted)} of {len(study.sites)} sites are fitted")
+    number = len(study.records_at(*study.fitted))
+    facts.append(
+        f"{len(study.fitted)} of {len(study.sites)} sites are fitted"
+        + (f", with {number} records" if number > len(study.fitted) else "")
+    )
     if study.priors:
         known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
     placed, anatomy = _places(study, given)
-    if sites and not placed:
+    if records and not placed:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
             "(limbfit run --until sites, then check again)"
         )
     if "socket" in study.model_fields_set:
         facts += _socket_facts(study, anatomy)
-    flags = record_flags(study, sites, steps, placed, anatomy)
+    flags = record_flags(study, records, steps, placed, anatomy)
     listener(Progress("check", 2, 2))
     return {
         "study": study.study.name,
         "facts": facts,
-        "sites": sites,
+        "sites": records,
         "flags": [flag.to_dict() for flag in flags],
     }
 

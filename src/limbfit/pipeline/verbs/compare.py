@@ -64,7 +64,7 @@ def compare_site(
     program = find_febio(study.febio.program) if febio_log is None else None
     log = None if febio_log is None else read_log(febio_log)
     found = prepare_site(study, name, parameters=parameters, listener=listener)
-    folder = found.context.store["compare"]
+    folder, name = found.context.store["compare"], found.name
     folder.mkdir(parents=True, exist_ok=True)
     problem = site_problem(found)
     found.context.tell("compare", 0, 3, f"site {name}: FEBio")
@@ -83,13 +83,13 @@ def compare_site(
 
 def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Result:
     """limbfit's own result, as ``limbfit simulate`` gets it."""
-    found.context.tell("compare", part, 3, f"site {found.site.name}: limbfit")
+    found.context.tell("compare", part, 3, f"site {found.name}: limbfit")
     return solve(problem, first_steps(found.model, found.context.study.tissues), store="none")
 
 
 def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
     """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
-    found.context.tell("compare", 2, 3, f"site {found.site.name}: limbfit with FEBio's contact and steps")
+    found.context.tell("compare", 2, 3, f"site {found.name}: limbfit with FEBio's contact and steps")
     settings = feb_settings(found, "")
     end = float(problem.history.times[-1])
     times = np.minimum(other.times[1:], end)  # a table has nine digits
@@ -135,7 +135,7 @@ def difference(other: Result, mine: Result) -> dict[str, float | None]:
 
 def _summary(found: Indentation, other: Result, runs: dict[str, Result]) -> dict[str, Any]:
     return {
-        "site": found.site.name,
+        "site": found.name,
         "parameters": found.parameters,
         "parameters_from": found.origin,
         "element": other.statistics["element"],

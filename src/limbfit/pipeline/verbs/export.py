@@ -10,7 +10,8 @@ from typing import Any
 from ...errors import InputError
 from ...febio import Range, differences, in_indenter_frame, write_feb, write_inp, write_optimisation
 from ...indentation import Parameters
-from ...study import Site, Study
+from ...study import Indentation as Planned
+from ...study import Record, Study
 from ..shared.context import Listener, quiet
 from ..stages.traces import site_record
 from .simulate import Indentation, feb_settings, prepare_site, site_problem
@@ -27,7 +28,7 @@ def export_study(
     parameters: Parameters | None = None,
     listener: Listener = quiet,
 ) -> dict[str, Any]:
-    """Write one site, or all of them, for another solver; meshes are made where missing.
+    """Write one indentation, or all of them, for another solver; meshes are made where missing.
 
     Parameters
     ----------
@@ -64,22 +65,22 @@ def export_study(
     return {"format": to, "sites": rows}
 
 
-def _chosen(study: Study, to: str, site: str | None) -> Sequence[Site]:
+def _chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:
     if site is not None:
-        one = study.site(site)
-        if to == "febio-optimize" and one.trace is None:
+        one = study.indentation(site)
+        if to == "febio-optimize" and not isinstance(one, Record):
             raise InputError("has no record to fit", file=study.file, place=f"sites.{site}")
         return (one,)
     if to == "febio-optimize":
         if not study.fitted:
             raise InputError("no site is fitted", file=study.file, remedy="give --site")
-        return study.fitted
-    return study.sites
+        return study.records_at(*study.fitted)
+    return study.indentations
 
 
 def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files of a site, and what the other solver does otherwise."""
-    name, problem = found.site.name, site_problem(found)
+    name, problem = found.name, site_problem(found)
     settings = feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
         write_feb(problem, folder / f"{name}.feb", settings)
@@ -90,7 +91,8 @@ def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...],
         settings = replace(settings, penalty=None)
         turned = in_indenter_frame(problem)
         write_feb(turned, model, settings)
-        record = site_record(found.context, found.site)
+        assert isinstance(found.stated, Record)
+        record = site_record(found.context, found.stated)
         inside = (record.times_s >= 0.0) & (record.times_s <= problem.history.times[-1])
         ranges = _ranges(found, problem.mesh.region_names)
         iterations = found.context.study.calibration.max_iterations

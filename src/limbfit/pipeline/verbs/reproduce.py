@@ -134,9 +134,14 @@ def _relative(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple
             yield f"{tissue}.{name}", abs(now[tissue][name] - value) / max(abs(value), 1e-300)
 
 
+def _simulated(curves: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """What is compared of a prediction, simulated: force, or displacement under a stated force."""
+    return curves.get("force_simulated_N", curves.get("displacement_simulated_mm"))
+
+
 def _forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
     for file in sorted(then.glob("*.csv")):
-        a, b = (read_curves(folder / file.name).get("force_simulated_N") for folder in (then, now))
+        a, b = (_simulated(read_curves(folder / file.name)) for folder in (then, now))
         if a is not None and b is not None:
             yield file.stem, float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300))
         elif a is not b:  # one of them could not be predicted: all of the force is missing

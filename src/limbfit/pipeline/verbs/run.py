@@ -31,23 +31,29 @@ from ..stages.surfaces import run_surfaces
 from ..stages.traces import run_traces
 from .journal import journal
 
-_PLACE = ("name", "position", "near", "axis", "region", "fitted")
-_RECORD = ("trace", "touch_down_s", "peak_s")
-_UNSEEN: dict[str, Any] = {"region": "", **dict.fromkeys((*_RECORD, "axis", "edge"))}
+_PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
+_RECORD = ("trace", "touch_down_s", "peak_s", "control")
+_UNSEEN: dict[str, Any] = {
+    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter")),
+    "region": "",
+    "control": "displacement",
+}
+_NAMED = ("site", "name")
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation")),
     Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces")),
-    Stage("sites", run_sites, ("surfaces",), ("indenter",), _PLACE),
-    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD)),
+    Stage("sites", run_sites, ("surfaces",), ("indenter", "indenters"), _PLACE, (*_NAMED, "indenter")),
+    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD), (*_NAMED, *_RECORD)),
     Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",)),
     Stage(
         "calibrate",
         run_calibrate,
         ("sites", "traces", "mesh"),
-        ("material", "calibration", "solver", "indenter"),
-        ("name", "fitted", "weight", "edge"),
+        ("material", "calibration", "solver", "indenter", "indenters"),
+        ("name", "fitted", "weight", "edge", "indenter"),
+        (*_NAMED, "indenter"),
     ),
-    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge")),
+    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge"), _NAMED),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
 _FOLDERS = frozenset(("compare", "export", "simulate", *(stage.name for stage in STAGES)))  # of results
@@ -83,7 +89,9 @@ def _seen_by_calibration(study: Study) -> Study:
     if any(site.near is not None for site in sites):
         others = [site for site in study.sites if not site.fitted and site.near is not None]
         sites += [site.model_copy(update=_UNSEEN) for site in others]
-    return study.model_copy(update={"sites": tuple(sites)})
+    fitted = {site.name for site in study.fitted}
+    records = tuple(record for record in study.records if record.site in fitted)
+    return study.model_copy(update={"sites": tuple(sites), "records": records})
 
 
 def study_status(study: Study) -> list[dict[str, Any]]:
@@ -287,7 +295,7 @@ def summarise(study: Study) -> dict[str, Any]:
         summary["intervals_95"] = calibration["uncertainty"]["intervals_95"]
     if (store["predict"] / "predict.json").is_file():
         predicted = store.read("predict", "predict.json")
-        columns = ("site", "region", "fitted", "peak_force_N", "error_percent")
+        columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent")
         summary["sites"] = [
             {**{key: row[key] for key in columns}, "warnings": row.get("warnings", [])}
             for row in predicted["sites"]

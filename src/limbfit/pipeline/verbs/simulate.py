@@ -12,9 +12,10 @@ from ...fe import Problem, Result
 from ...febio import FebSettings, find_febio, result_of_log, run_febio, write_feb
 from ...indentation import Parameters, SiteModel, build_problem, first_steps, simulate_fields
 from ...mesh import read_vtu
-from ...study import Site, Study
+from ...study import Indentation as Planned
+from ...study import Study
 from ..shared.context import Context, Listener, quiet
-from ..shared.simulations import CURVE_POINTS, planned_model, recorded_model
+from ..shared.simulations import CURVE_POINTS, model_of
 from ..shared.store import Store, write_json
 from ..stages.traces import write_curves
 from .run import keys, run_study
@@ -24,13 +25,18 @@ FEB_NAME, FORCES = "model.feb", "forces.txt"
 
 @dataclass(frozen=True)
 class Indentation:
-    """One site of a study, ready to be simulated: ``origin`` says where the parameters are from."""
+    """An indentation of a study, ready to be simulated: ``origin`` says where the parameters are from."""
 
     context: Context
-    site: Site
+    stated: Planned
     model: SiteModel
     parameters: Parameters
     origin: str
+
+    @property
+    def name(self) -> str:
+        """That of the record, or of the site that plans it."""
+        return self.model.name
 
 
 def prepare_site(
@@ -40,6 +46,7 @@ def prepare_site(
 
     Parameters
     ----------
+    name : of a site with one record at most, or of a record.
     parameters : per tissue; by default the identified ones, or the study's start where none were identified.
 
     Raises
@@ -48,13 +55,12 @@ def prepare_site(
         For a site that the study does not have, identified parameters that are stale, or any input of the
         stages before.
     """
-    site = study.site(name)
+    stated = study.indentation(name)
     store = Store(study.results)
     used, origin = (parameters, "given") if parameters else known_parameters(study, store)
     run_study(study, until="mesh", listener=listener)
     context = Context(study, store, SerialExecutor(), listener)
-    model = planned_model(context, site) if site.trace is None else recorded_model(context, site)
-    return Indentation(context, site, model, used, origin)
+    return Indentation(context, stated, model_of(context, stated), used, origin)
 
 
 def simulate_site(
@@ -87,7 +93,7 @@ def simulate_site(
     if program is not None and animation:
         raise InputError("FEBio's fields are in its plot file", place="--animation", remedy="leave it out")
     found = prepare_site(study, name, parameters=parameters, listener=listener)
-    context, model = found.context, found.model
+    context, model, name = found.context, found.model, found.name
     folder = context.store["simulate"]
     folder.mkdir(exist_ok=True)
     context.tell("simulate", 0, 1, f"site {name}")
@@ -104,7 +110,7 @@ def simulate_site(
     write_curves(
         curve,
         time_s=times,
-        displacement_mm=model.history.at(times),
+        displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
         force_N=result.force_at(times),
     )
     summary = _summary(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
@@ -123,12 +129,12 @@ def _summary(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
     """What is told of a simulation; FEBio says nothing of its penetration."""
     own = solver == "limbfit"
     return {
-        "site": found.site.name,
+        "site": found.name,
         "solver": solver,
         "parameters": found.parameters,
         "parameters_from": found.origin,
         "peak_force_N": result.peak_force,
-        "depth_mm": max(found.model.knots_mm),
+        "depth_mm": float(result.displacement.max()) if found.model.forced else max(found.model.knots_mm),
         "penetration_mm": float(result.penetration.max(initial=0.0)) if own else None,
         "completed": result.completed,
         "reason": result.reason,
@@ -146,7 +152,7 @@ def site_problem(found: Indentation) -> Problem:
 def feb_settings(found: Indentation, force_file: str) -> FebSettings:
     """What is written for FEBio beside the problem."""
     study = found.context.study
-    title = f"{study.study.name}, site {found.site.name}, parameters: {found.origin}"
+    title = f"{study.study.name}, site {found.name}, parameters: {found.origin}"
     return FebSettings(study.febio.penalty, first_steps(found.model, study.tissues), force_file, title)
 
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..formats import fixed, number, symbol, unit_of
 from ..page import Figure
-from ..store import Curves, Json, Results
+from ..store import Curves, Json, Results, compared_of
 from ..tables import interval
 from .ink import (
     FITTED,
@@ -44,8 +44,8 @@ def force_figure(
     store: Results, rows: Iterable[Json], against: str, name: str, columns: int
 ) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
-    found = [(row, store.curves("predict", row["site"])) for row in rows]
-    pairs = [(row, curves) for row, curves in found if curves is not None]
+    found = [(row, store.curves("predict", row["record"])) for row in rows]
+    pairs = [(row, curves) for row, curves in found if curves is not None and against in curves]
     if not pairs:
         return None
     drawing, axes = panels(len(pairs), columns, 2.6 if columns < 3 else 2.1)
@@ -56,10 +56,11 @@ def force_figure(
             ax.set_title(_site_title(store, row, columns))
             if i + columns >= len(pairs):
                 ax.set_xlabel(words[against][0])
-            if i % columns == 0:
-                ax.set_ylabel("Force (N)")
+            quantity, unit = compared_of(curves)
+            if i % columns == 0 or quantity != "force":
+                ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
         legend_above(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
-    sites = ", ".join(f"{row['site']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
+    sites = ", ".join(f"{row['record']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words[against][1]}; site and error: {sites}"
     kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
     paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
@@ -71,7 +72,7 @@ def force_figure(
 
 def _site_title(store: Results, row: Json, columns: int) -> str:
     region = str(row.get("region") or "")
-    head = f"site {row['site']}" + (f", {region}" if region and columns < 3 else "")
+    head = f"site {row['record']}" + (f", {region}" if region and columns < 3 else "")
     return f"{_short(head, LONGEST_TITLE // (columns - 1 or 1))}: {fixed(row.get('error_percent'))} %"
 
 
@@ -80,16 +81,17 @@ def _short(text: str, most: int) -> str:
 
 
 def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None:
-    x = curves[against]
-    if "force_low_N" in curves and against == "time_s":
-        low, high = curves["force_low_N"], curves["force_high_N"]
+    x, (quantity, unit) = curves[against], compared_of(curves)
+    kinds = ("low", "high", "measured", "one_material", "simulated")
+    low, high, measured, one, simulated = (curves.get(f"{quantity}_{kind}_{unit}") for kind in kinds)
+    if low is not None and high is not None and against == "time_s":
         ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
-    if "force_measured_N" in curves:
-        ax.plot(x, curves["force_measured_N"], color=MEASURED, lw=2.6, alpha=0.55, label="measured")
-    if "force_one_material_N" in curves:
-        ax.plot(x, curves["force_one_material_N"], color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
-    if "force_simulated_N" in curves:
-        ax.plot(x, curves["force_simulated_N"], color=SIMULATED, label=materials)
+    if measured is not None:
+        ax.plot(x, measured, color=MEASURED, lw=2.6, alpha=0.55, label="measured")
+    if one is not None:
+        ax.plot(x, one, color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
+    if simulated is not None:
+        ax.plot(x, simulated, color=SIMULATED, label=materials)
     ax.margins(x=0.01)
 
 
@@ -214,14 +216,14 @@ def error_figure(store: Results) -> Figure | None:
         ax.invert_yaxis()
         ax.grid(visible=False, axis="y")
         ax.set_xlabel("Mean absolute error over largest force (%)")
-    sites = ", ".join(f"{row['site']} {fixed(row['error_percent'])} %" for row in rows)
+    sites = ", ".join(f"{row['record']} {fixed(row['error_percent'])} %" for row in rows)
     caption = "Force error of each site. Plain bars: sites that were fitted; hatched: held out."
     return Figure("errors", svg(drawing, "errors", f"Error of each site: {sites}"), caption)
 
 
 def _bar_label(row: Json) -> str:
     use = "fitted" if row.get("fitted") else "held out"
-    return f"{row['site']} ({use})"
+    return f"{row['record']} ({use})"
 
 
 def interval_figure(store: Results) -> Figure | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,8 @@ def _layers(store: Results) -> Iterable[tuple[str, Any]]:
 def _site(store: Results, row: Json) -> Json:
     fitted = bool(row.get("fitted"))
     axis = np.asarray(row["axis"], dtype=float)
-    known = {one["site"]: one for one in store.predicted}.get(row["site"], {})
+    known = [one["error_percent"] for one in store.predicted if one["site"] == row["site"]]
+    errors = [error for error in known if error is not None]
     return {
         "name": str(row["site"]),
         "region": store.region(row["site"]),
@@ -96,7 +98,7 @@ def _site(store: Results, row: Json) -> Json:
         "at": [float(value) for value in row["position_mm"]],
         "axis": (axis / np.linalg.norm(axis)).tolist(),
         "colour": FITTED if fitted else HELD_OUT,
-        "error_percent": known.get("error_percent"),
+        "error_percent": statistics.fmean(errors) if errors else None,
     }
 
 
@@ -154,15 +156,25 @@ _COLUMNS = (
     "force_low_N",
     "force_high_N",
     "force_N",
+    "displacement_measured_mm",
+    "displacement_simulated_mm",
+    "displacement_one_material_mm",
+    "displacement_low_mm",
+    "displacement_high_mm",
 )
 
 
 def _site_curves(store: Results, site: str) -> Json | None:
-    """What is known of a site's force: predicted, else simulated by itself, else as recorded."""
+    """What is known of a site's force: predicted, else simulated by itself, else as recorded.
+
+    Of several records it is that of the first.
+    """
     for stage in ("predict", "simulate", "traces"):
-        curves = store.curves(stage, site)
-        if curves is not None and len(next(iter(curves.values()))):
-            return {"stage": stage, "materials": store.materials, **_plain(curves, _COLUMNS)}
+        for record in dict.fromkeys((site, *store.records_of(site))):
+            curves = store.curves(stage, record)
+            if curves is not None and len(next(iter(curves.values()))):
+                facts = {"stage": stage, "record": record, "materials": store.materials}
+                return facts | _plain(curves, _COLUMNS)
     return None
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Drawing
 
 from ..formats import fixed, symbol
 from ..page import Figure
-from ..store import Json, Results
+from ..store import Json, Results, compared_of
 from .ink import (
     INK,
     MEASURED,
@@ -106,10 +106,14 @@ def _name_axes(ax: Axes, names: list[str], i: int, j: int) -> None:
         ax.set_ylabel(short(names[i]), fontsize=7)
 
 
+def _record(row: Json) -> str:
+    return str(row.get("record", row["site"]))
+
+
 def prediction_figure(store: Results, content: Json) -> Figure | None:
     """Records beside their prediction intervals, held-out sites first."""
     rows = sorted(content["predictions"]["sites"], key=lambda row: row["fitted"])[:_MOST_SITES]
-    found = [(row, store.curves("uncertainty", f"predictions/{row['site']}")) for row in rows]
+    found = [(row, store.curves("uncertainty", f"predictions/{_record(row)}")) for row in rows]
     pairs = [(row, curves) for row, curves in found if curves is not None]
     if not pairs:
         return None
@@ -118,15 +122,17 @@ def prediction_figure(store: Results, content: Json) -> Figure | None:
     with matplotlib.rc_context(STYLE):
         for i, (ax, (row, curves)) in enumerate(zip(axes, pairs, strict=True)):
             time = curves["time_s"]
-            low, high = curves["force_low_N"], curves["force_high_N"]
+            quantity, unit = compared_of(curves)
+            kinds = ("low", "high", "measured", "predicted")
+            low, high, measured, predicted = (curves[f"{quantity}_{kind}_{unit}"] for kind in kinds)
             ax.fill_between(time, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
-            ax.plot(time, curves["force_measured_N"], color=MEASURED, lw=2.2, alpha=0.55, label="measured")
-            ax.plot(time, curves["force_predicted_N"], color=SIMULATED, lw=1.1, label="predicted")
+            ax.plot(time, measured, color=MEASURED, lw=2.2, alpha=0.55, label="measured")
+            ax.plot(time, predicted, color=SIMULATED, lw=1.1, label="predicted")
             kind = "fitted" if row["fitted"] else "held out"
-            ax.set_title(f"site {row['site']}, {kind}: {fixed(row['inside_percent'], 0)} % inside")
+            ax.set_title(f"site {_record(row)}, {kind}: {fixed(row['inside_percent'], 0)} % inside")
             ax.margins(x=0.01)
-            if i % columns == 0:
-                ax.set_ylabel("Force (N)")
+            if i % columns == 0 or quantity != "force":
+                ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
             if i + columns >= len(pairs):
                 ax.set_xlabel("Time (s)")
         legend_above(drawing, axes[0])
@@ -137,5 +143,5 @@ def prediction_figure(store: Results, content: Json) -> Figure | None:
         "sources, noise "
         "of the record and misfit of the model."
     )
-    alt = "Measured and predicted force with intervals: " + ", ".join(row["site"] for row, _ in pairs)
+    alt = "Measured and predicted force with intervals: " + ", ".join(_record(row) for row, _ in pairs)
     return Figure("predictions", svg(drawing, "predictions", alt), caption)

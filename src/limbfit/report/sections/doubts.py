@@ -30,7 +30,9 @@ def doubts(store: Results) -> Section:
 def _not_looked_at(store: Results) -> tuple[Note, ...]:
     """What failed, and so was not compared."""
     sites = [
-        str(row["site"]) for row in store.predicted if row.get("not_predicted", {}).keys() - {"one_material"}
+        str(row["record"])
+        for row in store.predicted
+        if row.get("not_predicted", {}).keys() - {"one_material"}
     ]
     failed = [f"Sites not compared with the others: {', '.join(sites)}."] if sites else []
     failed += [f"Not simulated: {text}." for text in store.predict.get("failed") or ()]
@@ -71,11 +73,12 @@ def _words(name: str) -> str:
 def _left_out_tables(store: Results, left_out: list[Json]) -> tuple[Table, ...]:
     if not left_out:
         return ()
+    fitted = [name for site in store.fitted for name in (site, *store.records_of(site))]
     rows = tuple(
         Row(
             (
                 heading(str(row["site"])),
-                Cell("fitted" if row["site"] in store.fitted else "held out"),
+                Cell("fitted" if row["site"] in fitted else "held out"),
                 numeric(fixed(100 * row["error"])),
                 numeric(fixed(100 * row["expected"])),
                 numeric(fixed(row["standardised"])),

@@ -11,8 +11,9 @@ from ...laws import OGDEN
 from ...shapes import SHAPES
 from ..formats import fixed, friction, number, symbol, unit_of
 from ..page import Prose, Section
+from ..site_tables import mean_and_deviation
 from ..store import Json, Results
-from ..tables import NOTHING, flatten, mean_and_deviation
+from ..tables import NOTHING, flatten
 from .priors import constraints
 
 Part = tuple[str, str]  # a heading and its paragraph
@@ -115,11 +116,13 @@ def _indentations(store: Results) -> str:
     if not store.traces:
         return ""
     facts = tuple(store.traces.values())
+    sites = len({one.get("site", name) for name, one in store.traces.items()})
+    words = "a record" if sites == len(facts) else f"{len(facts)} records"
     marked = sum(1 for site in store.sites if site.get("marker"))
     where = f" {marked} of their places come from skin markers in the image." if marked else ""
     noise = [fact["noise_N"] for fact in facts if fact.get("noise_N") is not None]
     return (
-        f"{len(facts)} sites have a record of time, displacement and force; {len(store.fitted)} were fitted "
+        f"{sites} sites have {words} of time, displacement and force; {len(store.fitted)} were fitted "
         f"({', '.join(store.fitted)}).{where} The indenter's axis is the mean inward normal of the skin "
         "under it "
         "unless the study states one. Touch-down is where the force of each record leaves its baseline as a "
@@ -209,12 +212,17 @@ def _contact(store: Results) -> str:
         else "a stiffness with which a reference tissue lets it sink in by 0.3 % of the depth at most"
     )
     deepest = [row["penetration_mm"] for row in store.predicted if row.get("penetration_mm") is not None]
+    others = "; ".join(
+        f"{name}, a {SHAPES[one['shape']].said(one)}, {friction(one.get('friction'))}"
+        for name, one in _settings(store, "indenters").items()
+    )
     return _said(
         (
             "Nodes on bones and on the proximal cut are fixed. A rigid "
             f"{SHAPES[indenter['shape']].said(indenter)} starts where it just touches the skin and follows "
             f"the recorded displacement along its axis; contact is {friction(indenter.get('friction'))}, by "
             f"a penalty at the skin's quadrature points with {stiff}.",
+            f"Some records are of other indenters: {others}." if others else "",
             f"The largest penetration was {fixed(max(deepest), 3)} mm." if deepest else "",
         )
     )
@@ -338,7 +346,8 @@ def _uncertainty(store: Results) -> str:
         return ""
     sites = residuals.get("sites") or {}
     words = ", ".join(
-        f"{name} {fixed(one.get('noise_sd_N'), 3)} N and {fixed(one.get('misfit_sd_N'), 3)} N"
+        f"{name} {fixed(one.get('noise_sd_N'), 3)} and {fixed(one.get('misfit_sd_N'), 3)} "
+        + str(one.get("unit", "N"))
         for name, one in sites.items()
     )
     return (
@@ -352,7 +361,7 @@ def _uncertainty(store: Results) -> str:
 def _prediction(store: Results) -> str:
     if not store.predict:
         return ""
-    held = [row for row in store.predicted if not row.get("fitted")]
+    held = {row["site"] for row in store.predicted if not row.get("fitted")}
     others = f" and {mean_and_deviation(store, 'heldout')} % at {len(held)} held-out sites" if held else ""
     return (
         "The error of a site is the mean absolute force difference over the trace over the largest "

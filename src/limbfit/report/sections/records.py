@@ -105,7 +105,7 @@ def trace_table(store: Results) -> Table:
                 *(numeric(fixed(facts.get(key), digits)) for key, digits in keys),
                 Cell(facts.get("phases_in_words") or NOTHING),
             ),
-            site in store.fitted,
+            facts.get("site", site) in store.fitted,
         )
         for site, facts in store.traces.items()
     )

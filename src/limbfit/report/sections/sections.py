@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from .. import tables
+from .. import site_tables, tables
 from ..drawing import figures, pictures
 from ..drawing.interactive import convergence_curves, explorer, record_curves
 from ..drawing.slices import slices_figure
@@ -111,7 +111,8 @@ def meshes(store: Results) -> Section:
 
 def records(store: Results) -> Section:
     """Indentation records."""
-    chosen = [site for site in (*store.fitted, *store.traces) if store.curves("traces", site)]
+    fitted = [name for site in store.fitted for name in store.records_of(site)]
+    chosen = [name for name in (*fitted, *store.traces) if store.curves("traces", name)]
     blocks = _blocks(
         record_figure(store, chosen[0]) if chosen else None,
         record_curves(store, tuple(dict.fromkeys(chosen))),
@@ -136,7 +137,7 @@ def prediction(store: Results) -> Section:
     """Everything about the sites that were not used, and table 2."""
     rows = [row for row in store.predicted if not row.get("fitted")]
     blocks = _blocks(
-        tables.site_table(store) if store.predicted else None,
+        site_tables.site_table(store) if store.predicted else None,
         figures.error_figure(store),
         figures.force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
@@ -261,7 +262,7 @@ def solver(store: Results) -> Section:
         "Element": store.calibration.get("element"),
     }
     known = {key: value for key, value in facts.items() if value is not None}
-    failed = [str(row["site"]) for row in store.predicted if not row.get("completed")]
+    failed = [str(row["record"]) for row in store.predicted if not row.get("completed")]
     warning = (
         f"The simulation did not reach the end of the record at: {', '.join(failed)}." if failed else None
     )

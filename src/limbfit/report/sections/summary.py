@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 
-from .. import tables
+from .. import site_tables, tables
 from ..formats import fixed, number, symbol
 from ..page import Block, Bullets, KeyNumber, Prose
 from ..store import Results
@@ -17,7 +17,7 @@ def key_numbers(store: Results) -> tuple[KeyNumber, ...]:
     """The numbers that a reader looks for first."""
     found = []
     if store.predict:
-        heldout, fitted = (tables.mean_and_deviation(store, which) for which in ("heldout", "fitted"))
+        heldout, fitted = (site_tables.mean_and_deviation(store, which) for which in ("heldout", "fitted"))
         found.append(KeyNumber(heldout, "%", "mean force error at the held-out sites"))
         found.append(KeyNumber(fitted, "%", "mean force error at the fitted sites"))
     for tissue in store.tissues:
@@ -79,14 +79,15 @@ def _how_well(store: Results) -> str:
     if not store.predict:
         return ""
     if not held:
-        return f"At the fitted sites the force error is {tables.mean_and_deviation(store, 'fitted')} %."
-    places = "the one site that was" if len(held) == 1 else f"the {len(held)} sites that were"
+        return f"At the fitted sites the force error is {site_tables.mean_and_deviation(store, 'fitted')} %."
+    sites = len({row["site"] for row in held})
+    places = "the one site that was" if sites == 1 else f"the {sites} sites that were"
     errors = [row["error_percent"] for row in held if row.get("error_percent") is not None]
     worst = f" (largest {fixed(max(errors))} %)" if errors else ""
     return (
         f"At {places} not used, the model predicts the force with a mean error of "
-        f"{tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted sites "
-        f"it is {tables.mean_and_deviation(store, 'fitted')} %."
+        f"{site_tables.mean_and_deviation(store, 'heldout')} % of the largest force{worst}; at the fitted "
+        f"sites it is {site_tables.mean_and_deviation(store, 'fitted')} %."
     )
 
 

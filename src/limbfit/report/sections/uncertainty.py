@@ -217,7 +217,7 @@ def _predictions(content: Json) -> Table:
     rows = tuple(
         Row(
             (
-                heading(row["site"]),
+                heading(row.get("record", row["site"])),
                 numeric(
                     f"not predicted: {row['reason']}"
                     if row.get("reason")

@@ -15,8 +15,10 @@ function againstChoice(changed) {
 }
 
 /** The curves of one site for a chart. */
-function forceCurves(curves, site, against) {
+function forceCurves(curves, site, chosen) {
+  const against = curves[chosen] ? chosen : "time_s";
   const x = curves[against];
+  if (curves.displacement_measured_mm) return depthCurves(curves, site, against);
   const one = (label, column, colour, more) => ({ label, colour, x, y: curves[column], ...more });
   const found = [
     one("measured", "force_measured_N", "--measured", { width: 3 }),
@@ -26,7 +28,17 @@ function forceCurves(curves, site, against) {
   ].filter((series) => series.y);
   const band = curves.force_low_N && against === "time_s"
     ? { label: "95 % interval", colour: "--simulated", x, low: curves.force_low_N, high: curves.force_high_N } : null;
-  return { label: `Force at site ${site}.`, x: AGAINST[against], y: FORCE, series: found, band };
+  return { label: `Force at site ${curves.record ?? site}.`, x: AGAINST[against], y: FORCE, series: found, band };
+}
+
+/** The same of a record under a stated force, whose depths are compared. */
+function depthCurves(curves, site, against) {
+  const x = curves[against];
+  const one = (label, kind, colour, more) => ({ label, colour, x, y: curves[`displacement_${kind}_mm`], ...more });
+  const series = [one("measured", "measured", "--measured", { width: 3 }), one("one material", "one_material", "--one-material", { dash: "dashed" }),
+    one(curves.materials, "simulated", "--simulated", {})].filter((line) => line.y);
+  const band = curves.displacement_low_mm ? { label: "95 % interval", colour: "--simulated", x, low: curves.displacement_low_mm, high: curves.displacement_high_mm } : null;
+  return { label: `Displacement at site ${curves.record ?? site}.`, x: AGAINST[against], y: AGAINST.displacement_mm, series, band };
 }
 
 class Explorer {

@@ -220,12 +220,14 @@ class IdentificationView {
     }
     this.curveNote.textContent = `Simulated: ${found.of}.`;
     const { time_s: x, displacement_mm: depth } = found;
-    const series = [{ label: "measured", colour: "--measured", width: 2, x, y: found.force_measured_N },
-      { label: "simulated", colour: "--simulated", dash: "dashed", width: 2.5, x, y: found.force_simulated_N }].filter((line) => line.y);
-    if (found.force_one_material_N) series.push({ label: "one material", colour: "--second", dash: "dotted", width: 1.5, x, y: found.force_one_material_N });
-    const band = found.force_low_N ? { label: "95 %", colour: "--simulated", x, low: found.force_low_N, high: found.force_high_N } : undefined;
-    this.plot("curves", this.curveHost, { label: `Force at site ${name}, to ${Math.max(...depth).toFixed(1)} mm.`, x: { title: "Time from touch-down", unit: "s" },
-      y: { title: "Force", unit: "N" }, series, band }, 250);
+    const y = found.displacement_measured_mm ? { title: "Displacement", unit: "mm" } : { title: "Force", unit: "N" };
+    const of = (kind) => found[`${y.title.toLowerCase()}_${kind}_${y.unit}`];
+    const series = [{ label: "measured", colour: "--measured", width: 2, x, y: of("measured") },
+      { label: "simulated", colour: "--simulated", dash: "dashed", width: 2.5, x, y: of("simulated") }].filter((line) => line.y);
+    if (of("one_material")) series.push({ label: "one material", colour: "--second", dash: "dotted", width: 1.5, x, y: of("one_material") });
+    const band = of("low") ? { label: "95 %", colour: "--simulated", x, low: of("low"), high: of("high") } : undefined;
+    this.plot("curves", this.curveHost, { label: `${y.title} at site ${name}, to ${Math.max(...(depth ?? of("measured"))).toFixed(1)} mm.`, x: { title: "Time from touch-down", unit: "s" },
+      y, series, band }, 250);
   }
 
   // --- the answer -----------------------------------------------------------------------------------------

@@ -58,7 +58,8 @@ class ResultsView {
     } catch (error) {
       return this.context.warn(error.message);
     }
-    const { sites } = this.scene;
+    const sites = this.scene.sites.flatMap((site) => (site.records.length ? site.records.map((name) => ({ ...site, name })) : [site]));
+    this.indentations = sites;
     replace(this.site, ...sites.map((site) => el("option", { value: site.name }, [site.name, site.region, site.fitted ? "fitted" : "held out"].filter(Boolean).join(", "))));
     if (!sites.some((site) => site.name === this.chosen)) this.chosen = sites[0]?.name ?? null;
     this.showRuns();
@@ -82,7 +83,7 @@ class ResultsView {
     const mark = JSON.stringify([name, sources]);
     if (mark === this.opened) return;
     this.opened = mark;
-    await this.player.open(this.scene.sites.find((site) => site.name === name), sources, this.scene.frame);
+    await this.player.open(this.indentations.find((site) => site.name === name), sources, this.scene.frame);
   }
 
   showSite({ sources, downloads, simulating, failure }) {
@@ -135,7 +136,7 @@ class ResultsView {
   async readCurves() {
     const name = this.chosen, path = `results/curves/${encodeURIComponent(name)}`;
     const read = (more) => this.context.api.get(path + more).catch(() => null);
-    const has = (run) => run?.sites.some((row) => row.site === name);
+    const has = (run) => run?.sites.some((row) => row.record === name);
     const [ours, theirs] = await Promise.all([has(this.outcome) ? read("") : null, has(this.beside) ? read(`?kept=${encodeURIComponent(this.other)}`) : null]);
     if (name !== this.chosen) return;
     this.curves = { ours, theirs };
@@ -156,19 +157,22 @@ class ResultsView {
   }
 
   curveContent(ours, theirs) {
-    const x = ours[this.against];
+    const against = ours[this.against] ? this.against : "time_s";
+    const x = ours[against];
+    const y = ours.displacement_measured_mm ? { title: "Displacement", unit: "mm" } : { title: "Force", unit: "N" };
+    const of = (kind, curves = ours) => curves?.[`${y.title.toLowerCase()}_${kind}_${y.unit}`];
     const one = (label, colour, y, more = {}) => ({ label, colour, x, y, ...more });
     const series = [
-      one("measured", "--measured", ours.force_measured_N, { width: 3 }),
-      one("one material", "--second", ours.force_one_material_N, { dash: "dashed" }),
-      one("this run", "--simulated", ours.force_simulated_N),
+      one("measured", "--measured", of("measured"), { width: 3 }),
+      one("one material", "--second", of("one_material"), { dash: "dashed" }),
+      one("this run", "--simulated", of("simulated")),
     ].filter((line) => line.y);
-    if (theirs?.force_simulated_N) series.push({ label: this.other, colour: "--third", dash: "dashdot", x: theirs[this.against], y: theirs.force_simulated_N });
-    if (this.time !== null && this.against === "time_s" && this.player.times.length > 1) {
-      series.push({ label: "moment shown", colour: "--soft", width: 1, dash: "dotted", x: [this.time, this.time], y: [0, Math.max(...ours.force_measured_N)] });
+    if (of("simulated", theirs)) series.push({ label: this.other, colour: "--third", dash: "dashdot", x: theirs[against], y: of("simulated", theirs) });
+    if (this.time !== null && against === "time_s" && this.player.times.length > 1) {
+      series.push({ label: "moment shown", colour: "--soft", width: 1, dash: "dotted", x: [this.time, this.time], y: [0, Math.max(...of("measured"))] });
     }
-    const band = this.against === "time_s" && ours.force_low_N ? { label: "95 % interval", colour: "--simulated", x, low: ours.force_low_N, high: ours.force_high_N } : null;
-    return { label: `Force at site ${this.chosen}.`, x: AXES[this.against], y: { title: "Force", unit: "N" }, series, band };
+    const band = against === "time_s" && of("low") ? { label: "95 % interval", colour: "--simulated", x, low: of("low"), high: of("high") } : null;
+    return { label: `${y.title} at site ${this.chosen}.`, x: AXES[against], y, series, band };
   }
 
   /** The moment that the player shows, as a line in the curves. */
@@ -216,9 +220,9 @@ class ResultsView {
   siteTable() {
     const { sites, means } = this.outcome;
     if (!sites.length) return el("p", { class: "hint" }, "No predictions are stored yet: run the study (view Identification).");
-    const other = new Map((this.beside?.sites ?? []).map((row) => [row.site, row]));
-    const rows = sites.map((row) => [row.site, row.region, row.fitted ? "fitted" : "held out", shortNumber(row.peak_force_N),
-      shortNumber(row.error_one_material_percent), shortNumber(row.error_percent), ...(this.beside ? [shortNumber(other.get(row.site)?.error_percent)] : [])]);
+    const other = new Map((this.beside?.sites ?? []).map((row) => [row.record, row]));
+    const rows = sites.map((row) => [row.record, row.region, row.fitted ? "fitted" : "held out", shortNumber(row.peak_force_N),
+      shortNumber(row.error_one_material_percent), shortNumber(row.error_percent), ...(this.beside ? [shortNumber(other.get(row.record)?.error_percent)] : [])]);
     const mean = (from, kind) => shortNumber(from?.[`mean_error_${kind}_percent`]);
     for (const [kind, text] of [["fitted", "mean, fitted"], ["heldout", "mean, held out"]]) {
       rows.push([text, "", "", "", "", mean(means, kind), ...(this.beside ? [mean(this.beside.means, kind)] : [])]);

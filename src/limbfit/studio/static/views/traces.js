@@ -34,7 +34,7 @@ class TracesView {
   }
 
   async refresh() {
-    const sites = this.context.study?.sites ?? [];
+    const sites = this.context.study?.indentations ?? [];
     if (this.dragging || !sites.length) return;
     if (!sites.some((site) => site.name === this.site)) this.site = (sites.find((site) => site.is_recorded) ?? sites[0]).name;
     this.list();
@@ -56,7 +56,7 @@ class TracesView {
 
   list() {
     const focused = this.side.contains(document.activeElement) ? document.activeElement.dataset.site : null;
-    const rows = this.context.study.sites.map((site) => {
+    const rows = this.context.study.indentations.map((site) => {
       const error = this.found.sites.find((row) => row.site === site.name)?.error;
       const flags = this.flags(site.name).length;
       const notes = [site.fitted ? "fitted" : "held out", site.region];
@@ -95,7 +95,7 @@ class TracesView {
 
   async open(name) {
     const turn = (this.turn = (this.turn ?? 0) + 1);
-    const site = this.context.study.sites.find((one) => one.name === name);
+    const site = this.context.study.indentations.find((one) => one.name === name);
     this.flagList = el("ul", { class: "plain flags" });
     this.doubts();
     const head = [el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList];

@@ -1,0 +1,142 @@
+"""Where a limb is indented, ``[[sites]]``, and what was recorded there, ``[[records]]``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from .tables import Positive, TomlTable, Vector
+
+Control = Literal["displacement", "force"]
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
+
+
+class _Stated(TomlTable):
+    """What is stated of a record, at its site or in a table of its own.
+
+    ``touch_down_s`` and ``peak_s`` are times of the record, where it is not to be left to limbfit to find
+    them. ``indenter`` is a name in ``[indenters]``; None: the one of ``[indenter]``. ``control`` is what was
+    stated to the machine, and drives the model; the other is compared.
+    """
+
+    name: str = Field(pattern=_NAME)
+    trace: Path | None = None
+    touch_down_s: float | None = None
+    peak_s: float | None = None
+    indenter: str | None = None
+    control: Control = "displacement"
+
+    @model_validator(mode="after")
+    def _in_order(self) -> _Stated:
+        if None not in (self.touch_down_s, self.peak_s) and self.touch_down_s >= self.peak_s:  # type: ignore[operator]
+            raise ValueError("touch_down_s must come before peak_s")
+        return self
+
+
+class Site(_Stated):
+    """An indentation site, with its record where it has one only; more are `RecordTable`.
+
+    ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
+    ``axis`` (into the limb) and ``edge`` (one edge direction of the square) are found when not given.
+    ``weight`` is how often a fitted site counts, however many records it has.
+    Where there is no record, ``depth_mm`` and ``speed_mm_s`` plan an indentation to be simulated.
+    """
+
+    region: str = ""
+    fitted: bool = False
+    weight: Positive = 1.0
+    depth_mm: Positive | None = None
+    speed_mm_s: Positive = 0.96
+    position: Vector | None = None
+    near: Vector | None = None
+    axis: Vector | None = None
+    edge: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Site:
+        if (self.position is None) == (self.near is None):
+            raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
+        for key in ("touch_down_s", "peak_s"):
+            if self.trace is None and getattr(self, key) is not None:
+                raise ValueError(f"{key} is a time of a record, and the site has no trace")
+        return self
+
+
+class RecordTable(_Stated):
+    """A record of ``site``, beside others there; ``name`` is its own among those."""
+
+    site: str
+    trace: Path
+
+    @field_validator("name")
+    @classmethod
+    def _free(cls, name: str) -> str:
+        if name == "raw":
+            raise ValueError("'raw' is what limbfit calls a record as it was recorded; give another name")
+        return name
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record, and what a stage asks of it.
+
+    ``name`` is the site's where the site states it, else ``<site>-<record>``: one name in files, tables and
+    messages. ``of_site`` is how many records the site has.
+    """
+
+    name: str
+    site: Site
+    trace: Path
+    key: str  # where the study file states it
+    touch_down_s: float | None = None
+    peak_s: float | None = None
+    indenter: str | None = None
+    control: Control = "displacement"
+    of_site: int = 1
+
+    @property
+    def forced(self) -> bool:
+        """Whether a force drove the indenter, so that depths are compared."""
+        return self.control == "force"
+
+    @property
+    def unit(self) -> Literal["N", "mm"]:
+        """Of what is compared."""
+        return "mm" if self.forced else "N"
+
+    @property
+    def fitted(self) -> bool:
+        return self.site.fitted
+
+    @property
+    def region(self) -> str:
+        return self.site.region
+
+    @property
+    def weight(self) -> float:
+        """Its share of the site's: records of a site count together as often as the site does."""
+        return self.site.weight / self.of_site
+
+
+Indentation = Record | Site  # a site is one where it plans an indentation
+
+
+def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
+    """The records of a site: its own, then those of the study's tables that name it."""
+    stated: list[tuple[str, str, _Stated]] = []
+    if site.trace is not None:
+        stated.append((site.name, f"sites.{site.name}", site))
+    for table in tables:
+        if table.site == site.name:
+            name = f"{site.name}-{table.name}"
+            stated.append((name, f"records.{name}", table))
+    return tuple(
+        Record(
+            name, site, one.trace, key, one.touch_down_s, one.peak_s, one.indenter, one.control, len(stated)
+        )
+        for name, key, one in stated
+        if one.trace is not None
+    )
