@@ -98,7 +98,7 @@ def test_walls_that_cannot_be_made_are_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mean", "limb-1", "limb-8"])
+@pytest.mark.parametrize("name", ["mean", "limb-2", "limb-8"])
 @pytest.mark.skipif(not FILES["mean"].is_file(), reason="shared/data is not here")
 def test_real_limbs(tmp_path: Path, name: str) -> None:
     limb = real_limb(name)

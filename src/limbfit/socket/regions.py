@@ -93,7 +93,7 @@ def _levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str, Mask]:
     bottom = float(height.min())
     level = np.floor(3.0 * (top - height) / (top - bottom + 1e-9)).astype(int)
     left = np.cross(known.proximal, known.anterior)
-    ahead, beside = np.empty(len(middles)), np.empty(len(middles))
+    ahead, beside = np.zeros(len(middles)), np.zeros(len(middles))
     for k in range(len(LEVELS)):  # sides are told from the middle of their level
         here = level == k
         spokes = middles[here] - middles[here].mean(axis=0) if here.any() else middles[here]

@@ -97,33 +97,36 @@ def _joined(socket: Socket, outer: Array, outwards: Array, thickness: float) -> 
 
 
 def _block(socket: Socket, axis: Array, diameter: float, below: float) -> Surface:
-    """The adapter's cylinder, up to where the cavity is wider than it is."""
+    """The adapter's cylinder under the middle of the distal end, up into the wall around it."""
     height = socket.points @ axis
-    lowest = socket.points[height.argmin()]
+    bottom, length = float(height.min()), float(np.ptp(height))
+    end = socket.points[height < bottom + min(diameter / 2, 0.25 * length)]
+    lowest = end.mean(axis=0)
+    lowest = lowest + (bottom - lowest @ axis) * axis
     spokes = socket.points - lowest
     across = np.linalg.norm(spokes - np.outer(spokes @ axis, axis), axis=1)
-    under = across < diameter / 2
-    top = float(height[under].max()) + 0.1 * below  # at no point's own height
-    if top > height.min() + 0.5 * np.ptp(height):
+    low = height < bottom + 0.5 * length
+    if diameter / 2 > np.percentile(across[low], 90):
         raise SurfaceError(
             f"an adapter of {diameter:g} mm is as wide as the socket",
             remedy="give a smaller diameter, or 0 for none",
         )
+    # At no point's own height, where faces would lie in each other.
+    top = float(height[low & (across < diameter / 2)].max()) + 0.1 * below
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     ring = diameter / 2 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-    low = lowest - below * axis
-    high = lowest + (top - float(height.min())) * axis
-    points = np.vstack([low + ring, high + ring, low, high])
+    foot, head = lowest - below * axis, lowest + (top - bottom) * axis
+    points = np.vstack([foot + ring, head + ring, foot, head])
     here, there = np.arange(AROUND), np.roll(np.arange(AROUND), -1)
-    bottom, lid = np.full(AROUND, 2 * AROUND), np.full(AROUND, 2 * AROUND + 1)
+    base, lid = np.full(AROUND, 2 * AROUND), np.full(AROUND, 2 * AROUND + 1)
     faces = np.vstack(
         [
             np.column_stack([here, there, there + AROUND]),
             np.column_stack([here, there + AROUND, here + AROUND]),
-            np.column_stack([there, here, bottom]),
+            np.column_stack([there, here, base]),
             np.column_stack([here + AROUND, there + AROUND, lid]),
         ]
     )
