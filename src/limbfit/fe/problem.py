@@ -189,6 +189,10 @@ class Problem:
         """What drives the rigid bodies at time ``t``."""
         return Drives.of([body.motion for body in self.rigid_bodies], t)
 
+    def travel(self, t: float) -> float:
+        """What grows evenly while the indenter moves, or what drives the further bodies changes."""
+        return self.history.travel(t) + sum(body.motion.moving_s(t) for body in self.bodies)
+
     @property
     def turns(self) -> NDArray[np.float64]:
         """Times where what drives a further body, or a pressure, turns, s."""
