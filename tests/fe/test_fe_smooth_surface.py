@@ -11,6 +11,7 @@ from limbfit.fe import (
     History,
     Motion,
     NeoHookean,
+    OgdenQLV,
     Problem,
     RigidBody,
     SmoothSurface,
@@ -164,3 +165,41 @@ def test_a_press_fit_by_growth_is_lames_and_comes_off_by_its_friction(mu):
     radial, axial = -found.reactions[-1, 0, 0], found.reactions[-1, 0, 2]
     assert radial == pytest.approx(pressure * b * height, rel=0.01)
     assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01, abs=1e-6 * radial)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_sensitivities_through_growth_equal_central_differences(mu):
+    """A cone grows onto a tube by 1 mm, and is pulled: displacements and axial force by the parameters."""
+    law = OgdenQLV(0.01, 4.0, 1.5, 0.4)
+    mesh = sector(np.linspace(10.0, 20.0, 4), 6)
+    sets = mesh.node_sets
+    planes = (Support(sets["y0"], 1), Support(sets["x0"], 0), Support(sets["ends"], 2))
+    height = float(mesh.points[:, 2].max())
+    wide, faces = pipe(20.2, 4.0 * height, 60)
+    final = wide * [0.95, 0.95, 1.0] * (1.0 + 0.002 * wide[:, 2:]) ** [1.0, 1.0, 0.0]
+    shape = SmoothSurface.of(final, faces, clear=wide, reach=4.0)
+    motion = Motion.of([0.0, 1.0], growth=[0.0, 1.0]).then(Motion.of([0.0, 1.0], z=[0.0, 0.3]))
+    body = RigidBody(shape, mesh.face_sets["outside"], motion, mu)
+    problem = Problem(
+        mesh, dict.fromkeys(mesh.region_names, law), np.zeros(0, int), np.zeros((0, 4), int), None, STILL,
+        supports=planes, bodies=(body,),
+    )  # fmt: skip
+    control = StepControl(
+        times=(0.4, 0.7, 1.0, 1.4, 2.0), penalty=100.0, hold_penalty=True, penetration=1.0, tolerance=1e-9
+    )
+    centre = solve(problem, control, sensitivities=True, store="all")
+    assert centre.completed, centre.reason
+    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, len(problem.parameters))
+
+    def changed(sign):
+        values = (problem.parameters + sign * change).reshape(-1, 4)
+        laws = {name: OgdenQLV(*row) for name, row in zip(mesh.region_names, values)}
+        return solve(problem.with_materials(laws), control, store="all")
+
+    ahead, back = changed(1), changed(-1)
+    force = 0.5 * (ahead.force - back.force)
+    assert np.abs(force).max() > 0.0
+    np.testing.assert_allclose(centre.force_sensitivity @ change, force, atol=1e-3 * np.abs(force).max())
+    u = 0.5 * (ahead.states[-1].u - back.states[-1].u)
+    slope = centre.states[-1].sensitivity @ change
+    np.testing.assert_allclose(slope, u, atol=1e-3 * np.abs(u).max())

@@ -75,7 +75,7 @@ class _Body:
         self.columns = slice(0, 0)
         nothing = np.zeros(surface.areas.size)
         vectors = np.zeros((nothing.size, 3))
-        self.loose = nothing > 0.0, vectors, vectors, nothing
+        self.loose = (nothing > 0.0, vectors, vectors, nothing), 1.0
 
     @property
     def pivot(self) -> Array:
@@ -191,8 +191,8 @@ class Bodies:
             weights[at] = penalty * areas
             found = contact(
                 (near.points, near.places, near.gaps, near.slopes, near.bends), tool.body.frame, weights[at],
-                areas, flat_from, body.loose if grip is None else grip.arrays, forces[at], gaps[at],
-                normals[at], blocks[at], stick[at],
+                areas, flat_from, *(body.loose if grip is None else (grip.arrays, grip.hardness)), forces[at],
+                gaps[at], normals[at], blocks[at], stick[at],
             )  # fmt: skip
             energy, deepest, area = energy + found[0], max(deepest, found[1]), area + found[2]
             pushed = np.flatnonzero(forces[at].any(axis=1))

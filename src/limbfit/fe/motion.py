@@ -12,6 +12,7 @@ from ..errors import ProblemError
 from .contact.rigid import RigidShape
 
 Array = NDArray[np.float64]
+HARDNESS_GROWING = 0.05  # of a surface that grows: its points move along it by tenths of a mm in a step
 # A body's coordinates: its move along the axes of its frame at the start, mm, and its rotation vector about
 # them, rad.  Conjugate to them are the force, N, and the moment about the pivot, N mm.
 COORDINATES = ("x", "y", "z", "turn_x", "turn_y", "turn_z")
@@ -121,6 +122,12 @@ class Motion:
         found = (1.0 - share) * start + share * end
         return found[:6], np.asarray(self.forced)[i], float(found[6])
 
+    def moving_s(self, t: float) -> float:
+        """How long anything has changed up to time ``t``, s."""
+        steps = np.diff(self.times)
+        moving = (np.diff(self._driven, axis=0) != 0.0).any(axis=1)
+        return float((np.clip(t - self.times[:-1], 0.0, steps) * moving).sum())
+
     @property
     def _driven(self) -> Array:
         """(n, 7) the values, and the growth."""
@@ -172,6 +179,10 @@ class RigidBody:
     faces : (f, k) outward boundary faces that it may touch.
     motion : what drives it.
     friction : as in `Problem`.
+    hardness : stiffness that holds a point along the body until it slips by Coulomb's law, over that of the
+        contact; where not given 0.05 for shapes that grow, 1 for others.  The softer, the wider is what
+        sticking goes over into slipping in, the coefficient times the penetration over the hardness, and the
+        quicker is the solution.
     pivot : (3,) mm, the point about which it turns; the shape's centre where not given.
     name : for messages and results.
     """
@@ -182,12 +193,22 @@ class RigidBody:
     friction: str | float = "frictionless"
     pivot: Sequence[float] | Array | None = None
     name: str = ""
+    hardness: float | None = None
 
     def __post_init__(self) -> None:
+        if self.hardness is not None and not 0.0 < self.hardness <= 1.0:
+            raise ProblemError(f"a hardness of {self.hardness} is not between 0 and 1")
         if self.pivot is not None:
             pivot = np.asarray(self.pivot, dtype=float)
             if pivot.shape != (3,) or not np.isfinite(pivot).all():
                 raise ProblemError("the pivot of a rigid body is not three finite numbers")
+
+    @property
+    def holding(self) -> float:
+        """The hardness, or what stands for it."""
+        if self.hardness is not None:
+            return self.hardness
+        return HARDNESS_GROWING if self.shape.grows else 1.0
 
     @property
     def origin(self) -> Array:

@@ -198,6 +198,10 @@ class Problem:
         bodies = tuple(replace(body, motion=motion) for body, motion in zip(self.bodies, moved))
         return replace(self, bodies=bodies)
 
+    def travel(self, t: float) -> float:
+        """What grows evenly while the indenter moves, or what drives the further bodies changes."""
+        return self.history.travel(t) + sum(body.motion.moving_s(t) for body in self.bodies)
+
     @property
     def turns(self) -> NDArray[np.float64]:
         """Times where what drives a further body, or a pressure, turns, s."""

@@ -148,16 +148,17 @@ def check_clear(surface: ContactSurface, indenter: RigidShape, name: str = "inde
 
 @njit(cache=True)
 def contact(  # type: ignore[no-untyped-def]
-    near, frame, weights, areas, flat_from, grip, forces, gaps, normals, blocks, stick
+    near, frame, weights, areas, flat_from, grip, hardness, forces, gaps, normals, blocks, stick
 ):  # fmt: skip
     """Energy and forces of the contact points of one body; the hessian is that of the springs ``blocks``.
 
     ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
     ``weights, areas (c,)``: penalty times area (N/mm) and area of every point.  ``flat_from``: penetration
     from which a point's tangent leaves the body's curvature out (mm).  ``grip``: the held points, their
-    anchors, normals and bounds (`Grip`).  ``forces (c, 3)`` receive the derivative of the energy with respect
-    to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks (c, 3, 3)`` distance, its gradient and
-    the tangent of each point, ``stick (c, 3, 3)`` the part of the tangent that holds it along the body.
+    anchors, normals and bounds (`Grip`), by ``hardness`` times the weights.  ``forces (c, 3)`` receive the
+    derivative of the energy with respect to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks (c,
+    3, 3)`` distance, its gradient and the tangent of each point, ``stick (c, 3, 3)`` the part of the tangent
+    that holds it along the body.
     Returns energy, largest penetration (mm), reference area in touch (mm^2).
     """
     points, local, phis, slopes, bends = near
@@ -180,7 +181,7 @@ def contact(  # type: ignore[no-untyped-def]
                 for j in range(3):
                     h[i, j] = w * (g[i] * g[j] + (phi * bends[p, i, j] if phi > -flat_from else 0.0))
         if held[c]:
-            energy += _hold(local[p], places[c], planes[c], bounds[c], w, t, hold)
+            energy += _hold(local[p], places[c], planes[c], bounds[c], hardness * w, t, hold)
             _rotated(frame, hold, stick[c])
             for i in range(3):
                 for j in range(3):

@@ -4,8 +4,8 @@ The force of a point in touch is at most ``mu`` times its normal force.  In a st
 the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are those of the last equilibrium: a
 convex potential (as in incremental potential contact, Li et al. 2020).  The step is solved again with new
 ones until they do not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks
-by the penalty of the contact, so the width in which sticking goes over into slipping is ``mu`` times the
-penetration.
+by ``hardness`` times the penalty of the contact, so the width in which sticking goes over into slipping is
+``mu`` times the penetration over the hardness.
 
 A point is anchored where it is at the end of the step in which it first touched; the anchor of one that slips
 follows it at the distance of the bound (return mapping, Wriggers 2006, chapter 5.2).  So what sticks does not
@@ -29,17 +29,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Coulomb(Grip):
-    """A `Grip` whose bounds are ``mu`` times the penetration."""
+    """A `Grip` whose bounds are ``mu`` times the penetration, over the ``hardness``."""
 
     mu: float
+    hardness: float
 
     lags: ClassVar[bool] = True
 
     @classmethod
-    def none(cls, mu: float, surface: ContactSurface, parameters: int = 0) -> Coulomb:
+    def none(cls, mu: float, surface: ContactSurface, parameters: int = 0, hardness: float = 1.0) -> Coulomb:
         shape = surface.areas.shape
         nothing, vectors = np.zeros(shape), np.zeros((*shape, 3))
-        return cls(nothing > 0.0, vectors, vectors, nothing, np.zeros((*shape, 3, parameters)), mu)
+        return cls(nothing > 0.0, vectors, vectors, nothing, np.zeros((*shape, 3, parameters)), mu, hardness)
 
     def renewed(self, tool: Tool) -> Coulomb:
         """Planes and bounds as they are where the tool is."""
@@ -48,7 +49,7 @@ class Coulomb(Grip):
     def _at(self, near: Distances) -> Coulomb:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
         normals.reshape(-1, 3)[near.points] = near.normals
-        bounds.ravel()[near.points] = self.mu * np.maximum(-near.gaps, 0.0) * near.steepness
+        bounds.ravel()[near.points] = self.mu / self.hardness * np.maximum(-near.gaps, 0.0) * near.steepness
         return replace(self, normals=normals, bounds=bounds)
 
     def after(self, tool: Tool, du: Array | None) -> Coulomb:
@@ -71,15 +72,16 @@ class Coulomb(Grip):
 
     def explicit(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
-        return np.asarray(-_Slip.of(self, tool.local).tangent @ self.d_places)
+        return np.asarray(-self.hardness * _Slip.of(self, tool.local).tangent @ self.d_places)
 
     def coupling(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, 3) of the forces, over penalty and area, through planes and bounds, which are
         those that hold where the tool is."""
         near = Distances.of(tool, self.held)
-        return self._coupling(near, _Slip.of(self, tool.local))
+        return self.hardness * self._coupling(near, _Slip.of(self, tool.local))
 
     def _coupling(self, near: Distances, slip: _Slip) -> Array:
+        """That of the elastic part of the slip."""
         bends, deeper = np.zeros(slip.tangent.shape), np.zeros(slip.move.shape)
         bends.reshape(-1, 3, 3)[near.points] = near.tilts
         deeper.reshape(-1, 3)[near.points] = near.pressing
@@ -87,7 +89,7 @@ class Coulomb(Grip):
         across = np.einsum("fqi,fqi->fq", n, move)[..., None, None]
         turned = -(across * bends + n[..., None] * np.einsum("fqi,fqij->fqj", move, bends)[:, :, None])
         along = np.einsum("fqi,fqij->fqj", slip.unit, turned)[:, :, None]
-        yielding = self.mu * slip.unit[..., None] * deeper[:, :, None]
+        yielding = self.mu / self.hardness * slip.unit[..., None] * deeper[:, :, None]
         yielding += slip.share * (turned - slip.unit[..., None] * along)
         found = np.where(slip.stuck[..., None, None], turned, yielding)
         return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)

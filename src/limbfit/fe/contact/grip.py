@@ -40,6 +40,8 @@ class Grip(ABC):
     bounds: Array
     d_places: Array
 
+    # Stiffness that holds a point over that of the contact.
+    hardness = 1.0
     # Whether a step holds something constant that follows the displacement (`coupling`).
     lags: ClassVar[bool] = False
 

@@ -40,6 +40,9 @@ NEARLY = 0.1
 MOST_RENEWALS, UNSETTLED = 30, 1e-2
 # Renewals in a row that may bring it no closer: then it goes round, or away.
 VAIN_RENEWALS, CLOSER = 6, 0.9
+# Force over the mean shear modulus and the square of a body's width against which a residual is judged before
+# anything is touched.
+NOTHING = 1e-6
 # Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
 STEEP_PRESSURE = 15.0
 
@@ -72,10 +75,11 @@ class Simulation:
         self.damping = 0.0  # to begin a step with, after one that needed it
         self.grips = _grips(self.system, self.laws.count if sensitivities else 0)
         self.warm = Warm.of(problem, warm_start)
-        self.floor, self.pushing = 0.0, False
-        width = problem.indenter.width if problem.indenter is not None else 1.0
+        widths = [body.shape.width for body in problem.rigid_bodies]
+        width = min(widths, default=1.0)
+        self.floor, self.pushing = NOTHING * self.laws.modulus * width**2, False
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
-        self.deepest = control.penetration * _travel(problem, self.laws.modulus)
+        self.deepest = control.penetration * _travel(self.system, self.laws.modulus)
         rest, drives = np.zeros((self.system.rows, 3)), problem.drives(0.0)
         if self.system.bodies is not None:
             rest = self.system.bodies.impose(rest, drives)
@@ -221,9 +225,14 @@ class Simulation:
         return np.asarray(sum(w * state.rows for w, state in zip(weights, self.states)))
 
     def _foreseen(self, t: float) -> Array:
-        """Weights of the last states in a guess of the one at time ``t``."""
-        travel = self.problem.history.travel
-        return extrapolation([travel(state.time) for state in self.states], travel(t))
+        """Weights of the last states in a guess of the one at time ``t``; those before a further body turned
+        say nothing of it."""
+        travel, little = self.problem.travel, 1e-9 * t
+        turned = max((turn for turn in self.problem.turns if turn < t - little), default=-np.inf)
+        known = [state for state in self.states if state.time >= turned - little]
+        weights = np.zeros(len(self.states))
+        weights[-len(known) :] = extrapolation([travel(state.time) for state in known], travel(t))
+        return weights
 
     def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
         started = time.perf_counter()
@@ -322,15 +331,20 @@ class Simulation:
         return du, at.force * d_penalty + d_reaction + d_force
 
 
-def _travel(problem: Problem, modulus: float) -> float:
-    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement.
+def _travel(system: System, modulus: float) -> float:
+    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
+    or how deep the tissue at rest lies in what a body grows to.
 
     Where only forces drive bodies it is that of a flat punch on a half-space of the tissue's shear
     ``modulus``, ``F / (4 mu w)``, and no more than half a width.
     """
-    bodies = problem.rigid_bodies
-    if not bodies:
-        return float(np.abs(problem.history.driver).max())
+    bodies = system.problem.rigid_bodies
+    if system.bodies is None:
+        return float(np.abs(system.problem.history.driver).max())
+    grown = [-one.surface.gaps_at_rest(one.start.grown(1.0)).min() for one in system.bodies.all
+             if one.stated.motion.grows]  # fmt: skip
+    if max(grown, default=0.0) > 0.0:
+        return float(max(grown))
     sizes = [np.abs(np.nan_to_num(body.motion.values[:, :3])) for body in bodies]
     ways = [np.where(body.motion.free[:3], 0.0, size).max() for body, size in zip(bodies, sizes)]
     if max(ways) > 0.0:
@@ -350,7 +364,7 @@ def _grips(system: System, parameters: int) -> tuple[Grip | None, ...]:
         elif isinstance(friction, str):
             found.append(Anchors.none(body.surface, parameters))
         else:
-            found.append(Coulomb.none(float(friction), body.surface, parameters))
+            found.append(Coulomb.none(float(friction), body.surface, parameters, body.stated.holding))
     return tuple(found)
 
 
