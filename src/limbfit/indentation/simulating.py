@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +91,8 @@ _KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest u
 # The tissue that sets a site's contact penalty, whatever law the site's own have.
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}
 _REFERENCE_STEPS, _REFERENCE_MM = 4, 65.0  # to the deepest point; from the site
-# Of the penetration that is allowed: two of 24 tissues drawn over the bounds then go 1.3 times beyond it.
-_MARGIN = 0.3
+# Of the penetration that is allowed: three of 24 tissues drawn over the bounds then go beyond it.
+_MARGIN = 0.5
 
 
 @dataclass
@@ -121,17 +122,17 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     """The site's discretisation and contact penalty; sites not used for longest are forgotten."""
     known = _prepared.get((model, tissues))
     if known is None:
-        mesh, reference, control = read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE), steps_of(model)
-        usual = replace(model, law=OGDEN)
-        problem = build_problem(usual, mesh, reference)
-        system = System(problem, control.threads)
-        penalty = control.penalty
+        problem = build_problem(
+            replace(model, law=OGDEN), read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE)
+        )
+        control = steps_of(model)
+        penalty, system = control.penalty, System(problem, control.threads)
         if penalty is None:
-            near = problem
-            if model.within_mm is None or model.within_mm > _REFERENCE_MM or model.forced:
-                within = min(model.within_mm or _REFERENCE_MM, _REFERENCE_MM)
-                near = build_problem(replace(usual, within_mm=within, knots_N=()), mesh, reference)
-            penalty = _reference_penalty(near, control, system)
+            is_farther = model.within_mm is None or model.within_mm > _REFERENCE_MM
+            # Under a stated force too it is driven by its displacement.
+            near = replace(model, knots_N=(), within_mm=_REFERENCE_MM if is_farther else model.within_mm)
+            allowed = _MARGIN * control.penetration
+            penalty = max(_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
     while (
@@ -141,19 +142,23 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     return known
 
 
-def _reference_penalty(problem: Problem, control: StepControl, system: System) -> float | None:
-    """The contact penalty that reference tissue needs at the deepest point it reaches; None where at none.
+@lru_cache(maxsize=64)
+def _yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
+    """How far reference tissue lets the indenter sink in, over the way, times the contact penalty (1/mm).
 
-    All simulations of a site hold it, on a part of its mesh and on the whole: it is that of the tissue near
-    the site.  One that each found for itself would change in steps with the parameters, and the force by a
-    percent with it; one taken over from the simulation before makes the answer depend on what that was.
-    Where other tissue lets the indenter sink in farther, the result says so.
+    Over the penetration that is allowed it is the penalty, which all simulations of a site hold.  One that
+    each found for itself would change in steps with the parameters, and the force by a percent with it; one
+    taken over from the simulation before makes the answer depend on what that was.  Where other tissue lets
+    the indenter sink in farther, the result says so.  Zero where the reference goes nowhere.
     """
+    mesh = read_vtu(model.mesh)
+    problem = build_problem(replace(model, law=OGDEN), mesh, dict.fromkeys(tissues, _REFERENCE))
     deepest = problem.history.peak or float(problem.history.times[-1])
     times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
-    control = replace(control, times=times, penetration=_MARGIN * control.penetration)
-    found = solve(problem, steps=control, store="peak", system=system)
-    return found.states[0].penalty if found.states else None
+    found = solve(problem, steps=replace(steps_of(model), times=times), store="peak")
+    if not found.states:
+        return 0.0
+    return float(found.penetration[-1] / found.displacement[-1]) * found.states[-1].penalty
 
 
 def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:

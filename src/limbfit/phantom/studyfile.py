@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..anatomy.meshing.layers import LayerSpec
-from .forces import PENALTY_PER_MM
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 _HEAD = """\
@@ -29,11 +28,6 @@ shape = "square"
 width_mm = {width:.1f}
 edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sharp edge they never do
 
-[solver]        # fewer steps and a stated contact: within 1 % of the peak, in three quarters of the time
-load_steps = {load}
-unload_steps = {unload}
-penalty_per_mm = {penalty:.0f}
-
 {mesh}# One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
 # The fitted sites identify the material; all others are predicted and compared.
 """
@@ -48,7 +42,6 @@ accuracy = "fine"
 """,
 }
 
-STEPS = {"load": 6, "unload": 8}
 _SURFACE_EDGE_MM = {"coarse": 4.0, "paper": 3.0}
 
 _SITE = """
@@ -70,8 +63,6 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         surface=_SURFACE_EDGE_MM[detail],
         width=INDENTER_MM,
         edge=INDENTER_EDGE_MM,
-        **STEPS,
-        penalty=PENALTY_PER_MM,
         mesh=_MESH[detail],
     )
     parts = [head]

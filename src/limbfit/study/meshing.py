@@ -107,13 +107,24 @@ class MeshTable(TomlTable):
         if not isinstance(given, Mapping):
             return given
         own, coarse = ACCURACIES.get(str(given.get("accuracy", "standard")), ACCURACIES["standard"])
-        stated = own.keys() & given.keys()
-        return {**own, "coarse": None if stated else coarse, **given}
+        near = given.get("edge_near_mm", 0.0)
+        if coarse and isinstance(near, int | float) and near >= coarse["edge_near_mm"]:
+            coarse = None  # it would be no coarser
+        return {**own, "coarse": coarse, **given}
 
     @model_validator(mode="after")
     def _few_enough(self) -> MeshTable:
         _refuse_too_many(self)
         return self
+
+    @property
+    def stands_for(self) -> str | None:
+        """The ``accuracy`` whose edges these are; none where the study states others."""
+        for name, (own, coarse) in ACCURACIES.items():
+            table = None if self.coarse is None else self.coarse.model_dump()
+            if table == coarse and all(getattr(self, key) == edge for key, edge in own.items()):
+                return name
+        return None
 
     @property
     def cell_type(self) -> Literal["tet4", "tet10"]:

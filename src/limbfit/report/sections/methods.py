@@ -154,10 +154,11 @@ def _meshes(store: Results) -> str:
         return ""
     facts = tuple(store.mesh.values())
     element = table.get("element") or facts[0].get("element")
+    knob = f" (mesh.accuracy = “{table['accuracy']}”)" if table.get("accuracy") else ""
     edges = (
         f" by {table.get('engine')}: edges of {table['edge_near_mm']} mm within "
         f"{table.get('near_radius_mm')} mm of the site, growing at {table.get('growth')} per mm "
-        f"to {table.get('edge_far_mm')} mm"
+        f"to {table.get('edge_far_mm')} mm{knob}"
         if "edge_near_mm" in table
         else ""
     )
@@ -209,7 +210,8 @@ def _contact(store: Results) -> str:
     stiff = (
         f"a stiffness of {penalty} per mm times the mean instantaneous shear modulus"
         if penalty
-        else "a stiffness with which a reference tissue lets it sink in by 0.3 % of the depth at most"
+        else "a stiffness with which a reference tissue lets it sink in by 1 % of the depth at most"
+        f"{_penalties(store)}"
     )
     deepest = [row["penetration_mm"] for row in store.predicted if row.get("penetration_mm") is not None]
     others = "; ".join(
@@ -226,6 +228,14 @@ def _contact(store: Results) -> str:
             f"The largest penetration was {fixed(max(deepest), 3)} mm." if deepest else "",
         )
     )
+
+
+def _penalties(store: Results) -> str:
+    """The stiffnesses of contact that the fitted sites were given."""
+    sites = (store.calibration.get("contact") or {}).values()
+    values = [one["penalty_per_mm"] for one in sites if one.get("penalty_per_mm") is not None]
+    ends = f"{number(min(values))} to {number(max(values))}" if values else ""
+    return f" ({ends} per mm times the mean instantaneous shear modulus)" if values else ""
 
 
 def _solution(store: Results) -> str:

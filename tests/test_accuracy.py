@@ -1,0 +1,115 @@
+"""What a study that states no tuning is solved with; the one knob, and what goes before it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from layered import layered_block
+from limbfit.bench.blocks import SPEED, block_site
+from limbfit.errors import StudyError
+from limbfit.indentation import SimulationJob, simulate
+from limbfit.indentation.sites import ROUGHLY
+from limbfit.pipeline.shared.provenance import settings_record
+from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
+from limbfit.study import Study, load_study
+from limbfit.study.meshing import ACCURACIES, estimated_cells
+from limbfit.study.tables import SolverTable
+
+EDGES = ("edge_near_mm", "edge_far_mm", "near_radius_mm", "growth", "flatness")
+STUDY = """\
+[study]
+name = "bare"
+[surfaces]
+skin = "skin.stl"
+[[sites]]
+name = "1"
+trace = "1.csv"
+fitted = true
+position = [0.0, 0.0, 0.0]
+"""
+
+
+@pytest.fixture
+def stated(tmp_path: Path) -> Any:
+    """The study with a further table."""
+    for name in ("skin.stl", "1.csv"):
+        (tmp_path / name).write_text(name)
+
+    def load(more: str = "") -> Study:
+        (tmp_path / "study.toml").write_text(STUDY + more)
+        return load_study(tmp_path)
+
+    return load
+
+
+def edges(settings: object) -> tuple[float, ...]:
+    return tuple(asdict(settings)[key] for key in EDGES)  # type: ignore[call-overload]
+
+
+def test_a_bare_study_is_searched_on_less_and_corrected(stated: Any) -> None:
+    study = stated()
+    assert edges(mesh_settings(study)) == (3.5, 30.0, 14.0, 0.9, 1.6)
+    assert mesh_settings(study).element == "tet10"
+    assert study.mesh.element == "tet10p0"
+    assert coarse_settings(study) is None
+    assert study.within_mm == 65.0
+    assert study.is_searched_apart
+    assert (study.solver.load_steps, study.solver.unload_steps, study.solver.penalty_per_mm) == (8, 10, None)
+    assert settings_record(study, dict.fromkeys(study.inputs, "0" * 64))["mesh"]["accuracy"] == "standard"
+
+
+def test_a_finer_accuracy_has_more_cells(stated: Any) -> None:
+    counts = []
+    for name in ("fast", "standard", "fine"):
+        table = stated(f'[mesh]\naccuracy = "{name}"\n').mesh
+        assert table.stands_for == name
+        counts.append(
+            estimated_cells(table.edge_near_mm, table.edge_far_mm, table.near_radius_mm, table.growth)
+        )
+    assert counts[0] < 0.75 * counts[1] < 0.75**2 * counts[2]
+
+
+def test_fine_meshes_are_corrected_on_coarser_ones(stated: Any) -> None:
+    coarse = coarse_settings(stated('[mesh]\naccuracy = "fine"\n'))
+    assert coarse is not None
+    assert edges(coarse) == tuple((ACCURACIES["fine"][1] or {})[key] for key in EDGES)
+
+
+def test_what_is_stated_goes_before_the_knob(stated: Any) -> None:
+    study = stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 2.5\ngrowth = 0.5\n')
+    assert edges(mesh_settings(study)) == (2.5, 24.0, 14.0, 0.5, 1.6)
+    assert coarse_settings(study) is not None  # it is the knob's still
+    assert study.mesh.stands_for is None
+    other = stated('[mesh]\naccuracy = "fine"\n[mesh.coarse]\nedge_near_mm = 4.5\n')
+    assert edges(coarse_settings(other)) == (4.5, 30.0, 12.0, 0.9, 1.6)
+    assert other.mesh.stands_for is None
+
+
+def test_no_coarse_mesh_is_finer_than_the_own(stated: Any) -> None:
+    assert coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 6.0\n')) is None
+
+
+def test_an_unknown_accuracy_is_refused(stated: Any) -> None:
+    with pytest.raises(StudyError, match=r"mesh\.accuracy: .*'fast', 'standard' or 'fine'"):
+        stated('[mesh]\naccuracy = "best"\n')
+
+
+def test_contact_is_as_stiff_as_the_site_needs(tmp_path: Path) -> None:
+    """Reference tissue takes half of the allowed penetration; on a part of the mesh more."""
+    tissues, depth = ("skin", "muscle"), 5.0
+    mesh = layered_block((3.0, 12.0), tissues)
+    whole = block_site("a", tmp_path / "a.vtu", mesh, depth, SolverTable(load_steps=4, unload_steps=2))
+    found = {}
+    for name, model in (("whole", whole), ("part", replace(whole, within_mm=60.0))):
+        job = SimulationJob(model, tissues, (5.0, 5.0, 1.0, 1.0) * 2, (depth / SPEED,), sensitivities=False)
+        found[name] = simulate(job)
+        assert "sunk" not in [doubt.kind for doubt in found[name].doubts]
+    own, rough = (found[name].facts["penalty_per_mm"] for name in ("whole", "part"))
+    assert own > 100.0  # 2000 over the width of 20 mm: thin tissue needs more
+    assert max(100.0, own / ROUGHLY) == pytest.approx(rough)
+    assert found["whole"].penetration_mm == pytest.approx(0.005 * depth, rel=0.15)
+    assert found["part"].force_N == pytest.approx(found["whole"].force_N, rel=0.03)
