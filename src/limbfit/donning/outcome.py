@@ -22,8 +22,8 @@ LITTLE = 1e-4  # of a parameter: how far it is moved where pressures are differe
 class Patch:
     """Pressure and shear over a part of the outer surface.
 
-    ``mean_kPa``: normal force over area; ``peak_kPa``: largest mean of the faces around a node; ``shear_kPa``
-    and ``shear_peak_kPa`` likewise of the size of the shear.
+    ``mean_kPa``: normal force over area; ``peak_kPa``: the largest mean over one face; ``shear_kPa`` and
+    ``shear_peak_kPa`` likewise of the size of the shear.
     """
 
     mean_kPa: float
@@ -32,16 +32,15 @@ class Patch:
     shear_peak_kPa: float
 
     @classmethod
-    def of(cls, found: Tractions, chosen: Mask, nodal: tuple[Array, Array]) -> Patch:
-        """Over the chosen (f,) faces; ``nodal``: pressure (n,) and size of the shear (n,) at nodes, kPa."""
+    def of(cls, found: Tractions, chosen: Mask) -> Patch:
+        """Over the chosen (f,) faces."""
         areas = found.areas.sum(axis=1)
-        nodes = np.unique(found.faces[chosen])
         shear = np.linalg.norm(found.face_shear_kPa[chosen], axis=1)
         return cls(
             mean_kPa=_mean(found, areas, chosen),
-            peak_kPa=float(nodal[0][nodes].max()),
+            peak_kPa=float(found.face_pressure_kPa[chosen].max()),
             shear_kPa=float(areas[chosen] @ shear / areas[chosen].sum()),
-            shear_peak_kPa=float(nodal[1][nodes].max()),
+            shear_peak_kPa=float(shear.max()),
         )
 
 
@@ -50,8 +49,9 @@ class Row:
     """One step: what the socket does, and what it does to the limb.
 
     ``force (3,)`` N and ``moment (3,)`` N mm about the pivot, on the socket, and its ``move (3,)`` mm and
-    ``turn (3,)`` degrees, along anterior, the third axis and proximal (`Fit.frame`).  ``imbalance``: how far
-    the contact is from the stated force and moment, a share.
+    ``turn (3,)`` degrees, along anterior, the third axis and proximal (`Fit.frame`).  ``penetration_mm``: how
+    far the limb is in the wall at most.  ``imbalance``: how far the contact is from the stated force and
+    moment, a share.
     """
 
     time: float
@@ -60,6 +60,7 @@ class Row:
     move: Array
     turn: Array
     contact_area_mm2: float
+    penetration_mm: float
     imbalance: float
     whole: Patch
     regions: Mapping[str, Patch]
@@ -117,10 +118,10 @@ def don(
 
     def note(step: Step) -> None:
         found = tractions(system, laws, step.state)
-        pressure, shear = found.at_nodes(len(problem.mesh.points))
-        rows.append(_row(step, found, (pressure, np.linalg.norm(shear, axis=1)), patches))
+        rows.append(_row(step, found, patches))
         for name, _, off in fit.ends:
             if np.isclose(step.time, off):
+                pressure, shear = found.at_nodes(len(problem.mesh.points))
                 slopes = _slopes(problem, system, laws, step.state, patches) if sensitivities else {}
                 held[name] = Held(rows[-1], pressure, shear, step.state.u, slopes)
         if on_row is not None:
@@ -133,8 +134,8 @@ def don(
     return Donned(result, told, held)
 
 
-def _row(step: Step, found: Tractions, nodal: tuple[Array, Array], patches: Mapping[str, Mask]) -> Row:
-    values = {name: Patch.of(found, mask, nodal) for name, mask in patches.items()}
+def _row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> Row:
+    values = {name: Patch.of(found, mask) for name, mask in patches.items()}
     return Row(
         time=step.time,
         force=step.reactions[0, :3],
@@ -142,6 +143,7 @@ def _row(step: Step, found: Tractions, nodal: tuple[Array, Array], patches: Mapp
         move=step.coordinates[0, :3],
         turn=np.degrees(step.coordinates[0, 3:]),
         contact_area_mm2=found.contact_area,
+        penetration_mm=step.penetration,
         imbalance=0.0,
         whole=values.pop(WHOLE),
         regions=values,

@@ -173,7 +173,8 @@ def mesh_limb(
 
     Parameters
     ----------
-    anatomy, settings, fat_depth_mm : as for :func:`base_mesh`; edges are of ``edge_near_mm``.
+    anatomy, settings, fat_depth_mm : as for :func:`base_mesh`; edges are of ``edge_near_mm`` under the layers
+        and grow with the depth below them.
     fine_to_mm : distance from the proximal cut up to which they are; nearer to it they grow.
     """
     base = base_mesh(anatomy, settings, fat_depth_mm)
@@ -229,8 +230,9 @@ def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: M
 
 
 def limb_size(base: BaseMesh, fine_to_mm: float, settings: MeshSettings) -> Array:
-    """Wanted edge length (n,) at the grid's points of a whole limb: fine but for its proximal end."""
-    beyond = np.maximum(base.grid.points[:, 2] + fine_to_mm, 0.0)
+    """Wanted edge length (n,) at a whole limb's grid points: short under its layers, not near the cut."""
+    points = base.grid.points
+    beyond = np.maximum(points[:, 2] + fine_to_mm, 0.0) + np.maximum(base.fields.layer(points)[0], 0.0)
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
     return np.minimum(size, base.size_limit)
 

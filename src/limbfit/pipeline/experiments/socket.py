@@ -187,12 +187,14 @@ def _content(study: Study, found: Donned, fit: Fit, covariance: Array | None) ->
     statistics = found.result.statistics
     return {
         "seconds": statistics["seconds"]["total"],
+        "penetration_mm": max((row.penetration_mm for row in found.rows), default=0.0),
         "balance_percent": 100.0 * max((row.imbalance for row in found.rows), default=0.0),
         "friction": fit.friction,
         "donning": donned,
         "loads": loads,
         "steps": [_step(row, fit) for row in found.rows],
-        "warnings": list(found.result.warnings),
+        # How far it sinks in is told by itself: the wall's stiffness is stated, and no study's.
+        "warnings": [doubt.text for doubt in found.result.doubts if doubt.kind != "sunk"],
         "statistics": {key: statistics[key] for key in ("steps", "cuts", "newton_iterations", "unknowns")},
     }
 

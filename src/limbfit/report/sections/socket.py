@@ -41,7 +41,8 @@ def socket_section(store: Results, content: Json) -> Section:
             f"Sum of contact forces and moments against the stated load: within "
             f"{content['balance_percent']:.2g} % at every step. Pressures are those of contact, on the "
             "outside of the liner where there is one; a mean is the normal force over the area, a peak the "
-            "largest mean around a node, which depends on the mesh."
+            "largest mean over one face of the mesh, which grows as faces get smaller. The limb is at most "
+            f"{content['penetration_mm']:.2f} mm in the wall."
         ),
         *(Note(text) for text in content["warnings"]),
     ]
