@@ -16,8 +16,8 @@ ORIGINS = {
     "given": "given by hand",
 }
 PUBLISHED = (
-    "Measured peaks of pressure between limb and socket in stance are mostly 30 to 200 kPa (Sanders et al., "
-    "J Rehabil Res Dev 1997, 34:19; Dumbleton et al., J Rehabil Res Dev 2009, 46:405)."
+    "For measured pressures to hold these against see Al-Fakih et al. (Sensors 2016, 16:1119, a review), "
+    "Sanders et al. (J Rehabil Res Dev 1997, 34:19) and Dumbleton et al. (J Rehabil Res Dev 2009, 46:405)."
 )
 
 

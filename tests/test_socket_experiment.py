@@ -1,0 +1,141 @@
+"""``limbfit socket``: a small limb in its socket, from the study to table and report."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "anatomy"))
+from bodies import limb
+
+from limbfit import fit_socket, load_study, report_study
+from limbfit.anatomy.meshing.layers import LayerSpec
+from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
+from limbfit.anatomy.surfaces.surfaces import write_surface
+from limbfit.donning import Fit, Load, don, socket_problem
+from limbfit.fe import OgdenQLV
+from limbfit.pipeline.shared.socket_shape import socket_of
+
+STUDY = """
+[study]
+name = "small limb"
+[surfaces]
+skin = "skin.stl"
+bones = { tibia = "tibia.stl" }
+[geometry]
+proximal_cut = { point = [12.0, -80.0, 300.0], normal = [0.0, 0.0, 1.0] }
+[socket]
+trim_mm = 26.0
+edge_mm = 14.0
+distal_clearance_mm = 3.0
+hold_s = 1.0
+[[socket.loads]]
+name = "stance"
+force_N = [0.0, 0.0, 150.0]
+duration_s = 1.0
+hold_s = 1.0
+[[sites]]
+name = "1"
+position = [46.0, -80.0, 290.0]
+depth_mm = 3.0
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    where = tmp_path_factory.mktemp("socket")
+    anatomy = limb()
+    write_surface(where / "skin.stl", anatomy.skin)
+    write_surface(where / "tibia.stl", anatomy.bones["tibia"])
+    (where / "study.toml").write_text(STUDY)
+    return where
+
+
+@pytest.fixture(scope="module")
+def found(folder) -> dict:
+    return fit_socket(load_study(folder))
+
+
+def test_what_is_told_is_what_others_read(found, folder):
+    assert {"seconds", "balance_percent", "loads", "donning", "parameters_from", "steps"} <= found.keys()
+    (load,) = found["loads"]
+    assert {"name", "settling_mm", "contact_area_mm2", "peak_kPa", "regions"} <= load.keys()
+    row = load["regions"][0]
+    assert {"region", "peak_kPa", "mean_kPa", "interval_kPa", "shear_kPa"} <= row.keys()
+    assert found["parameters_from"] == "literature"  # nothing was identified
+    assert str(folder) not in (folder / "results" / "socket" / "socket.json").read_text()
+
+
+def test_the_load_is_carried_and_the_limb_settles(found):
+    """By contact alone, at every step; pressure and area grow under the load, and most under its brim."""
+    assert found["balance_percent"] < 0.1
+    last, (load,) = found["steps"][-1], found["loads"]
+    np.testing.assert_allclose(last["force_N"], [0.0, 0.0, 150.0], atol=0.15)
+    assert 0.5 < load["settling_mm"] < 10.0
+    assert load["contact_area_mm2"] > found["donning"]["contact_area_mm2"]
+    for held in (found["donning"], load):
+        for row in held["regions"]:
+            assert 0.0 <= row["mean_kPa"] <= row["peak_kPa"] <= held["peak_kPa"]
+    before = {row["region"]: row["mean_kPa"] for row in found["donning"]["regions"]}
+    assert all(row["mean_kPa"] > before[row["region"]] for row in load["regions"])
+
+
+def test_what_holds_the_donned_socket_goes_over_into_the_load(found):
+    """No jump where displacement hands over to force."""
+    steps = found["steps"]
+    ends = [i for i, row in enumerate(steps) if np.isclose(row["time_s"], 3.0)]
+    here, after = (steps[i]["force_N"][2] for i in (ends[0], ends[0] + 1))
+    assert here < after < here + 0.3 * (150.0 - here)
+
+
+def test_tissue_relaxes_while_the_socket_is_held(found):
+    held = [row for row in found["steps"] if 2.0 - 1e-9 <= row["time_s"] <= 3.0 + 1e-9]
+    assert (np.diff([row["mean_kPa"] for row in held]) < 0.0).all()
+
+
+def test_it_is_not_done_twice_and_the_report_shows_it(found, folder):
+    file = folder / "results" / "socket" / "socket.json"
+    before = file.stat().st_mtime_ns
+    assert fit_socket(load_study(folder))["steps"] == json.loads(file.read_text())["steps"]
+    assert file.stat().st_mtime_ns == before
+    page = Path(report_study(load_study(folder))["report"]).read_text()
+    assert "The limb in its socket" in page
+    assert "not a medical device" in page
+    assert page.count("stance, anterior view") == 2  # pressure and shear
+
+
+@pytest.mark.slow
+def test_slopes_of_pressure_and_settling_are_central_differences(folder):
+    """With respect to the muscle's and the skin's stiffness: what the intervals are made of."""
+    study, anatomy = load_study(folder), limb()
+    socket = socket_of(study, anatomy, anatomy.skin)
+    settings = MeshSettings(edge_near_mm=14.0, edge_far_mm=24.0, growth=0.6, layers=(LayerSpec("skin", 3.0),))
+    mesh, _ = mesh_limb(anatomy, settings, 10.0)
+    up = np.array([0.0, 0.0, 1.0])
+    load = Load("stance", 60.0 * up, np.zeros(3), anatomy.cut_point, 1.0, 0.0)
+    fit = Fit(anatomy.cut_point, up, np.array([0.0, -1.0, 0.0]), 0.3, 1.0, 0.0, loads=(load,))
+    tissues = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}
+    problem = socket_problem(mesh, tissues, socket, fit)
+    middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
+    regions = {"front": middles[:, 1] < anatomy.cut_point[1] - 20.0}
+    names = [f"{region}.{name}" for region, name in problem.parameter_names]
+    centre = don(problem, fit, regions, sensitivities=True).held
+    for tissue in ("muscle", "skin"):
+        ways = []
+        for sign in (1.0, -1.0):
+            other = replace(tissues[tissue], c=tissues[tissue].c * np.exp(sign * 0.01))
+            moved = problem.with_materials({**tissues, tissue: other})
+            ways.append(don(moved, fit, regions).held)
+        for name in ("donning", "stance"):
+            ahead, back = (way[name].row for way in ways)
+            slope = centre[name].slopes["front"][names.index(f"{tissue}.c")]
+            difference = (ahead.regions["front"].mean_kPa - back.regions["front"].mean_kPa) / 0.02
+            assert slope == pytest.approx(difference, rel=0.02, abs=1e-3)
+        slope = centre["stance"].slopes["settling"][names.index(f"{tissue}.c")]
+        difference = (ways[0]["stance"].row.move[2] - ways[1]["stance"].row.move[2]) / 0.02
+        assert slope == pytest.approx(difference, rel=0.02)
