@@ -196,7 +196,7 @@ READ: dict[str, str] = {
             *("socket.friction", "socket.edge_mm", "socket.donning", "socket.travel_mm"),
             "socket.liner.thickness_mm",
         ),
-        "pipeline/verbs/check.py",
+        "pipeline/experiments/socket.py",
     ),
     **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},
 }

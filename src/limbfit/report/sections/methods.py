@@ -100,15 +100,11 @@ def _layers(geometry: Json) -> str:
     if not layers:
         thickness = geometry.get("skin_layer_mm")
         return f"The skin–adipose layer is {thickness} mm thick." if thickness else ""
-    words = [
-        f"{layer['name']} ("
-        + (
-            f"{layer['thickness_mm']} mm)"
-            if layer.get("thickness_mm")
-            else f"as thick as the segmented fat, at least {layer.get('min_thickness_mm')} mm)"
-        )
-        for layer in layers
-    ]
+    words = []
+    for layer in layers:
+        stated, least = layer.get("thickness_mm"), layer.get("min_thickness_mm")
+        thick = f"{stated} mm" if stated else f"as thick as the segmented fat, at least {least} mm"
+        words.append(f"{layer['name']} ({thick})")
     return f"Over the {geometry.get('core')} lie, outermost first: {', '.join(words)}."
 
 
@@ -124,9 +120,8 @@ def _indentations(store: Results) -> str:
     return (
         f"{sites} sites have {words} of time, displacement and force; {len(store.fitted)} were fitted "
         f"({', '.join(store.fitted)}).{where} The indenter's axis is the mean inward normal of the skin "
-        "under it "
-        "unless the study states one. Touch-down is where the force of each record leaves its baseline as a "
-        f"power of the depth in a tissue with memory{_touch_downs(facts)}; from there on displacement was "
+        "under it unless the study states one. Touch-down is where the force of each record leaves its "
+        f"baseline as a power of the depth in a tissue with memory{_touch_downs(facts)}; from there on displacement was "
         "made piecewise linear and force smoothed, every phase (loading, hold, unloading) by itself so that "
         "the peak is kept; where parameters are searched and judged, the simulated force is smoothed in the "
         "same way. "
@@ -138,9 +133,8 @@ def _indentations(store: Results) -> str:
 
 def _touch_downs(facts: Sequence[Json]) -> str:
     known = [one for one in facts if one.get("touch_down_uncertainty_mm") is not None]
-    if not known:
-        return ""
-    return f" (known to {_range(known, 'touch_down_uncertainty_mm', 3)} mm, one standard deviation)"
+    ends = _range(known, "touch_down_uncertainty_mm", 3)
+    return f" (known to {ends} mm, one standard deviation)" if known else ""
 
 
 def _range(facts: Iterable[Json], key: str, digits: int) -> str:
@@ -344,10 +338,8 @@ def _unit(name: str) -> str:
 def _mesh_error(sites: Json) -> str:
     """The meshes' part of the residuals' covariance, in words; nothing where it was not measured."""
     shares = [100 * one["mesh_share"] for one in sites.values() if one.get("mesh_share") is not None]
-    if not shares:
-        return ""
-    least, most = fixed(min(shares), 1), fixed(max(shares), 1)
-    return f", and for the error of the meshes: {least} to {most} % of the largest force, from others"
+    ends = f"{fixed(min(shares), 1)} to {fixed(max(shares), 1)}" if shares else ""
+    return f", and for the error of the meshes: {ends} % of the largest force, from others" if shares else ""
 
 
 def _uncertainty(store: Results) -> str:
@@ -355,11 +347,9 @@ def _uncertainty(store: Results) -> str:
     if not residuals:
         return ""
     sites = residuals.get("sites") or {}
-    words = ", ".join(
-        f"{name} {fixed(one.get('noise_sd_N'), 3)} and {fixed(one.get('misfit_sd_N'), 3)} "
-        + str(one.get("unit", "N"))
-        for name, one in sites.items()
-    )
+    said = [(fixed(one.get("noise_sd_N"), 3), fixed(one.get("misfit_sd_N"), 3)) for one in sites.values()]
+    units = [one.get("unit", "N") for one in sites.values()]
+    words = ", ".join(f"{n} {a} and {b} {unit}" for n, (a, b), unit in zip(sites, said, units, strict=True))
     return (
         "Residuals at the fitted sites are taken for noise of the records and a smooth misfit of the model, "
         f"correlated along the record (standard deviations, site by site: {words}){_mesh_error(sites)}. 95 % "
