@@ -76,7 +76,7 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
     np.testing.assert_array_equal(theirs.faces, mine.faces)
     np.testing.assert_array_equal(theirs.shape.points[theirs.shape.faces], SIDE[SHEET.faces])
     for t in (0.0, 0.4, 1.0, 1.3, 2.0):
-        (values, forced), (expected, under) = theirs.motion.at(t), mine.motion.at(t)
+        (values, forced, _), (expected, under, _) = theirs.motion.at(t), mine.motion.at(t)
         np.testing.assert_allclose(values, expected, atol=1e-14)
         np.testing.assert_array_equal(forced, under)
     (pressed,) = found.pressures
@@ -259,7 +259,7 @@ def test_febios_own_inputs_are_written_anew(tmp_path, case):
         near = problem.mesh.points[mine.faces].mean(axis=1)
         np.testing.assert_allclose(theirs.shape.signed_distance(near), mine.shape.signed_distance(near))
         for t in np.linspace(0.0, problem.history.times[-1], 43):
-            (values, forced), (expected, under) = theirs.motion.at(t), mine.motion.at(t)
+            (values, forced, _), (expected, under, _) = theirs.motion.at(t), mine.motion.at(t)
             np.testing.assert_allclose(values, expected, atol=1e-12)
             np.testing.assert_array_equal(forced, under)
     held = [(s.component, s.factor, s.nodes.tolist()) for s in problem.supports]

@@ -246,7 +246,7 @@ def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     """What is doubtful about the simulations of the sites."""
     for site in sites:
         for text in site["warnings"]:
-            STDERR.print(f"warning: site {site['record']}: {text}", soft_wrap=True)
+            STDERR.print(f"warning: site {site.get('record', site['site'])}: {text}", soft_wrap=True)
 
 
 def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:

@@ -52,8 +52,15 @@ def in_space(name: str, motion: Motion, frame: Array) -> Motion:
     ------
     ProblemError
         Where a force drives it along, or about, an axis that lies askew: FEBio holds and drives along its
-        own; and where it turns about several axes.
+        own; where it turns about several axes, grows, or leaves a force open.
     """
+    if motion.grows:
+        raise ProblemError(f"{name}: a body that grows is not written for FEBio, which has none")
+    if np.isnan(motion.values).any():
+        raise ProblemError(
+            f"{name}: a force that takes over what held the body is not written for FEBio",
+            remedy="state the force, as Result.reactions tell it",
+        )
     turn, forced = np.kron(np.eye(2), frame), np.asarray(motion.forced)
     own = forced.copy()
     for block in (slice(0, 3), slice(3, 6)):

@@ -116,7 +116,7 @@ class _Faces:
         if not self.current:
             return
         areas = self._areas_at(self.problem.mesh.points + step.state.u)
-        there, forced = self.body.stated.motion.at(ahead)
+        there, forced, _ = self.body.stated.motion.at(ahead)
         gone, way = coordinates - self.coordinates, np.where(forced, 0.0, there - coordinates)
         moved = float(gone[:3] @ gone[:3])
         ratio = float(np.clip(way[:3] @ gone[:3] / moved, -2.0, 2.0)) if moved else 0.0
