@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -24,6 +25,7 @@ COMING_ON, HELD, LOADING = 8, 6, 6
 RELAXING = 2.0  # power of the step's number that the time in a hold goes with
 # The stiffness of contact, MPa/mm: where pressures are the largest, 0.2 MPa, the wall is met to 0.1 mm.
 STIFFNESS = 2.0
+MOST_THREADS = 4  # one simulation has the machine to itself; more wait for memory
 
 
 @dataclass(frozen=True)
@@ -150,4 +152,5 @@ def socket_steps(fit: Fit, modulus: float) -> StepControl:
         times += [start + (on - start) * k / count for k in range(1, count + 1)]
         if off > on:
             times += [on + (off - on) * (k / HELD) ** RELAXING for k in range(1, HELD + 1)]
-    return StepControl(times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True)
+    threads = min(os.cpu_count() or 1, MOST_THREADS)
+    return StepControl(times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=threads)

@@ -44,14 +44,14 @@ Z95 = 1.96
 def run_socket(
     context: Context, folder: Path, *, parameters: Parameters, parameters_from: str
 ) -> dict[str, Any]:
-    """Pressure, shear and settling of the study's socket at the parameters of the tissues (`table 4`)."""
+    """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues."""
     study, table = context.study, context.study.socket
     anatomy = load_anatomy(context.store["surfaces"])
     outer, depth = _outer(context, anatomy)
     socket = socket_of(study, anatomy, outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
     mesh = _mesh(context, folder, outer, depth, socket)
-    fit = _fit(study, anatomy)
+    fit = _fit(study, anatomy, socket)
     laws = materials(parameters, study.material.kappa_ratio, study.material.law)
     if table.liner.thickness_mm:
         laws |= materials({LINER: table.liner.parameters}, study.material.kappa_ratio)
@@ -124,7 +124,7 @@ def _mesh(context: Context, folder: Path, outer: Anatomy, depth: Array | None, s
     return read_vtu(file)
 
 
-def _fit(study: Study, anatomy: Anatomy) -> Fit:
+def _fit(study: Study, anatomy: Anatomy, socket: Socket) -> Fit:
     table, known = study.socket, directions(anatomy, study.socket.side)
     knee = knee_centre(anatomy)
     loads = []
@@ -138,15 +138,14 @@ def _fit(study: Study, anatomy: Anatomy) -> Fit:
         friction=table.friction,
         donning_s=table.donning_s,
         hold_s=table.hold_s,
-        travel_mm=None if table.donning == "growth" else _travel(study, anatomy),
+        travel_mm=None if table.donning == "growth" else table.travel_mm or _depth(socket, known.proximal),
         loads=tuple(loads),
     )
 
 
-def _travel(study: Study, anatomy: Anatomy) -> float:
-    """How far the socket slides on, mm: as stated, or the length of the limb."""
-    stated = study.socket.travel_mm
-    return stated if stated is not None else float(-anatomy.height(anatomy.skin.points).min())
+def _depth(socket: Socket, proximal: Array) -> float:
+    """From the brim to the distal end, mm."""
+    return float(np.ptp(socket.points @ proximal))
 
 
 def _regions(regions: Mapping[str, Region], anatomy: Anatomy, mesh: Mesh, socket: Socket) -> dict[str, Mask]:
