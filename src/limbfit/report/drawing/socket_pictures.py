@@ -44,7 +44,7 @@ def _surface(file: Path) -> Grid:
 
 
 def _figure(store: Results, names: list[str], surfaces: list[Grid], field: str, title: str) -> Figure:
-    top = max(float(np.percentile(surface.point_data[field], 99.5)) for surface in surfaces)
+    top = max(float(np.max(surface.point_data[field])) for surface in surfaces)
     limits = (0.0, max(top, 1e-6))
     views = four_sides(store, surfaces[0])
     markup = ""
