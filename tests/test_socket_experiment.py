@@ -17,8 +17,9 @@ from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.anatomy.surfaces.surfaces import write_surface
-from limbfit.donning import Fit, Load, don, socket_problem
+from limbfit.donning import Fit, Load, don, socket_problem, socket_steps
 from limbfit.fe import OgdenQLV
+from limbfit.fe.kernel.laws import Laws
 from limbfit.pipeline.shared.socket_shape import socket_of
 
 STUDY = """
@@ -111,7 +112,11 @@ def test_it_is_not_done_twice_and_the_report_shows_it(found, folder):
 
 @pytest.mark.slow
 def test_slopes_of_pressure_and_settling_are_central_differences(folder):
-    """With respect to the muscle's and the skin's stiffness: what the intervals are made of."""
+    """With respect to the muscle's and the skin's stiffness: what the intervals are made of.
+
+    Within 2 %, or what 1 % of the value itself is.  The force that the load takes over is held: its own
+    dependence is not carried (docs/socket.md).
+    """
     study, anatomy = load_study(folder), limb()
     socket = socket_of(study, anatomy, anatomy.skin)
     settings = MeshSettings(edge_near_mm=14.0, edge_far_mm=24.0, growth=0.6, layers=(LayerSpec("skin", 3.0),))
@@ -124,18 +129,23 @@ def test_slopes_of_pressure_and_settling_are_central_differences(folder):
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
     regions = {"front": middles[:, 1] < anatomy.cut_point[1] - 20.0}
     names = [f"{region}.{name}" for region, name in problem.parameter_names]
-    centre = don(problem, fit, regions, sensitivities=True).held
+    laws = Laws.build([tissues[name] for name in mesh.region_names])
+    steps = socket_steps(fit, laws.modulus)
+    whole = don(problem, fit, regions, sensitivities=True, steps=steps)
+    centre = whole.held
+    held = (replace(problem.bodies[0], motion=whole.result.problem.bodies[0].motion),)
     for tissue in ("muscle", "skin"):
         ways = []
         for sign in (1.0, -1.0):
             other = replace(tissues[tissue], c=tissues[tissue].c * np.exp(sign * 0.01))
-            moved = problem.with_materials({**tissues, tissue: other})
-            ways.append(don(moved, fit, regions).held)
+            moved = replace(problem.with_materials({**tissues, tissue: other}), bodies=held)
+            ways.append(don(moved, fit, regions, steps=steps).held)
         for name in ("donning", "stance"):
             ahead, back = (way[name].row for way in ways)
             slope = centre[name].slopes["front"][names.index(f"{tissue}.c")]
             difference = (ahead.regions["front"].mean_kPa - back.regions["front"].mean_kPa) / 0.02
-            assert slope == pytest.approx(difference, rel=0.02, abs=1e-3)
+            one_percent = 0.01 * centre[name].row.regions["front"].mean_kPa
+            assert slope == pytest.approx(difference, rel=0.02, abs=one_percent)
         slope = centre["stance"].slopes["settling"][names.index(f"{tissue}.c")]
         difference = (ways[0]["stance"].row.move[2] - ways[1]["stance"].row.move[2]) / 0.02
-        assert slope == pytest.approx(difference, rel=0.02)
+        assert slope == pytest.approx(difference, rel=0.02, abs=0.01 * centre["stance"].row.move[2])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fe import Problem, Result, State, Step, System, Tractions, solve, tractions
+from ..fe import Problem, Result, State, Step, StepControl, System, Tractions, solve, tractions
 from ..fe.kernel.laws import Laws
 from .model import Fit, socket_steps
 
@@ -100,6 +100,7 @@ def don(
     regions: Mapping[str, Mask],
     sensitivities: bool = False,
     on_row: Callable[[Row], None] | None = None,
+    steps: StepControl | None = None,
 ) -> Donned:
     """Simulate a socket's problem.
 
@@ -109,6 +110,8 @@ def don(
     regions : masks (f,) of the faces of the socket's body.
     sensitivities : also derivatives with respect to every material parameter.
     on_row : called after every step.
+    steps : by default `socket_steps`. Derivatives are those at a contact stiffness over the mean modulus, so
+        that runs to be compared with them have the same steps.
     """
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     system = System(problem)
@@ -127,7 +130,7 @@ def don(
         if on_row is not None:
             on_row(rows[-1])
 
-    control = socket_steps(fit, laws.modulus)
+    control = steps or socket_steps(fit, laws.modulus)
     result = solve(problem, control, sensitivities, on_step=note, store="none", system=system)
     shares = result.imbalance[1:, 0]
     told = tuple(replace(row, imbalance=float(share)) for row, share in zip(rows, shares, strict=True))
