@@ -20,7 +20,7 @@ from limbfit.bench.layer import curve_error, reference_layer, solve_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu
-from limbfit.phantom.forces import STEPS as TRUTH
+from limbfit.phantom.forces import DISCRETISATIONS, STIFFEST_PER_MM
 from limbfit.phantom.sites import INDENTER_EDGE_MM, INDENTER_MM
 from limbfit.study import IndenterTable
 
@@ -32,7 +32,10 @@ HISTORIES = {
 }
 CONTROLS = {
     "default": StepControl(),
-    "truth": StepControl(load_steps=TRUTH.load_steps, unload_steps=TRUTH.unload_steps),
+    **{
+        f"truth, {detail}": StepControl(load_steps=made.load_steps, unload_steps=made.unload_steps)
+        for detail, made in DISCRETISATIONS.items()
+    },
     "default, linear": StepControl(stress="linear"),
 }
 TAUS = (0.1, 0.2, 0.32, 0.5, 1.0, 3.0)  # s
@@ -68,7 +71,7 @@ def site_rows(folder: Path, name: str) -> None:
     fine = StepControl(load_steps=80, unload_steps=100)
     print("| steps | made | Newton iterations | factorisations | error rms / worst |")
     for label, control in {"ten times": fine, **CONTROLS}.items():
-        stated = replace(control, penalty=TRUTH.penalty, hold_penalty=True)
+        stated = replace(control, penalty=STIFFEST_PER_MM, hold_penalty=True)
         found = solve(problem, stated, store="none")
         facts, force = found.statistics, found.force_at(t)
         exact = force if exact is None else exact

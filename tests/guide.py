@@ -21,7 +21,7 @@ BLOCKS = {"a": ((3.0, 5.0), 2.2, True), "b": ((3.0, 21.0), 6.0, True)}  # thickn
 TEXT = """
 [study]
 name = "blocks"
-extensions = ["{extension}"]
+extensions = {extensions}
 [surfaces]
 skin = "skin.stl"
 [solver]
@@ -53,19 +53,20 @@ def from_the_guide(word: str, file: Path) -> Path:
 
 
 def identified(
-    folder: Path, extension: Path, stated: str, truth: Mapping[str, float], within: float
+    folder: Path, extension: Path | None, stated: str, truth: Mapping[str, float], within: float
 ) -> dict[str, Any]:
-    """The calibration of two blocks whose tissues are one, in a study with an extension and further tables.
+    """The calibration of two blocks whose tissues are one, in a study with more stated, or an extension.
 
     Of records with known truth and noise, simulated by worker processes that load the study's file.  The
     answer must be the truth, ``within`` a share of it, and the intervals must hold it.
     """
-    shutil.copy(extension, folder / extension.name)
+    if extension is not None:
+        shutil.copy(extension, folder / extension.name)
     for name in ("skin.stl", *(f"{name}.csv" for name in BLOCKS)):
         (folder / name).touch()
     tied = [[f"{tissue}.{key}" for tissue in ("skin", "muscle")] for key in truth]
     sites = "".join(SITE.format(name=name) for name in BLOCKS)
-    text = TEXT.format(extension=extension.name, tied=tied) + stated + sites
+    text = TEXT.format(extensions=[extension.name] if extension else [], tied=tied) + stated + sites
     (folder / "study.toml").write_text(text, encoding="utf-8")
     study = load_study(folder)
     store = store_blocks(study, BLOCKS, {tissue: dict(truth) for tissue in study.tissues}, 4, coarse=4)

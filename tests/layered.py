@@ -17,7 +17,7 @@ from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import COARSE
+from limbfit.pipeline.shared.simulations import COARSE, fibres_of
 from limbfit.pipeline.shared.store import Store, write_json
 from limbfit.pipeline.stages.traces import run_traces
 from limbfit.study import Study
@@ -100,6 +100,7 @@ def store_blocks(
                 layered_block(thickness, tissues, divisions=coarse), store["mesh"] / COARSE / f"{name}.vtu"
             )
         model = replace(model, indenter=study.indenter, law=study.material.law, extensions=study.extensions)
+        model = replace(model, fibres=fibres_of(Context(study, store, SerialExecutor(), lambda event: None)))
         _write_record(study, model, truth, np.random.default_rng(i))
         places.append(
             {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}

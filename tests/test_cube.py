@@ -55,7 +55,7 @@ def exact_stress(terms, gamma: float, tau: float, depth: float, t: float) -> flo
 @pytest.mark.parametrize("tissue", PUBLISHED, ids=[tissue.name for tissue in PUBLISHED])
 def test_stress_is_that_of_the_closed_form(tissue):
     """Nearly incompressible: kappa ten thousand times the shear modulus."""
-    material = tissue.material((2.0, 0.5))
+    material = tissue.material(((2.0, 0.5),))
     stiff = type(material)(material.terms, material.prony, kappa_ratio=1e5)
     times = _times()
     stress, least, most = compress(stiff, times, 20.0)
@@ -98,7 +98,7 @@ def test_every_published_tissue_has_its_citation():
     for tissue in PUBLISHED:
         assert any(year in tissue.source for year in ("2001", "2010", "2011", "2016", "2018"))
         assert tissue.conversion
-        assert tissue.material((1.0, 1.0)).table().kappa == pytest.approx(tissue.bulk_kPa * KPA)
+        assert tissue.material(((1.0, 1.0),)).table().kappa == pytest.approx(tissue.bulk_kPa * KPA)
 
 
 @pytest.mark.parametrize("percent", [0.0, -5.0, 80.0])

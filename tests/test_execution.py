@@ -21,6 +21,7 @@ from limbfit.execution import (
     ProcessExecutor,
     SerialExecutor,
     make_executor,
+    meanwhile,
     placed,
     sharing,
     usable_cores,
@@ -99,6 +100,27 @@ def test_workers_persist_and_keep_their_keys(pool):
     assert first == second
     assert len(set(first.values())) == 2
     assert os.getpid() not in first.values()
+
+
+def test_work_goes_on_meanwhile():
+    with meanwhile(pid, None) as wait:
+        other = wait()
+        assert other != os.getpid()
+        assert wait() == other  # asked again, not done again
+
+
+def test_failures_and_deaths_of_what_is_done_meanwhile_are_raised_where_it_is_waited_for():
+    with meanwhile(refuse, 2) as wait, pytest.raises(TraceError):
+        wait()
+    with meanwhile(die, None) as wait, pytest.raises(RunError, match="died"):
+        wait()
+
+
+def test_what_nobody_waits_for_is_ended():
+    start = time.monotonic()
+    with meanwhile(nap, 60.0):
+        pass
+    assert time.monotonic() - start < 20.0
 
 
 def test_threads_are_pinned_in_workers_and_nowhere_else(pool, monkeypatch):

@@ -119,6 +119,12 @@ def test_what_is_wrong_is_told_in_one_line(folder: Path, old: str, new: str, tol
     assert "\n" not in str(caught.value)
 
 
+def test_an_indenter_that_no_record_names_is_told(folder: Path) -> None:
+    assert read(folder).notes == ()
+    (note,) = read(folder, STUDY + "[indenters.tip]\nwidth_mm = 10.0\n").notes
+    assert note == "indenters.tip: no record names it; only limbfit design --protocol does"
+
+
 def test_a_site_with_several_records_does_not_stand_for_one(folder: Path) -> None:
     study = read(folder, STUDY.replace('trace = "a.csv"\n', ""))
     with pytest.raises(StudyError, match="several records; name one of 1-fast, 1-ball"):

@@ -3,58 +3,33 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent / "anatomy"))
-from bodies import limb
-
 from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
-from limbfit.anatomy.surfaces.surfaces import write_surface
 from limbfit.donning import Fit, Load, don, socket_problem, socket_steps
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
 from limbfit.pipeline.shared.socket_shape import socket_of
+from small_limb import limb, small_limb
 
-STUDY = """
-[study]
-name = "small limb"
-[surfaces]
-skin = "skin.stl"
-bones = { tibia = "tibia.stl" }
-[geometry]
-proximal_cut = { point = [12.0, -80.0, 300.0], normal = [0.0, 0.0, 1.0] }
-[socket]
-trim_mm = 26.0
-edge_mm = 14.0
-distal_clearance_mm = 3.0
-hold_s = 1.0
+SOCKET = """hold_s = 1.0
 [[socket.loads]]
 name = "stance"
 force_N = [0.0, 0.0, 150.0]
 duration_s = 1.0
 hold_s = 1.0
-[[sites]]
-name = "1"
-position = [46.0, -80.0, 290.0]
-depth_mm = 3.0
 """
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    where = tmp_path_factory.mktemp("socket")
-    anatomy = limb()
-    write_surface(where / "skin.stl", anatomy.skin)
-    write_surface(where / "tibia.stl", anatomy.bones["tibia"])
-    (where / "study.toml").write_text(STUDY)
-    return where
+    return small_limb(tmp_path_factory.mktemp("socket"), SOCKET)
 
 
 @pytest.fixture(scope="module")

@@ -102,6 +102,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "indenter.width_mm": ("sites", 18.0),
     "indenter.edge_radius_mm": ("calibrate", 1.0),
     "indenter.friction": ("calibrate", "sticky"),
+    "indenters.ball": ("calibrate", {"shape": "stl", "file": "other.stl"}),
     "indenters.ball.shape": ("calibrate", "cylinder"),
     "indenters.ball.width_mm": ("sites", 18.0),
     "indenters.ball.edge_radius_mm": ("calibrate", 1.0),
@@ -185,19 +186,20 @@ READ: dict[str, str] = {
     **{key: "pipeline/shared/context.py" for key in KEYS if key.startswith("execution.")},
     **{key: "acquire/" for key in KEYS if key.startswith("acquire.")},
     "acquire.key_gap_ms": "cli/acquire.py",
-    **{key: "pipeline/shared/socket_shape.py" for key in KEYS if key.startswith("socket.")},
     **dict.fromkeys(
-        ("socket.donning_s", "socket.hold_s", "socket.loads.duration_s", "socket.loads.hold_s"),
-        "study/socket.py",
+        ("records.depth_mm", "records.speed_mm_s", "records.hold_s"), "pipeline/verbs/acquire.py"
     ),
+    **{key: "pipeline/shared/socket_shape.py" for key in KEYS if key.startswith("socket.")},
     **{key: "study/socket.py" for key in KEYS if key.startswith("socket.liner.")},
     **dict.fromkeys(
         (
             *("socket.friction", "socket.edge_mm", "socket.donning", "socket.travel_mm"),
+            *("socket.donning_s", "socket.hold_s", "socket.loads.duration_s", "socket.loads.hold_s"),
             "socket.liner.thickness_mm",
         ),
-        "pipeline/experiments/socket.py",
+        "pipeline/experiments/socket_limb.py",
     ),
+    **{key: "pipeline/experiments/socket_design.py" for key in KEYS if key.startswith("socket.design.")},
     **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},
 }
 # How else the tables above name them.
@@ -314,7 +316,6 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         {"socket": {"loads": [{"name": "1", "force_N": [0, 0, 9]}], "body_weight_N": 700.0}},
         "socket.body_weight_N",
     ),
-    (GIVEN, {"indenters.ball.width_mm": 10.0}, "indenters.ball"),
     (
         GIVEN,
         {
@@ -342,6 +343,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         },
         "sites.indenter",
     ),
+    (GIVEN, {"material.fibres": {"muscle": "axis"}}, "material.fibres"),
     (GIVEN, {"sites.1.control": "force"}, "sites.control"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
@@ -462,7 +464,7 @@ def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: An
 def test_every_refusal_is_tried() -> None:
     tried = {key for _, _, key in IN_VAIN}
     stated = {key for rule in VAIN for key in rule.keys}
-    by_name = {"mesh.accuracy", "indenters.ball", "indenters.ball.edge_radius_mm"}
+    by_name = {"mesh.accuracy", "indenters.ball.edge_radius_mm"}
     assert stated | {f"sites.{rule.key}" for rule in VAIN_OF_SITE} | by_name == tried
 
 
@@ -470,3 +472,17 @@ def test_what_an_amputation_takes_is_not_in_vain(folder: Path) -> None:
     content = changed(GIVEN, *AMPUTATED)
     content["geometry"] |= {"surface_edge_mm": 2.5, "amputation_pad_mm": 9.0}
     assert decided(loaded(folder, content))["surfaces"] != before(folder, False)["surfaces"]
+
+
+def test_the_design_of_a_socket_is_no_reason_to_put_it_on_again(folder: Path) -> None:
+    def of(content: Mapping[str, Any]) -> list[str]:
+        study = loaded(folder, content)
+        stages = keys(study)
+        names = ("socket", "socket_design")
+        return [experiment_key(EXPERIMENTS[n], Keys(study), stages, EXPERIMENTS[n].options) for n in names]
+
+    put_on, designed = of(GIVEN)
+    other = of(changed(GIVEN, "socket.design.pressure_kPa", 12.0))
+    assert other[0] == put_on
+    assert other[1] != designed
+    assert put_on not in of(changed(GIVEN, "socket.hold_s", 5.0))

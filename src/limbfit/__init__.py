@@ -21,7 +21,9 @@ Everything the command line does is one call away:
 ``limbfit compare``       ``compare_site(load_study(path), site, febio_log=None, listener=print)``
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
 ``limbfit design``        ``design_study(load_study(path), sites=4, depths_mm=(), listener=print)``
+``limbfit design --protocol``  ``plan_protocol(load_study(path), minutes=25, listener=print)``
 ``limbfit socket``        ``fit_socket(load_study(path), listener=print)``
+``limbfit socket design``  ``design_socket(load_study(path), optimise=(), simulations=6, listener=print)``
 ``limbfit cube``          ``compress_cube(folder)``, without a study
 ``limbfit studio``        ``serve_studio(study, port=0, browser=True, tell=print)``
 ``limbfit EXPERIMENT``    ``run_experiment(load_study(path), "regions", listener=print)``, and others

@@ -56,7 +56,7 @@ from .pipeline.verbs.acquire import (
     judge_recording as judge_recording,
     serve_fitsocket as serve_fitsocket,
     virtual_fitsocket as virtual_fitsocket,
-    waiting_sites as waiting_sites,
+    waiting as waiting,
 )
 from .pipeline.verbs.batch import run_batch as run_batch
 from .pipeline.verbs.calibration_bench import bench_calibrate as bench_calibrate
@@ -69,8 +69,14 @@ from .pipeline.verbs.demo import (
 from .pipeline.verbs.doctor import diagnose as diagnose
 from .pipeline.verbs.export import export_study as export_study
 from .pipeline.verbs.febfile import simulate_feb as simulate_feb
-from .pipeline.verbs.fitting import fit_socket as fit_socket
-from .pipeline.verbs.planning import design_study as design_study
+from .pipeline.verbs.fitting import (
+    design_socket as design_socket,
+    fit_socket as fit_socket,
+)
+from .pipeline.verbs.planning import (
+    design_study as design_study,
+    plan_protocol as plan_protocol,
+)
 from .pipeline.verbs.reproduce import reproduce_study as reproduce_study
 from .pipeline.verbs.run import (
     STAGE_NAMES as STAGE_NAMES,

@@ -6,7 +6,7 @@ A law of one's own is registered by `register_law`; see docs/extending.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ Parameters = dict[str, dict[str, float]]  # by tissue and key
 KPA = 1e-3  # MPa
 UNITS = {"kPa": KPA, "s": 1.0}  # of parameters, in the solver's
 OGDEN = "ogden"  # the law of a study that names none
+FIBRED = "ogden-fibres"  # the law whose tissues may have fibres
+MOST_RELAXATIONS = 6  # terms, as FEBio
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,9 @@ class TissueLaw:
     energy : its strain energy and relaxation, as the report's methods write it.
     parameters : in the order of every flat vector.
     material : the class that the solver takes (`fe.Material`); its fields are the parameters' names and
-        ``kappa_ratio``, the bulk modulus over the long-term shear modulus.  None: limbfit's own, `OgdenQLV`.
+        ``kappa_ratio``, the bulk modulus over the long-term shear modulus.  None: limbfit's own, `OgdenQLV`,
+        with as many relaxation terms as there are pairs of parameters after the first two, and fibres where
+        there are k1 and k2.
     """
 
     name: str
@@ -106,23 +110,62 @@ class TissueLaw:
 
 
 # Start and bounds are the paper's (section 2.3, table 1).
-LAWS = Registry(
-    "tissue law",
-    {
-        OGDEN: TissueLaw(
-            OGDEN,
-            "second-order Ogden",
-            "the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
-            "G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress",
-            (
-                Parameter("c", 4.7, 0.047, 47.0, "kPa", "long-term shear modulus"),
-                Parameter("m", 3.0, 2.0, 20.0, "", "strain-stiffening exponent"),
-                Parameter("gamma", 1.2, 0.01, 10.0, "", "relaxation amplitude"),
-                Parameter("tau", 2.0, 0.01, 10.0, "s", "relaxation time"),
-            ),
-        )
-    },
+_MODULUS = Parameter("c", 4.7, 0.047, 47.0, "kPa", "long-term shear modulus")
+_EXPONENT = Parameter("m", 3.0, 2.0, 20.0, "", "strain-stiffening exponent")
+_AMPLITUDE = Parameter("gamma", 1.2, 0.01, 10.0, "", "relaxation amplitude")
+_TIME = Parameter("tau", 2.0, 0.01, 10.0, "s", "relaxation time")
+
+
+def _ogden(terms: int) -> TissueLaw:
+    """The paper's law with so many relaxation terms.
+
+    Several share out the bounds of the one time in equal ratios, so that none can change places with another,
+    and the start of the one amplitude.
+    """
+    name, words, series = OGDEN, "second-order Ogden", "γ exp(−t/τ)"
+    relaxation: tuple[Parameter, ...] = (_AMPLITUDE, _TIME)
+    if terms > 1:
+        name, words = f"{OGDEN}-prony{terms}", f"second-order Ogden with {terms} relaxation terms"
+        series = "Σ γᵢ exp(−t/τᵢ)"
+        ratio = (_TIME.upper / _TIME.lower) ** (1.0 / terms)
+        relaxation = ()
+        for k in range(terms):
+            lower, start, upper = (float(f"{_TIME.lower * ratio**x:.3g}") for x in (k, k + 0.5, k + 1))
+            amplitude = replace(_AMPLITUDE, name=f"gamma{k + 1}", start=round(_AMPLITUDE.start / terms, 2))
+            relaxation += (
+                amplitude, replace(_TIME, name=f"tau{k + 1}", start=start, lower=lower, upper=upper)
+            )  # fmt: skip
+    energy = (
+        "the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
+        f"G(t) = 1 + {series} acting on the deviatoric stress"
+    )
+    return TissueLaw(name, words, energy, (_MODULUS, _EXPONENT, *relaxation))
+
+
+# Bounds are wide, for nobody has identified fibres so: passive muscle is near its ground along them or some
+# ten times as stiff; the fibres' modulus of small stretch is 4 k1.
+_FIBRES = (
+    Parameter("k1", 5.0, 0.05, 500.0, "kPa", "stiffness of the fibres"),
+    Parameter("k2", 1.0, 0.01, 100.0, "", "stiffening of the fibres"),
 )
+
+
+def _fibred() -> TissueLaw:
+    """The paper's law with fibres."""
+    plain = _ogden(1)
+    words, energy = f"{plain.words} with fibres", f"{plain.energy}; where fibres are stretched (I₄ > 1), "
+    energy += "k₁/(2 k₂) (exp(k₂ (I₄ − 1)²) − 1) is added to Ψ, I₄ the isochoric squared stretch along them"
+    return TissueLaw(FIBRED, words, energy, (*plain.parameters, *_FIBRES))
+
+
+FIBRE_KEYS = tuple(parameter.key for parameter in _FIBRES)
+_OWN = {law.name: law for law in map(_ogden, range(1, MOST_RELAXATIONS + 1))}
+LAWS = Registry("tissue law", _OWN | {FIBRED: _fibred()})
+
+
+def is_ogden(name: str) -> bool:
+    """Whether a law is the paper's, with however many relaxation terms."""
+    return name in _OWN
 
 
 def register_law(law: TissueLaw) -> None:

@@ -29,7 +29,7 @@ from limbfit.acquire.virtual import FAULT_KINDS, Fault
 
 WAY = [
     *(Phase.CLAMP, Phase.SETTLE, Phase.APPROACH, Phase.READY, Phase.SEARCH, Phase.RETURN, Phase.PAUSE),
-    *(Phase.LOAD, Phase.UNLOAD, Phase.RETRACT, Phase.RELEASE),
+    *(Phase.LOAD, Phase.DWELL, Phase.UNLOAD, Phase.RETRACT, Phase.RELEASE),
 ]
 CHANNELS = [kind for kind in FAULT_KINDS if kind != "limb"]
 
@@ -37,7 +37,7 @@ CHANNELS = [kind for kind in FAULT_KINDS if kind != "limb"]
 @cache
 def prepared(seed: int, phase: Phase, depth: float, repeats: int) -> Bench:
     """A session that has come to a phase without trouble."""
-    bench = Bench(seed, depth_mm=depth, repeats=repeats)
+    bench = Bench(seed, depth_mm=depth, repeats=repeats, hold_s=0.2)
     bench.until(phase)
     assert bench.phase is phase
     return bench

@@ -71,6 +71,28 @@ def test_both_sites_are_acquired_into_the_study(ready) -> None:
     }
 
 
+@pytest.mark.slow
+def test_the_records_of_a_site_are_made_each_in_its_own_way(ready) -> None:
+    """Two records of a site, one of them fast and held, as a designed protocol states them."""
+    file = ready / "study.toml"
+    text = file.read_text().replace('trace = "1.csv"\n', "")
+    for name, speed, hold in (("slow", 1.4, 0.0), ("held", 4.0, 3.0)):
+        text += f'[[records]]\nsite = "1"\nname = "{name}"\ntrace = "records/1-{name}.csv"\n'
+        text += f"depth_mm = 3.5\nspeed_mm_s = {speed}\nhold_s = {hold}\n"
+    file.write_text(text)
+    with fitsocket(ready, "--speed", SPEED) as (address, _):
+        code, found, err = acquire(ready, address, "--unattended", "--depth", 3.5)
+    assert code == 0, err
+    assert [row["name"] for row in found["sites"]] == ["1-slow", "1-held", "2"]
+    study = load_study(ready)
+    for one, speed, kinds in zip(
+        study.recorded, (1.4, 4.0), (["load", "unload"], ["load", "hold", "unload"])
+    ):
+        _, curve, facts = read_record(study, one)
+        assert facts["speed_load_mm_s"] == pytest.approx(speed, rel=0.02)
+        assert [phase.kind for phase in curve.phases] == kinds
+
+
 def is_home(address: str) -> bool:
     """Greets the device until it takes a session, which it does only once everything is home."""
     for _ in range(40):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from in_process import FAST, Bench
+from in_process import FAST, Bench, settings
 
 from limbfit.acquire.events import Abort, Confirm, KeyDown, KeyUp
 from limbfit.acquire.phases import FINAL, TRANSITIONS, Outcome, Phase
@@ -43,6 +43,22 @@ def test_the_paper_s_order() -> None:
     true_gap = bench.device.limb._gap[0]
     assert protocol.touch_um / 1000 == pytest.approx(true_gap, abs=0.08)
     assert bench.device.is_home
+
+
+def test_each_ramp_that_counts_is_held() -> None:
+    bench = Bench(repeats=2, precondition=1, depth_mm=3.0, hold_s=0.4)
+    bench.until()
+    found = phases(bench)
+    held = ("pause", "load", "hold", "unload")
+    assert found[found.index("pause") :] == [
+        *("pause", "load", "unload"),  # preconditioning is not held
+        *(*held, *held, "retract", "release", "done"),
+    ]
+
+
+def test_a_hold_longer_than_a_phase_may_take_is_refused() -> None:
+    with pytest.raises(ValueError, match="hold_s is not below time_limit_s"):
+        settings(hold_s=5.0)
 
 
 def test_neighbours_stay_off_while_eleven_clamp() -> None:
@@ -141,7 +157,7 @@ def test_a_device_that_falls_silent_after_a_stop_is_reported() -> None:
 
 @pytest.mark.parametrize("phase", [p for p in Phase if p not in FINAL | {Phase.IDLE, Phase.STOPPING}])
 def test_an_abort_in_any_phase_retracts(phase: Phase) -> None:
-    bench = Bench()
+    bench = Bench(hold_s=0.2)
     bench.until(phase)
     bench.session.handle(Abort("for the test"), bench.now)
     bench.settle()

@@ -14,6 +14,7 @@ from limbfit.acquire import Recorder, follow_recording, judge, ramps, read_recor
 from limbfit.acquire.events import PINS, Sample
 from limbfit.acquire.recording import COLUMNS
 from limbfit.errors import TraceError
+from limbfit.traces import find_touch_down, regularise
 
 
 def sample(number: int) -> Sample:
@@ -144,6 +145,7 @@ def session(tmp_path, **changes):
             "pin": 1,
             "repeats": bench.settings.repeats,
             "precondition": bench.settings.precondition,
+            "ramp_speed_mm_s": bench.settings.ramp_speed_mm_s,
         },
         "device": {"range_mN": 50_000},
     }
@@ -174,8 +176,21 @@ def test_a_good_session_is_called_good(tmp_path) -> None:
         assert abs(ramp.trace.displacement_mm[[0, -1]]).max() < 0.1
 
 
+def test_a_ramp_is_kept_with_its_hold(tmp_path) -> None:
+    _, recording = session(tmp_path, ramp_speed_mm_s=1.4, hold_s=2.0, pause_s=3.0, settle_s=0.5)
+    assert judge(recording).is_good
+    (ramp,) = ramps(recording)
+    curve = regularise(ramp.trace, find_touch_down(ramp.trace))
+    assert [phase.kind for phase in curve.phases] == ["load", "hold", "unload"]
+    hold = curve.phases[1]
+    assert hold.duration_s == pytest.approx(2.0, abs=0.15)
+    inside = (curve.time_s > hold.start_s + 0.1) & (curve.time_s < hold.end_s - 0.1)
+    assert np.diff(curve.force_N[inside])[[0, -1]].max() < 0.0  # it relaxes
+
+
 def test_what_is_wrong_is_named(tmp_path) -> None:
     _, recording = session(tmp_path, ramp_speed_mm_s=6.0, settle_s=0.5)
+    recording.head["settings"]["ramp_speed_mm_s"] = 0.96  # and the device ran at 6 mm/s
     assert checks(recording)["speed"] is False
     recording.force_mN[recording.host_us > 3_000_000, 0] += 400
     recording.force_mN[100, 7] = 50_000

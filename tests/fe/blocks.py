@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from limbfit.bench.blocks import HEX, SIX_TETS, boxes, upright
@@ -10,14 +13,20 @@ from limbfit.fe import (
     ELEMENTS,
     History,
     Indenter,
+    Material,
+    NeoHookean,
     OgdenQLV,
     Problem,
     Result,
+    RigidBody,
     StepControl,
     Support,
+    System,
     solve,
 )
+from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
+from limbfit.fe.system import Evaluation, Increment
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
 
 HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
@@ -140,6 +149,37 @@ def sector(radii: NDArray, n: int, cell_type: str = "hex8") -> Mesh:
         points, mesh.cells, cell_type, mesh.regions, mesh.region_names, sets,
         {"inside": inside, "outside": outside},
     )  # fmt: skip
+
+
+def quarter_tube(mesh: Mesh, law: Material, body: RigidBody, **how: Any) -> Problem:
+    """A `sector` in plane strain that a rigid body meets from outside."""
+    sets, faces = mesh.node_sets, np.zeros((0, len(mesh.face_sets["outside"][0])), dtype=np.int64)
+    planes = (Support(sets["y0"], 1), Support(sets["x0"], 0), Support(sets["ends"], 2))
+    still = History(np.array([0.0, 2.0]), np.zeros(2))
+    laws = dict.fromkeys(mesh.region_names, law)
+    return Problem(mesh, laws, np.zeros(0, int), faces, None, still, supports=planes, bodies=(body,), **how)
+
+
+def press_fit(law: NeoHookean, inner: float, outer: float, overlap: float) -> float:
+    """Pressure, MPa, of a rigid ring on a tube ``overlap`` mm too wide: Lame, plane strain, small strain."""
+    G, K, a, b = law.shear_modulus, law.kappa_ratio * law.shear_modulus, inner, outer
+    E, nu = 9 * K * G / (3 * K + G), (3 * K - 2 * G) / (2 * (3 * K + G))
+    return overlap * E * (b**2 - a**2) / (b * (1 + nu) * ((1 - 2 * nu) * b**2 + a**2))
+
+
+def check_tangent(system: System, laws: Laws, u: NDArray, rest: Increment, d: NDArray) -> Evaluation:
+    """Residual and tangent at ``u`` (n, 3) are differences of energy and residual along ``d`` (n, 3)."""
+    h = 1e-6
+    here = system.evaluate(u, laws, rest)
+    ahead, back = (system.evaluate(u + s * h * d, laws, rest) for s in (1, -1))
+    K = np.zeros((system.unknowns, system.unknowns))
+    K[np.repeat(np.arange(system.unknowns), np.diff(system.indptr)), system.indices] = here.tangent
+    K += np.triu(K, 1).T
+    size = np.abs(K).max()
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), abs=1e-7 * size)
+    change = ((ahead.residual - back.residual) / (2 * h)).ravel()[system.free]
+    np.testing.assert_allclose(K @ d.ravel()[system.free], change, atol=1e-7 * size)
+    return here
 
 
 def drive(advance: float, x: float = 0.0, y: float = 0.0) -> Drives:

@@ -240,6 +240,25 @@ def test_impossible_parameters_are_refused(change):
         OgdenQLV(**values)
 
 
+@pytest.mark.parametrize(
+    ("gamma", "tau", "what"),
+    [
+        ((1.0, 2.0), (0.1,), "2 gamma and 1 tau.* give as many of each"),
+        ((1.0, -0.2), (0.1, 1.0), "gamma2 = -0.2 is negative"),
+        ((1.0, 0.2), (0.1, 0.0), "tau2 = 0.0 is not positive"),
+        ((), (), r"gamma = \(\) is no number, nor several"),
+        ("much", 1.0, "gamma = much is no number"),
+    ],
+)
+def test_impossible_relaxation_is_refused(gamma, tau, what):
+    with pytest.raises(ProblemError, match=what):
+        OgdenQLV(0.005, 4.0, gamma, tau)
+
+
+def test_one_term_in_a_list_is_one_term():
+    assert OgdenQLV(0.005, 4.0, [1.0], [0.3]) == OgdenQLV(0.005, 4.0, 1.0, 0.3)
+
+
 GOOD = {"terms": ((0.005, 4.0),), "prony": ((1.0, 0.3),), "kappa_ratio": 100.0, "volumetric": "log"}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from blocks import punch, sector
+from blocks import press_fit, punch, quarter_tube, sector
 
 from limbfit.errors import ProblemError
 from limbfit.fe import (
@@ -12,11 +12,9 @@ from limbfit.fe import (
     Motion,
     NeoHookean,
     OgdenQLV,
-    Problem,
     RigidBody,
     SmoothSurface,
     StepControl,
-    Support,
     solve,
 )
 
@@ -145,25 +143,19 @@ def test_a_press_fit_by_growth_is_lames_and_comes_off_by_its_friction(mu):
     law = NeoHookean(0.01, kappa_ratio=20.0)
     mesh = sector(np.linspace(inner, outer, 13), n)
     height = float(mesh.points[:, 2].max())
-    sets = mesh.node_sets
-    planes = (Support(sets["y0"], 1), Support(sets["x0"], 0), Support(sets["ends"], 2))
     final, faces = pipe(outer - overlap, 4.0 * height)
     clear = pipe(outer + 0.02, 4.0 * height)[0]
     shape = SmoothSurface.of(final, faces, clear=clear, spacing=0.5, reach=2.0)
     growth = Motion.of([0.0, 1.0], growth=[0.0, 1.0])
     body = RigidBody(shape, mesh.face_sets["outside"], growth.then(Motion.of([0.0, 1.0], z=[0.0, 0.5])), mu)
-    problem = Problem(
-        mesh, dict.fromkeys(mesh.region_names, law), np.zeros(0, int), np.zeros((0, 4), int), None, STILL,
-        supports=planes, bodies=(body,), contact_rule="nodes",  # the mesh's facets are off the round
-    )  # fmt: skip
+    # the mesh's facets are off the round
+    problem = quarter_tube(mesh, law, body, contact_rule="nodes")
     times = (0.25, 0.5, 0.75, 1.0, 1.1, 1.25, 1.5, 2.0)
     found = solve(problem, StepControl(times=times, penalty=2000.0, hold_penalty=True, penetration=1.0))
     assert found.completed, found.reason
-    G, K, a, b = law.shear_modulus, law.kappa_ratio * law.shear_modulus, inner, outer
-    E, nu = 9 * K * G / (3 * K + G), (3 * K - 2 * G) / (2 * (3 * K + G))
-    pressure = overlap * E * (b**2 - a**2) / (b * (1 + nu) * ((1 - 2 * nu) * b**2 + a**2))
+    pressure = press_fit(law, inner, outer, overlap)
     radial, axial = -found.reactions[-1, 0, 0], found.reactions[-1, 0, 2]
-    assert radial == pytest.approx(pressure * b * height, rel=0.01)
+    assert radial == pytest.approx(pressure * outer * height, rel=0.01)
     assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01, abs=1e-6 * radial)
 
 
@@ -172,18 +164,13 @@ def test_sensitivities_through_growth_equal_central_differences(mu):
     """A cone grows onto a tube by 1 mm, and is pulled: displacements and axial force by the parameters."""
     law = OgdenQLV(0.01, 4.0, 1.5, 0.4)
     mesh = sector(np.linspace(10.0, 20.0, 4), 6)
-    sets = mesh.node_sets
-    planes = (Support(sets["y0"], 1), Support(sets["x0"], 0), Support(sets["ends"], 2))
     height = float(mesh.points[:, 2].max())
     wide, faces = pipe(20.2, 4.0 * height, 60)
     final = wide * [0.95, 0.95, 1.0] * (1.0 + 0.002 * wide[:, 2:]) ** [1.0, 1.0, 0.0]
     shape = SmoothSurface.of(final, faces, clear=wide, reach=4.0)
     motion = Motion.of([0.0, 1.0], growth=[0.0, 1.0]).then(Motion.of([0.0, 1.0], z=[0.0, 0.3]))
     body = RigidBody(shape, mesh.face_sets["outside"], motion, mu)
-    problem = Problem(
-        mesh, dict.fromkeys(mesh.region_names, law), np.zeros(0, int), np.zeros((0, 4), int), None, STILL,
-        supports=planes, bodies=(body,),
-    )  # fmt: skip
+    problem = quarter_tube(mesh, law, body)
     control = StepControl(
         times=(0.4, 0.7, 1.0, 1.4, 2.0), penalty=100.0, hold_penalty=True, penetration=1.0, tolerance=1e-9
     )

@@ -95,6 +95,17 @@ def test_it_is_read_back_as_it_was(tmp_path, element):
     assert set(np.round(schedule(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
 
 
+@pytest.mark.parametrize("terms", [1, 2, 6])
+def test_every_relaxation_term_is_read_back(tmp_path, terms):
+    tissue = OgdenQLV(0.004, 5.0, np.linspace(0.2, 1.7, terms), np.geomspace(0.03, 7.0, terms))
+    problem = replace(block(), materials={"skin": tissue, "muscle": OgdenQLV(0.006, 4.0, 0.5, 1.1)})
+    file, _ = exported(problem, tmp_path)
+    for name, law in to_problem(read_feb(file)).materials.items():
+        mine = problem.materials[name]
+        assert law.parameter_names == mine.parameter_names
+        assert law.parameters == mine.parameters
+
+
 def test_friction_is_read_back(tmp_path):
     file, _ = exported(replace(block(), friction=0.3), tmp_path)
     text = file.read_text(encoding="utf-8")
@@ -261,21 +272,27 @@ def test_in_the_frame_of_the_indenter(tmp_path):
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-3, atol=1e-4)
 
 
-def test_optimisation(tmp_path):
+@pytest.mark.parametrize("relaxation", [("gamma", "tau"), ("gamma1", "tau1", "gamma2", "tau2")])
+def test_optimisation(tmp_path, relaxation):
     """Ties hold at the start, bounds enclose it, and the data are those given."""
-    start = {"c": 0.004, "m": 6.0, "gamma": 2.0, "tau": 0.5}
+    start = {"c": 0.004, "m": 6.0} | {name: 2.0 / i for i, name in enumerate(relaxation, 1)}
+    each = 5 + len(relaxation)
     lower, upper = ({k: f * v for k, v in start.items()} for f in (0.1, 3.0))
     tissues = {name: Range(start, lower, upper, 100.0) for name in ("skin", "fat", "muscle")}
     times, force = np.linspace(0.0, 10.0, 21), np.linspace(-0.01, 3.0, 21)
     write_optimisation(tmp_path / "o.feb", tissues, times, force)
     root = ET.parse(tmp_path / "o.feb").getroot()
     rows = np.array([[float(v) for v in p.text.split(",")] for p in root.iterfind("Parameters/param")])
-    assert rows.shape == (21, 4)
+    assert rows.shape == (3 * each, 4)
+    names = [p.attrib["name"] for p in root.iterfind("Parameters/param")]
+    assert names[each - 2 : each] == [
+        f"fem.material('skin').{letter}{len(relaxation) // 2}" for letter in "gt"
+    ]
     assert (rows[:, 1] <= rows[:, 0]).all()
     assert (rows[:, 0] <= rows[:, 2]).all()
     ties = np.array([[float(v) for v in c.text.split(",")] for c in root.iterfind("Constraints/constraint")])
     np.testing.assert_allclose(ties[:, :-1] @ rows[:, 0], ties[:, -1], atol=1e-12)
-    assert np.linalg.matrix_rank(ties) == 9  # 21 parameters, 12 of them free
+    assert np.linalg.matrix_rank(ties) == 9  # of 7 parameters of each tissue 4 are free
     data = np.array([[float(v) for v in p.text.split(",")] for p in root.iterfind("Objective/data/pt")])
     np.testing.assert_array_equal(data, np.column_stack([times, np.maximum(force, 0.0)]))
     with pytest.raises(ProblemError, match="64 parameters"):

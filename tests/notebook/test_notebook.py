@@ -16,7 +16,7 @@ import pyvista as pv
 import limbfit
 from limbfit import History, Indenter, Mesh, OgdenQLV, Problem, StepControl
 from limbfit.errors import ProblemError
-from limbfit.fe import solve
+from limbfit.fe import Ogden, solve
 from limbfit.febio import write_feb
 from limbfit.mesh import cell_volumes, to_tet10
 
@@ -161,6 +161,35 @@ def test_own_curves_tell_their_tissue_and_how_well(solution):
     assert fit.problems[0].materials["muscle"] == TISSUE
     assert "skin.gamma" in fit.table()
     assert fit.plot().get_ylabel() == "force, N"
+
+
+def test_two_relaxation_terms_are_told_apart_by_a_hold():
+    """From a record with noise, in any law: here the terms of the paper's tissue and a modulus of Ogden's."""
+    true = OgdenQLV(c=0.005, m=4.0, gamma=(1.5, 0.7), tau=(0.08, 1.5))
+    one = Mesh.from_pyvista(block())
+    held = History([0.0, 0.5, 4.0, 6.0], [0.0, 2.0, 2.0, 0.0])
+    problem = replace(problem_of(one, tissue=true), history=held)
+    times = np.linspace(0.02, 6.0, 150)
+    record = limbfit.solve(problem, StepControl(load_steps=16, unload_steps=16), frames=False).force_at(times)
+    noisy = record + 0.005 * record.max() * np.random.default_rng(0).standard_normal(150)
+    start = {"tissue.c": 0.008, "tissue.gamma1": 0.6, "tissue.tau1": 0.2}
+    start |= {"tissue.gamma2": 0.6, "tissue.tau2": 0.6}
+    fit = limbfit.calibrate(problem, (times, noisy), start, steps=StepControl(load_steps=16, unload_steps=6))
+    assert fit.converged, fit.reason
+    truth = [0.005, 1.5, 0.08, 0.7, 1.5]
+    assert list(fit.parameters.values()) == pytest.approx(truth, rel=0.15)
+    for value, (low, high) in zip(truth, fit.uncertainty.intervals_95, strict=True):
+        assert low < value < high
+
+
+def test_a_parameter_that_is_no_field_is_fitted(solution):
+    skin = Ogden(((0.01, 4.0),), ((1.0, 0.6),))
+    problem = solution.problem.with_materials({"skin": skin, "muscle": TISSUE})
+    times = np.linspace(0.1, 4.0, 30)
+    record = limbfit.solve(problem, STEPS, frames=False).force_at(times)
+    fit = limbfit.calibrate(problem, (times, record), {"skin.c1": 0.015}, steps=STEPS)
+    assert fit.parameters["skin.c1"] == pytest.approx(0.01, rel=0.01)
+    assert fit.problems[0].materials["skin"].prony == skin.prony
 
 
 def test_creep_under_a_force_tells_the_tissue(solution):

@@ -7,7 +7,7 @@ import pytest
 
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import _ramp, _triple, true_parameters
-from limbfit.phantom.forces import MESHES, ForceJob, site_force
+from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, MeshJob, site_force, site_mesh
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.sites import true_sites
 from limbfit.phantom.surfaces import true_anatomy
@@ -28,11 +28,10 @@ def phantom(tmp_path_factory):
 def test_site_is_simulated_to_its_end(phantom, name):
     folder, sites = phantom
     site = sites[name]
-    flat = tuple(value for tissue in true_parameters(0).values() for value in tissue.values())
-    job = ForceJob(
-        name, folder, _triple(site.position), _triple(site.axis), _ramp(site), flat, MESHES["coarse"]
-    )
-    found = site_force(job)
+    made, at, axis = DISCRETISATIONS["coarse"], _triple(site.position), _triple(site.axis)
+    mesh = site_mesh(MeshJob(name, folder, at, axis, made.mesh, made.within_mm))
+    steps = made.steps(site.thickness)
+    found = site_force(ForceJob(name, mesh, at, axis, _ramp(site), steps, true_parameters(0)))
     peak = int(np.argmax(found.force))
     assert 2.0 < found.force[peak] < 20.0
     assert found.times[peak] == pytest.approx(site.depth / site.speed, rel=0.02)

@@ -43,9 +43,9 @@ def test_a_study_without_the_table_has_a_socket(tmp_path: Path) -> None:
     assert "socket" not in study.model_fields_set
     socket = drawn(study)
     assert socket.points[socket.brim, 2].max() == pytest.approx(110.0, abs=1.5)  # 10 mm below the tibia
-    assert [(s.name, s.ramp_s, s.hold_s) for s in study.socket.steps] == [
-        ("donning", 2.0, 10.0),
-        ("single stance", 1.0, 2.0),
+    assert (study.socket.donning_s, study.socket.hold_s) == (2.0, 10.0)
+    assert [(load.name, load.duration_s, load.hold_s) for load in study.socket.loads] == [
+        ("single stance", 1.0, 2.0)
     ]
     assert study.socket.liner.parameters == {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0}
     force, moment, point = load_of(study, study.socket.loads[0], round_limb())
@@ -96,6 +96,7 @@ def test_check_draws_the_socket(tmp_path: Path) -> None:
     assert "were turned" in facts
 
 
+DESIGN = "[[socket.design.regions]]\n"
 BAD: dict[str, tuple[str, str, bool]] = {
     "unknown key": ("[socket]\nreduction = 3\n", "see docs/study.md", True),
     "give either position (LPS, mm) or region": (AREA, "", True),
@@ -121,6 +122,13 @@ BAD: dict[str, tuple[str, str, bool]] = {
     "give either preset": ('[[socket.loads]]\nname = "x"\n', "", True),
     "a preset has its own moment": (
         '[[socket.loads]]\nname = "x"\npreset = "toe-off"\nmoment_Nmm = [0, 0, 1]\n',
+        "",
+        True,
+    ),
+    "no region is named 'heel'": (DESIGN + 'region = "heel"\nlimit_kPa = 90\n', "tibial crest", True),
+    "give pressure_kPa, limit_kPa or both": (DESIGN + 'region = "tibial crest"\n', "", True),
+    "'tibial crest' is given twice": (
+        (DESIGN + 'region = "tibial crest"\nlimit_kPa = 90\n') * 2,
         "",
         True,
     ),

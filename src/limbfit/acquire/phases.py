@@ -19,6 +19,7 @@ class Phase(StrEnum):
     RETURN = "return"
     PAUSE = "pause"
     LOAD = "load"
+    DWELL = "hold"  # at the deepest point
     UNLOAD = "unload"
     RETRACT = "retract"
     RELEASE = "release"
@@ -43,6 +44,8 @@ class Outcome(StrEnum):
     TOO_SHALLOW = "too shallow"
     RESTED = "rested"
     AT_DEPTH = "at depth"
+    TO_HOLD = "to hold"
+    HELD_OUT = "held out"
     NEXT_CYCLE = "next cycle"
     REST = "rest"
     CYCLES_DONE = "cycles done"
@@ -63,6 +66,7 @@ CLAMPED = frozenset(
         Phase.RETURN,
         Phase.PAUSE,
         Phase.LOAD,
+        Phase.DWELL,
         Phase.UNLOAD,
     }
 )
@@ -82,6 +86,8 @@ _WAY: dict[tuple[Phase, Outcome], Phase] = {
     (Phase.RETURN, Outcome.AT_START): Phase.PAUSE,
     (Phase.PAUSE, Outcome.RESTED): Phase.LOAD,
     (Phase.LOAD, Outcome.AT_DEPTH): Phase.UNLOAD,
+    (Phase.LOAD, Outcome.TO_HOLD): Phase.DWELL,
+    (Phase.DWELL, Outcome.HELD_OUT): Phase.UNLOAD,
     (Phase.UNLOAD, Outcome.NEXT_CYCLE): Phase.LOAD,
     (Phase.UNLOAD, Outcome.REST): Phase.PAUSE,
     (Phase.UNLOAD, Outcome.CYCLES_DONE): Phase.RETRACT,

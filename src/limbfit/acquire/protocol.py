@@ -281,7 +281,13 @@ class Protocol:
         return Outcome.RESTED if now - self._entered >= self.settings.pause_s else None
 
     def _end_load(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.AT_DEPTH if self._arrived(sample, now, self.depth_um) else None
+        if not self._arrived(sample, now, self.depth_um):
+            return None
+        held = self.settings.hold_s > 0.0 and self.cycle > self.settings.precondition
+        return Outcome.TO_HOLD if held else Outcome.AT_DEPTH
+
+    def _end_dwell(self, sample: Sample, now: float) -> Outcome | None:
+        return Outcome.HELD_OUT if now - self._entered >= self.settings.hold_s else None
 
     def _end_unload(self, sample: Sample, now: float) -> Outcome | None:
         if not self._arrived(sample, now, self.start_um):
@@ -340,6 +346,7 @@ _ENDS: dict[Phase, Callable[[Protocol, Sample, float], Outcome | None]] = {
     Phase.RETURN: Protocol._end_back,
     Phase.PAUSE: Protocol._end_pause,
     Phase.LOAD: Protocol._end_load,
+    Phase.DWELL: Protocol._end_dwell,
     Phase.UNLOAD: Protocol._end_unload,
     Phase.RETRACT: Protocol._end_retract,
     Phase.RELEASE: Protocol._end_release,

@@ -13,7 +13,7 @@ from ..traces import Regularised, Trace, find_touch_down, regularise
 from .events import PERIOD_US
 from .recording import Recording
 
-SPEED_MM_S = (0.46, 1.46)  # paper, section 2.1.2: 0.96 +- 0.5
+SPEED_OFF = 0.5 / 0.96  # of the ramp's speed; paper, section 2.1.2: 0.96 +- 0.5 mm/s
 TOUCH_MM = 0.3
 REPEATABLE_PERCENT = 5.0
 DRIFT_N = 0.2
@@ -54,9 +54,9 @@ class Ramp:
 
 
 def ramps(recording: Recording) -> list[Ramp]:
-    """The complete ramps of a record: in, out, and a moment of rest around."""
+    """The complete ramps of a record: in, held or not, out, and a moment of rest around."""
     pin = int(recording.head["settings"]["pin"]) - 1
-    marks = [event for event in recording.events if event["event"] == "phase"]
+    marks = [event for event in recording.events if event["event"] == "phase" and event["phase"] != "hold"]
     found = []
     for load, unload, after in zip(marks, marks[1:], marks[2:]):
         if (load["phase"], unload["phase"]) != ("load", "unload") or after["phase"] == "stopping":
@@ -89,7 +89,12 @@ def judge(recording: Recording) -> Verdict:
     """The verdict on a session that came to its end."""
     precondition = int(recording.head["settings"]["precondition"])
     counted = [ramp for ramp in ramps(recording) if ramp.cycle > precondition]
-    checks = [_complete(recording, counted), *_curves(counted), _drift(recording), _saturation(recording)]
+    checks = [
+        _complete(recording, counted),
+        *_curves(counted, float(recording.head["settings"]["ramp_speed_mm_s"])),
+        _drift(recording),
+        _saturation(recording),
+    ]
     return Verdict((*checks, _losses(recording)))
 
 
@@ -99,7 +104,7 @@ def _complete(recording: Recording, counted: list[Ramp]) -> Check:
     return Check("ramps", len(counted) == wanted, found, "record the site again")
 
 
-def _curves(counted: list[Ramp]) -> list[Check]:
+def _curves(counted: list[Ramp], speed_mm_s: float) -> list[Check]:
     smooth: list[Regularised] = []
     checks = []
     for ramp in counted:
@@ -110,14 +115,14 @@ def _curves(counted: list[Ramp]) -> list[Check]:
             checks.append(Check("touch-down", False, f"none is found: {error.what}", "record the site again"))
             continue
         smooth.append(curve)
-        checks += [_speed(curve), _touch(touch.displacement_mm, touch.uncertainty_mm)]
+        checks += [_speed(curve, speed_mm_s), _touch(touch.displacement_mm, touch.uncertainty_mm)]
     return [*checks, _repeatability(smooth)]
 
 
-def _speed(curve: Regularised) -> Check:
-    low, high = SPEED_MM_S
+def _speed(curve: Regularised, stated_mm_s: float) -> Check:
+    low, high = stated_mm_s * (1.0 - SPEED_OFF), stated_mm_s * (1.0 + SPEED_OFF)
     speeds = (curve.speed_load_mm_s, curve.speed_unload_mm_s)
-    found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:g} to {high:g})"
+    found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:.3g} to {high:.3g})"
     remedy = "see acquire.ramp_speed_mm_s, and the device's drive"
     return Check("speed", all(low <= speed <= high for speed in speeds), found, remedy)
 

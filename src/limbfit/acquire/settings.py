@@ -27,6 +27,7 @@ class Settings:
     precondition: int
     repeats: int
     ramp_speed_mm_s: float
+    hold_s: float
     retract_speed_mm_s: float
     force_limit_N: float
     clamp_limit_N: float

@@ -28,7 +28,9 @@ MOST_SPEED = 1000  # of an accelerated clock
 
 def acquire(
     study: StudyPath,
-    site: Annotated[str | None, typer.Option(help="which site; default: all that have no record yet")] = None,
+    site: Annotated[
+        str | None, typer.Option(help="site, or record such as 01-2; default: all not made yet")
+    ] = None,
     device: Annotated[
         str, typer.Option(help="tcp://HOST[:PORT] or serial:PATH[@BAUD]", metavar="ADDRESS")
     ] = DEFAULT_ADDRESS,
@@ -55,11 +57,14 @@ def acquire(
         remedy = "run it in a terminal, or with --unattended"
         raise InputError("the operator's key needs a terminal", place="standard input", remedy=remedy)
     given = limbfit.load_study(study, recorded=False)
-    names = [site] if site else [one.name for one in limbfit.waiting_sites(given)]
+    names = [site] if site else [one.name for one in limbfit.waiting(given)]
     if not names:
-        raise InputError("every site has a record", file=given.file, remedy="give --site and --again")
+        raise InputError("every record is made", file=given.file, remedy="give --site and --again")
     rows = []
     for name in names:
+        tool = given.indentation(name).indenter
+        if tool is not None:
+            STDERR.print(f"{name} is made with the indenter {tool!r}", soft_wrap=True)
         rows.append(_one(given, name, device, depth, unattended, again))
         if not as_json:
             _show(rows[-1])
@@ -112,10 +117,10 @@ def _signals(events: SimpleQueue[Event]) -> Iterator[None]:
 def _show(row: dict[str, Any]) -> None:
     if not row["completed"]:
         out = f"; pins out of reach: {', '.join(map(str, row['unreachable']))}" if row["unreachable"] else ""
-        STDERR.print(f"stopped: site {row['site']}: {row['reason']} ({row['phase']}{out})", soft_wrap=True)
+        STDERR.print(f"stopped: site {row['name']}: {row['reason']} ({row['phase']}{out})", soft_wrap=True)
     else:
         good = "good" if row["verdict"]["good"] else "not good: record it again (--site, --again)"
-        STDOUT.print(f"site {row['site']}: {row['depth_mm']:.2f} mm deep, record {good}", soft_wrap=True)
+        STDOUT.print(f"site {row['name']}: {row['depth_mm']:.2f} mm deep, record {good}", soft_wrap=True)
         _show_checks(row["verdict"])
     STDOUT.print(f"record: {row['files']['record']}", soft_wrap=True)
     if row["files"]["trace"]:

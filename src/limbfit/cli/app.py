@@ -35,16 +35,16 @@ def top(
         raise typer.Exit
 
 
-_PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS, *socket.VERBS}
+_PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS}
 _VERBS: tuple[Callable[..., None], ...] = (
     *(*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS),
-    *socket.VERBS,
     *runs.VERBS,
     *acquire.VERBS,
     *studio.VERBS,
 )
 for verb in _VERBS:
     app.command()(runs.where(verb) if verb in _PLACED else verb)
+app.add_typer(socket.app, name="socket")
 app.add_typer(bench.app, name="bench")
 
 

@@ -41,6 +41,15 @@ def print_json(content: Any) -> None:
     sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+def tell_stored(found: dict[str, Any], show: Callable[[dict[str, Any]], None], as_json: bool) -> None:
+    """What an experiment found: as JSON and nothing else, or in words with where it is stored."""
+    if as_json:
+        print_json(found)
+        return
+    show(found)
+    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+
+
 @contextmanager
 def listening() -> Iterator[Callable[[limbfit.Progress], None]]:
     """A listener that draws bars on a terminal and prints plain lines elsewhere, on standard error.

@@ -15,7 +15,7 @@ import limbfit
 
 from ..errors import InputError
 from .commands import StudyPath
-from .console import STDERR, STDOUT, AsJson, listening, parameter_heads, print_json
+from .console import STDERR, STDOUT, AsJson, listening, parameter_heads, print_json, tell_stored
 
 
 def run_verb(
@@ -24,11 +24,7 @@ def run_verb(
     """Do the experiment ``name`` with ``options``, tell of it, and say where it is stored."""
     with listening() as listener:
         found = limbfit.run_experiment(limbfit.load_study(study), name, listener=listener, **options)
-    if as_json:
-        print_json(found)
-        return
-    tell(found)
-    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+    tell_stored(found, tell, as_json)
 
 
 def cube(

@@ -1,4 +1,4 @@
-"""The list of verbs in ``limbfit --help``: in groups, each with its whole first sentence."""
+"""Verbs in groups: the list of ``limbfit --help``, each with its whole first sentence; one that is meant."""
 
 from __future__ import annotations
 
@@ -27,3 +27,13 @@ class Grouped(TyperGroup):
             with formatter.section(title):
                 verbs = [(name, self.get_command(ctx, name)) for name in names]
                 formatter.write_dl([(name, one.get_short_help_str(_LONGEST)) for name, one in verbs if one])
+
+
+class WithDefault(TyperGroup):
+    """A command whose first verb is meant where none is named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        verbs = self.list_commands(ctx)
+        if not ctx.resilient_parsing and not (args and args[0] in (*verbs, "--help")):
+            args = [verbs[0], *args]
+        return super().parse_args(ctx, args)

@@ -48,7 +48,7 @@ class PlainLines:
     def listen(self, told: Told) -> None:
         if isinstance(told, PhaseTold):
             self._began = told.time_s if self._began is None else self._began
-            cycle = f" (ramp {told.cycle})" if told.phase in ("load", "unload") else ""
+            cycle = f" (ramp {told.cycle})" if told.phase in ("load", "hold", "unload") else ""
             reason = f": {told.reason}" if told.reason else ""
             since = told.time_s - self._began
             STDERR.print(f"[{since:8.3f} s] site {self.site}: {told.phase}{cycle}{reason}", soft_wrap=True)
@@ -87,7 +87,7 @@ class Live:
                 f"clamps {last.clamp_N:5.1f} N"
             )
         hint = phase.reason or HINTS.get(phase.phase, "any other key: emergency stop")
-        touched = [s for s in samples if s.phase in ("search", "return", "load", "unload")]
+        touched = [s for s in samples if s.phase in ("search", "return", "load", "hold", "unload")]
         plots = [
             Panel(
                 plot([s.displacement_mm for s in touched], [s.force_N for s in touched]),

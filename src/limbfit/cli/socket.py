@@ -1,4 +1,4 @@
-"""The verb of the socket: what it does to the limb."""
+"""The verbs of the socket: what it does to the limb, and the design of one."""
 
 from __future__ import annotations
 
@@ -11,23 +11,32 @@ import limbfit
 
 from ..errors import InputError
 from .commands import StudyPath, parse_parameters
-from .console import STDOUT, AsJson, listening, print_json
+from .console import STDOUT, AsJson, listening, tell_stored
+from .groups import WithDefault
+from .runs import where
+
+app = typer.Typer(
+    help="Put a socket on the limb and load it (fit, also without that word), or design one.",
+    cls=WithDefault,
+    rich_markup_mode=None,
+)
+OfTissues = Annotated[
+    str | None,
+    typer.Option(help="the law's parameters of each tissue; default: identified, or those of people"),
+]
+OfPeople = Annotated[
+    bool, typer.Option("--literature", help="tissues of people, although some were identified")
+]
 
 
-def socket(
+def fit(
     study: StudyPath,
-    parameters: Annotated[
-        str | None,
-        typer.Option(help="the law's parameters of each tissue; default: identified, or those of people"),
-    ] = None,
-    literature: Annotated[
-        bool, typer.Option("--literature", help="tissues of people, although some were identified")
-    ] = False,
+    parameters: OfTissues = None,
+    literature: OfPeople = False,
     as_json: AsJson = False,
 ) -> None:
     """Put a socket on the limb and load it: pressure and shear by region, settling, balance."""
-    if parameters is not None and literature:
-        raise InputError("give either --parameters or --literature", place="--literature")
+    _check(parameters, literature)
     checked = limbfit.load_study(study)
     with listening() as listener:
         found = limbfit.fit_socket(
@@ -36,11 +45,7 @@ def socket(
             literature=literature,
             listener=listener,
         )
-    if as_json:
-        print_json(found)
-        return
-    show_socket(found)
-    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+    tell_stored(found, show_socket, as_json)
 
 
 def show_socket(found: dict[str, Any]) -> None:
@@ -66,4 +71,74 @@ def show_socket(found: dict[str, Any]) -> None:
     )
 
 
-VERBS = (socket,)
+def design(
+    study: StudyPath,
+    optimise: Annotated[
+        str,
+        typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
+    ] = "",
+    simulations: Annotated[
+        int, typer.Option(help="with --optimise: at most so many beside those of the two designs", min=1)
+    ] = 6,
+    parameters: OfTissues = None,
+    literature: OfPeople = False,
+    as_json: AsJson = False,
+) -> None:
+    """Design a socket from a target pressure, for printing; load it beside a uniformly reduced one."""
+    _check(parameters, literature)
+    checked = limbfit.load_study(study)
+    with listening() as listener:
+        found = limbfit.design_socket(
+            checked,
+            optimise=[name.strip() for name in optimise.split(",") if name.strip()],
+            simulations=simulations,
+            parameters=parse_parameters(parameters, checked),
+            literature=literature,
+            listener=listener,
+        )
+    tell_stored(found, show_design, as_json)
+
+
+def show_design(found: dict[str, Any]) -> None:
+    """Peaks of all regions in each design."""
+    designs, named = found["designs"], (found["optimisation"] or {}).get("regions", ())
+    for one in designs:
+        low, high = one["offset_mm"]
+        reduced = f", {one['reduction_percent']:.2f} % less around" if "reduction_percent" in one else ""
+        STDOUT.print(
+            f"{one['name']}: {one['volume_cm3']:.0f} cm3, {low:.1f} to {high:.1f} mm from the unloaded "
+            f"limb{reduced}",
+            soft_wrap=True,
+        )
+    table = Table("region, peak (kPa)", *(one["name"] for one in designs), box=None)
+    for name in designs[0]["peaks_kPa"]:
+        numbers = (one["peaks_kPa"].get(name) for one in designs)
+        table.add_row(
+            f"{name} *" if name in named else name,
+            *("" if number is None else f"{number:.0f}" for number in numbers),
+        )
+    STDOUT.print(table)
+    if named:
+        optimisation = found["optimisation"]
+        used = len(optimisation["trials"]) - 1
+        beyond = ", ".join(optimisation["beyond_limits"])
+        STDOUT.print(
+            f"* optimised in {used} simulations; "
+            + (f"beyond its limit: {beyond}" if beyond else "all others within their limits"),
+            soft_wrap=True,
+        )
+    measured = found["wall"]
+    STDOUT.print(
+        f"socket.stl: the {measured['of']} with a wall of {measured['stated_mm']:g} mm, measured "
+        f"{measured['least_mm']:.2f} mm at least; not a medical device",
+        soft_wrap=True,
+    )
+
+
+def _check(parameters: str | None, literature: bool) -> None:
+    if parameters is not None and literature:
+        raise InputError("give either --parameters or --literature", place="--literature")
+
+
+for verb in (fit, design):
+    app.command()(where(verb))

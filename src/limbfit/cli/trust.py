@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.table import Table
@@ -11,7 +11,7 @@ import limbfit
 
 from ..errors import InputError
 from .commands import StudyPath, parse_parameters
-from .console import STDOUT, AsJson, listening, print_json
+from .console import STDOUT, AsJson, listening, tell_stored
 from .experiments import run_verb
 
 
@@ -62,37 +62,67 @@ def design(
         str | None,
         typer.Option(help="the law's parameters of each tissue; default: identified, or the study's start"),
     ] = None,
+    protocol: Annotated[
+        bool, typer.Option("--protocol", help="choose the records of a whole session instead")
+    ] = False,
+    minutes: Annotated[float, typer.Option(help="with --protocol: of the session, min", min=1)] = 25.0,
+    speeds: Annotated[
+        str | None,
+        typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
+    ] = None,
+    holds: Annotated[str, typer.Option(help="with --protocol: holds in s, 0 for none")] = "0,30",
+    determine: Annotated[
+        str | None, typer.Option(help="with --protocol: parameters such as muscle.c_kPa; default: all")
+    ] = None,
+    criterion: Annotated[Literal["D", "A"], typer.Option(help="with --protocol: D or A")] = "D",
+    draws: Annotated[int, typer.Option(help="with --protocol: tissues to judge by", min=1, max=64)] = 3,
     as_json: AsJson = False,
 ) -> None:
-    """Choose the sites and depths that determine the parameters best, for records or for a plan."""
+    """Choose the sites and depths that determine the parameters best, for records or for a plan.
+
+    With --protocol: the records (site, indenter, depth, speed, hold) of a session of stated length, judged at
+    several tissues; records.toml has them as a study's [[records]].
+    """
     checked = limbfit.load_study(study)
+    used = parse_parameters(parameters, checked)
     with listening() as listener:
-        found = limbfit.design_study(
-            checked,
-            sites=sites,
-            depths_mm=parse_depths(depths),
-            parameters=parse_parameters(parameters, checked),
-            listener=listener,
-        )
-    if as_json:
-        print_json(found)
-        return
-    show_design(found)
-    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+        if protocol:
+            depth = parse_list(depths, "--depths", "give one depth in mm, such as 6")
+            if len(depth) > 1:
+                raise InputError("a protocol has one depth", place="--depths", remedy="give one, such as 6")
+            found = limbfit.plan_protocol(
+                checked,
+                minutes=minutes,
+                speeds_mm_s=parse_list(speeds, "--speeds", "give mm/s, such as 0.96,4.8"),
+                holds_s=parse_list(holds, "--holds", "give seconds, such as 0,30", least=0.0),
+                depth_mm=depth[0] if depth else None,
+                determine=determine.split(",") if determine else (),
+                criterion=criterion,
+                draws=draws,
+                parameters=used,
+                listener=listener,
+            )
+        else:
+            found = limbfit.design_study(
+                checked,
+                sites=sites,
+                depths_mm=parse_list(depths, "--depths", "give millimetres, such as 3,5,7"),
+                parameters=used,
+                listener=listener,
+            )
+    tell_stored(found, show_protocol if protocol else show_design, as_json)
 
 
-def parse_depths(text: str | None) -> tuple[float, ...]:
-    """``--depths``: positive numbers, in mm."""
+def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -> tuple[float, ...]:
+    """Numbers with commas between them, from ``least`` to 600; none where nothing is given."""
     if text is None:
         return ()
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    if not values or not all(0 < value < 100 for value in values):
-        raise InputError(
-            f"{text!r} are no depths", place="--depths", remedy="give millimetres, such as 3,5,7"
-        )
+    if not values or not all(least <= value <= 600 for value in values):
+        raise InputError(f"{text!r} will not do", place=place, remedy=remedy)
     return values
 
 
@@ -103,13 +133,28 @@ def show_design(found: dict[str, Any]) -> None:
         numbers = (f"{100 * row[key]:.0f}" for key in ("d_efficiency", "a_efficiency"))
         table.add_row(row["design"], chosen, *numbers)
     STDOUT.print(table)
-    widths = Table("parameter", *(row["design"] for row in found["designs"]), box=None)
-    for name in found["designs"][0]["factor_95"]:
-        widths.add_row(name, *(f"x/ {min(row['factor_95'][name], 999):.3g}" for row in found["designs"]))
+    _show_expected(found, found["designs"])
+
+
+def show_protocol(found: dict[str, Any]) -> None:
+    """The records, then what each protocol would determine."""
+    table = Table("site", "indenter", "depth (mm)", "speed (mm/s)", "hold (s)", "force (N)", box=None)
+    for row in found["records"]:
+        numbers = (f"{row[key]:.3g}" for key in ("depth_mm", "speed_mm_s", "hold_s", "peak_force_N"))
+        table.add_row(row["site"], row["indenter"], *numbers)
+    STDOUT.print(table)
+    _show_expected(found, found["protocols"])
+
+
+def _show_expected(found: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+    """The factors of the 95 % intervals that each choice promises, and the verdict."""
+    widths = Table("parameter", *(row["design"] for row in rows), box=None)
+    for name in rows[0]["factor_95"]:
+        widths.add_row(name, *(f"x/ {min(row['factor_95'][name], 999):.3g}" for row in rows))
     STDOUT.print(widths)
     STDOUT.print(found["verdict"], soft_wrap=True)
     for text in found["left_out"]:
-        STDOUT.print(f"left out: {text}", soft_wrap=True)
+        STDOUT.print(f"told: {text}" if "protocols" in found else f"left out: {text}", soft_wrap=True)
 
 
 VERBS = (crossvalidate, design)

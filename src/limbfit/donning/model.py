@@ -97,7 +97,6 @@ def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket
     local = (socket.points - fit.pivot) @ frame.T
     clear = None if fit.travel_mm is not None else (socket.clear - fit.pivot) @ frame.T
     shape = SmoothSurface.of(local, socket.faces, clear, centre=fit.pivot, axis=frame[2], edge=frame[0])
-    held = [nodes for name, nodes in mesh.node_sets.items() if name.startswith("fixed_")]
     motion = _donning(fit)
     before = None
     for load in fit.loads:
@@ -107,7 +106,7 @@ def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket
     return Problem(
         mesh=mesh,
         materials=materials,
-        fixed=np.unique(np.concatenate(held)),
+        fixed=mesh.held,
         contact_faces=np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64),
         indenter=None,
         history=History(np.array([0.0, motion.times[-1]]), np.zeros(2)),
@@ -152,5 +151,11 @@ def socket_steps(fit: Fit, modulus: float) -> StepControl:
         times += [start + (on - start) * k / count for k in range(1, count + 1)]
         if off > on:
             times += [on + (off - on) * (k / HELD) ** RELAXING for k in range(1, HELD + 1)]
-    threads = min(os.cpu_count() or 1, MOST_THREADS)
-    return StepControl(times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=threads)
+    return StepControl(
+        times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=most_threads()
+    )
+
+
+def most_threads() -> int:
+    """Threads of one simulation that has the machine to itself."""
+    return min(os.cpu_count() or 1, MOST_THREADS)

@@ -4,6 +4,7 @@ A job is anything that can be pickled, and the function that does it is importab
 order of the jobs whatever runs them, so a caller cannot tell one executor from another but by the clock.
 """
 
+from .background import meanwhile
 from .choice import Placement, make_executor, placed, sharing
 from .cluster import QUEUES, DaskExecutor
 from .face import SAFE_PATH, THREAD_VARIABLES, Executor, Limits, SerialExecutor, usable_cores
@@ -20,6 +21,7 @@ __all__ = [
     "ProcessExecutor",
     "SerialExecutor",
     "make_executor",
+    "meanwhile",
     "placed",
     "sharing",
     "usable_cores",

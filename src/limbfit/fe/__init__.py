@@ -28,11 +28,21 @@ from .contact.open_surface import OpenSurface
 from .contact.smooth_surface import SmoothSurface
 from .doubts import Doubt
 from .kernel.elements import ELEMENTS
-from .materials import ORDER_IN_TIME, VOLUMETRIC_LAWS, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from .materials import (
+    ORDER_IN_TIME,
+    VOLUMETRIC_LAWS,
+    Fibred,
+    Material,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    OgdenQLV,
+)
 from .motion import Motion, RigidBody
 from .pressure import Pressure
 from .problem import History, Problem, Support
 from .result import Result, State, Step
+from .solution.compiling import are_compiled, compile_kernels
 from .solution.control import StepControl
 from .solution.guesses import tangent_at_rest
 from .solution.linear import linear_solver
@@ -45,6 +55,7 @@ __all__ = [
     "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
     "Doubt",
+    "Fibred",
     "History",
     "Indenter",
     "Material",
@@ -66,6 +77,8 @@ __all__ = [
     "Support",
     "System",
     "Tractions",
+    "are_compiled",
+    "compile_kernels",
     "iterate",
     "linear_solver",
     "solve",

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .kernel.fibres import add_stress_at_rest
 from .kernel.laws import Laws
 from .kernel.response import elastic_response, elastic_stress
 from .lanes import LANES, workspace
@@ -95,6 +96,8 @@ def _elastic_stresses(elements, tables, u, records, out):  # type: ignore[no-unt
         elastic_response(elements, start, tables, u, points, law[0], numbers)
         for t in range(q):
             elastic_stress(points[t])
+            if len(elements[4]):
+                add_stress_at_rest(points[t])
             for l in range(min(LANES, m - start)):
                 for i in range(6):
                     out[start + l, t, i] = points[t].tau[i, l]

@@ -54,6 +54,11 @@ POINT = np.dtype(
         ("stiffening", "f8", _L),  # derivative of the pressure with respect to ln J at this point
         ("tau", "f8", (6, _L)),  # Kirchhoff stress
         ("D", "f8", (6, 6, _L)),  # moduli
+        ("fibre", "f8", (3, _L)),  # its direction, of length one
+        ("fibre_at_rest", "f8", (3, _L)),  # F^-1 of it
+        ("pull", "f8", _L),  # T = dW/d ln(its isochoric stretch)
+        ("pull_slope", "f8", _L),  # dT/d ln(its isochoric stretch)
+        ("pull_rates", "f8", (2, _L)),  # dT/d k1, dT/d k2
     ],
     align=True,
 )
@@ -63,6 +68,8 @@ LAW = np.dtype(
     [
         ("response", "i8", _L),
         ("rates", "i8", _L),
+        ("fibre", "f8", (2, _L)),  # k1, k2
+        ("along", "f8", (3, _L)),  # the fibre at rest, of length one
         ("energy", "f8", _L),
         ("beta", "f8", (3, _L)),
         ("slope", "f8", (6, _L)),
@@ -87,6 +94,9 @@ ELEMENT = np.dtype(
         ("axes", "f8", (6, 6, _L)),
         ("along", "f8", (9, _L)),
         ("across", "f8", (6, 6, _L)),
+        ("factor_of_fibre", "f8", _L),  # and of what fibres add: its factor, their dyad and its deviator
+        ("dyad", "f8", (6, _L)),
+        ("deviator", "f8", (6, _L)),
     ],
     align=True,
 )

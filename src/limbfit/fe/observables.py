@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .kernel.elements import Element
+from .kernel.fibres import add_stress
 from .kernel.laws import Laws
 from .kernel.response import elastic_response, kirchhoff, pressures
 from .lanes import LANES, workspace
@@ -168,6 +169,8 @@ def _fields(elements, mean, tables, history, u, records, out):  # type: ignore[n
                 out[start + l, 9] += w * p.J[l]
                 out[start + l, 10] += w * (p.energy[l] + p.volumetric[l])
             kirchhoff(p)
+            if len(elements[4]):
+                add_stress(p)
             for l in range(min(LANES, m - start)):
                 w = weights[start + l, t] / weights[start + l].sum() / p.J[l]
                 for i in range(6):

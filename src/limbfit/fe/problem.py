@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
 from ..mesh import Mesh
@@ -154,6 +154,8 @@ class Problem:
         coefficient.
     bodies : further rigid bodies, each driven by its own motion.
     pressures : on boundary faces, normal to them as they move.
+    fibres : direction of the fibres at rest, one (3,) or one for each cell (m, 3), of any length; where a
+        material is `Fibred`.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     """
 
@@ -170,6 +172,7 @@ class Problem:
     friction: str | float = "frictionless"
     bodies: tuple[RigidBody, ...] = ()
     pressures: tuple[Pressure, ...] = ()
+    fibres: ArrayLike | None = None
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
@@ -247,6 +250,7 @@ def check(problem: Problem) -> None:
         if value.size and (value.min() < 0 or value.max() >= n):
             raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
     _check_cells(problem)
+    _check_fibres(problem)
     _check_bodies(problem)
     if not len(problem.fixed) and not problem.supports:
         raise ProblemError("nothing is held in place", remedy="fix the bone and proximal nodes")
@@ -302,6 +306,23 @@ def _check_cells(problem: Problem) -> None:
     used[mesh.cells] = True
     if not used.all():
         raise ProblemError(f"{(~used).sum()} nodes belong to no cell", remedy="drop them from the mesh")
+
+
+def _check_fibres(problem: Problem) -> None:
+    if problem.fibres is None:
+        for region in problem.mesh.region_names:
+            if problem.materials[region].table().fibre[0] > 0.0:
+                raise ProblemError(
+                    f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
+                )
+        return
+    given = np.asarray(problem.fibres, dtype=float)
+    if given.shape not in ((3,), (len(problem.mesh.cells), 3)):
+        raise ProblemError(
+            f"fibres have shape {given.shape}", remedy=f"give (3,), or ({len(problem.mesh.cells)}, 3)"
+        )
+    if not (np.isfinite(given).all() and (np.linalg.norm(np.atleast_2d(given), axis=1) > 0.0).all()):
+        raise ProblemError("a direction of the fibres is zero or not finite")
 
 
 def _check_bodies(problem: Problem) -> None:

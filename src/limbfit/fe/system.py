@@ -105,6 +105,10 @@ class System:
         self.points = np.ascontiguousarray(mesh.points, dtype=float)
         self.cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
         self.regions = np.ascontiguousarray(mesh.regions, dtype=np.int32)
+        self.fibres = np.zeros((0, 3))
+        if problem.fibres is not None:
+            given = np.broadcast_to(np.asarray(problem.fibres, dtype=float), (len(self.cells), 3))
+            self.fibres = np.ascontiguousarray(given / np.linalg.norm(given, axis=1, keepdims=True))
         self.gradients, self.weights = reference_gradients(self.element, self.points, mesh.cells)
         self._number_unknowns(problem)
         self._build_pattern(problem)
@@ -164,6 +168,7 @@ class System:
             and mine.indenter is problem.indenter
             and mine.bodies is problem.bodies
             and mine.pressures is problem.pressures
+            and mine.fibres is problem.fibres
             and mine.history.forced == problem.history.forced
             and mine.supports == problem.supports
             and (mine.element, mine.start, mine.contact_rule)
@@ -177,7 +182,8 @@ class System:
 
     def elements(self, cells: slice) -> Elements:
         """Some of the elements, as the kernels take them."""
-        return self.cells[cells], self.gradients[cells], self.weights[cells], self.regions[cells]
+        own = self.gradients[cells], self.weights[cells], self.regions[cells]
+        return self.cells[cells], *own, self.fibres[cells]
 
     def over_cells(self, work: Callable[[slice], T]) -> list[T]:
         """``work`` done on as many parts of the cells as there are threads, side by side."""
@@ -187,6 +193,8 @@ class System:
 
     def evaluate(self, u: Array, laws: Laws, increment: Increment, tangent: bool = True) -> Evaluation:
         """Energy, residual (r, 3) and, if wanted, tangent entries at ``u (r, 3)``."""
+        if laws.fibred and not len(self.fibres):
+            raise ProblemError("the fibres of a material have no direction", remedy="state Problem.fibres")
         size = len(self.indices) if tangent else 0
         mean = self.element.mean_dilatation
 

@@ -21,18 +21,22 @@ from ..fe import Indenter, Problem
 from .faceting import INDENTER
 
 Array = NDArray[np.float64]
-NAMES = ("c", "m", "gamma", "tau")
 MOST = 64  # parameters, in FEBio
 
 
 @dataclass(frozen=True)
 class Range:
-    """Start and bounds of the parameters ``c`` (MPa), ``m``, ``gamma``, ``tau`` (s) of a tissue, by name."""
+    """Start and bounds of the parameters of `OgdenQLV` (MPa, s) of a tissue, by name and in their order."""
 
     start: Mapping[str, float]
     lower: Mapping[str, float]
     upper: Mapping[str, float]
     kappa_ratio: float
+
+    @property
+    def count(self) -> int:
+        """How many parameters of FEBio's it has: c and m twice each, k, and those of relaxation."""
+        return 3 + len(self.start)
 
 
 def in_indenter_frame(problem: Problem) -> Problem:
@@ -49,7 +53,8 @@ def in_indenter_frame(problem: Problem) -> Problem:
         place = (np.asarray(shape.centre, dtype=float) - centre) @ frame.T
         there = shape.placed(place, frame @ shape.frame[2], frame @ shape.frame[0])
         bodies.append(replace(body, shape=there, pivot=(body.origin - centre) @ frame.T))
-    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies))
+    fibres = None if problem.fibres is None else np.asarray(problem.fibres, dtype=float) @ frame.T
+    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies), fibres=fibres)
 
 
 def write_optimisation(
@@ -64,9 +69,10 @@ def write_optimisation(
     RunError
         Where the file cannot be written.
     """
-    if 7 * len(tissues) > MOST:
+    count = sum(tissue.count for tissue in tissues.values())
+    if count > MOST:
         raise ProblemError(
-            f"FEBio fits {MOST} parameters at most, 7 for each tissue, not {len(tissues)} tissues"
+            f"FEBio fits {MOST} parameters at most, not the {count} that {len(tissues)} tissues have there"
         )
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
@@ -87,10 +93,11 @@ def _lines(tissues: Mapping[str, Range], times: Array, force: Array, iterations:
             values = f"{start!r},{lower!r},{upper!r},{abs(start)!r}"
             yield f"<param name=\"fem.material('{name}').{path}\">{values}</param>"
     yield "</Parameters><Constraints>"
-    for i, tissue in enumerate(tissues.values()):
+    counts = [tissue.count for tissue in tissues.values()]
+    for first, tissue in zip(np.cumsum([0, *counts]), tissues.values()):
         for ties in _ties(tissue):
-            row = np.zeros(7 * len(tissues) + 1)
-            row[7 * i : 7 * i + 7] = ties
+            row = np.zeros(sum(counts) + 1)
+            row[first : first + len(ties)] = ties
             yield f"<constraint>{','.join(f'{value:.17g}' for value in row)}</constraint>"
     yield '</Constraints><Objective type="data-fit">'
     yield '<fnc type="filter_positive_only"><source type="parameter">'
@@ -109,8 +116,7 @@ def _parameters(tissue: Range) -> Iterator[tuple[str, float, float, float]]:
         ("k", "c", tissue.kappa_ratio),
         ("elastic.m1", "m", 1.0),
         ("elastic.m2", "m", -1.0),
-        ("g1", "gamma", 1.0),
-        ("t1", "tau", 1.0),
+        *((f"{'gt'[i % 2]}{i // 2 + 1}", name, 1.0) for i, name in enumerate(list(tissue.start)[2:])),
     )
     for path, name, scale in paths:
         low, high = sorted((scale * tissue.lower[name], scale * tissue.upper[name]))
@@ -120,7 +126,7 @@ def _parameters(tissue: Range) -> Iterator[tuple[str, float, float, float]]:
 def _ties(tissue: Range) -> tuple[tuple[float, ...], ...]:
     """c1 = c2, k = ratio c1 and m1 = -m2."""
     return (
-        (1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        (tissue.kappa_ratio, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0),
+        (1.0, -1.0, 0.0, 0.0, 0.0),
+        (tissue.kappa_ratio, 0.0, -1.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 1.0, 1.0),
     )

@@ -73,8 +73,20 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
             rigid_body(model, name, touching[name], motion, tissue) for name, motion in driven.motions.items()
         ),
         pressures=_pressures(model, tissue),
+        fibres=_fibres(model, tissue),
         **{"element": element, "contact_rule": _contact_rule(model, tissue), **settings},
     )
+
+
+def _fibres(model: FebModel, tissue: Tissue) -> Array | None:
+    """The direction of the fibres in every cell; any where there are none."""
+    if not model.fibres:
+        return None
+    found = np.tile([1.0, 0.0, 0.0], (len(tissue.mesh.cells), 1))
+    for r, name in enumerate(tissue.mesh.region_names):
+        if name in model.fibres:
+            found[tissue.mesh.regions == r] = model.fibres[name]
+    return found
 
 
 def _contact_rule(model: FebModel, tissue: Tissue) -> str:

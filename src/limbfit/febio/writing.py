@@ -18,6 +18,7 @@ from ..errors import ProblemError, RunError
 from ..fe import Indenter, Material, Problem, StepControl
 from ..fe.solution.control import schedule
 from .faceting import FRONT, INDENTER, PATCH, Body, Tool, blunt, written_bodies
+from .fibres import axes_of_cells, axis_of, directions
 from .moving import HELD, Curves, boundary_lines, conditions, pressure_lines, row, step_ends
 from .penalty import explicit_penalty, mean_stiffness
 from .reading.model import Contact
@@ -177,8 +178,9 @@ def _lines(problem: Problem, bodies: list[Body], settings: FebSettings) -> Itera
         yield from controls[0]
     yield "<Globals><Constants><T>0</T><R>0</R><Fc>0</Fc></Constants></Globals>"
     yield "<Material>"
+    axes = directions(problem)
     for i, name in enumerate(regions, 1):
-        yield from material_lines(i, name, problem.materials[name])
+        yield from material_lines(i, name, problem.materials[name], axis_of(axes.get(name)))
     for i, body in enumerate(bodies, len(regions) + 1):
         yield (
             f'<material id="{i}" name={quoteattr(body.name)} type="rigid body"><density>1</density>'
@@ -187,6 +189,7 @@ def _lines(problem: Problem, bodies: list[Body], settings: FebSettings) -> Itera
     yield "</Material>"
     yield from _mesh(problem, bodies)
     yield from _domains(problem, bodies)
+    yield from axes_of_cells(problem)
     yield from ("<Boundary>", *boundary, "</Boundary>")
     if bodies and len(ends) == 1:
         yield from ("<Rigid>", *by_step[0], "</Rigid>")
@@ -252,8 +255,8 @@ def _dividing(span: float, size: float) -> float:
     return span / float(np.ceil(span / size))
 
 
-def material_lines(number: int, name: str, material: Material) -> Iterator[str]:
-    """A tissue: Ogden terms, and relaxation around them.
+def material_lines(number: int, name: str, material: Material, axis: str = "") -> Iterator[str]:
+    """A tissue: Ogden terms, fibres beside them along ``axis``, and relaxation around them.
 
     Raises
     ------
@@ -271,14 +274,20 @@ def material_lines(number: int, name: str, material: Material) -> Iterator[str]:
         f"<k>{float(table.kappa)!r}</k><pressure_model>{_PRESSURE_MODELS[table.volumetric]}</pressure_model>"
     )
     head = f'<material id="{number}" name={quoteattr(name)} type='
+    kind, content = "Ogden", terms
+    if table.fibre[0] > 0.0:
+        k1, k2 = map(float, table.fibre)
+        kind = "uncoupled solid mixture"
+        content = f'<solid type="Ogden">{terms}</solid><solid type="fiber-exp-pow-uncoupled">'
+        content += f"<ksi>{k1!r}</ksi><alpha>{k2!r}</alpha><beta>2</beta></solid>"
     if not prony:
-        yield f'{head}"Ogden">{shared}{terms}</material>'
+        yield f'{head}"{kind}">{axis}{shared}{content}</material>'
         return
     relaxation = "".join(
         f"<g{i}>{float(g)!r}</g{i}><t{i}>{float(tau)!r}</t{i}>" for i, (g, tau) in enumerate(prony, 1)
     )
-    yield f'{head}"uncoupled viscoelastic">{shared}<g0>1</g0>{relaxation}'
-    yield f'<elastic type="Ogden"><k>0</k>{terms}</elastic></material>'
+    yield f'{head}"uncoupled viscoelastic">{axis}{shared}<g0>1</g0>{relaxation}'
+    yield f'<elastic type="{kind}"><k>0</k>{content}</elastic></material>'
 
 
 def _mesh(problem: Problem, bodies: list[Body]) -> Iterator[str]:

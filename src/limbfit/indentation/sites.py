@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from ..errors import ProblemError, SurfaceError
 from ..extensions import load_extensions
-from ..fe import History, Indenter, Material, OgdenQLV, Problem, RigidSurface, StepControl
+from ..fe import Fibred, History, Indenter, Material, OgdenQLV, Problem, RigidSurface, StepControl
 from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
@@ -53,6 +54,7 @@ class SiteModel:
     element: str = ""  # row of the element table; by default that of the mesh's cell type
     within_mm: float | None = None  # no more of the mesh than this far from the site
     law: str = OGDEN  # of all tissues
+    fibres: tuple[tuple[str, Vector], ...] = ()  # direction in each tissue that has some
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     extensions_digest: str = ""
     site: str = ""
@@ -75,20 +77,38 @@ class SiteModel:
         return spread(self.history.phases, points, self.history.times)
 
 
-def materials(parameters: Parameters, kappa_ratio: float, law: str = OGDEN) -> dict[str, Material]:
-    """The tissues for the solver, in MPa."""
+def materials(
+    parameters: Parameters, kappa_ratio: float, law: str = OGDEN, fibred: Container[str] = ()
+) -> dict[str, Material]:
+    """The tissues for the solver, in MPa; those in ``fibred`` have fibres, where their law knows some."""
     stated = LAWS[law]
-    make = stated.material or OgdenQLV
-    return {
-        tissue: make(**stated.in_solver_units(values), kappa_ratio=kappa_ratio)
-        for tissue, values in parameters.items()
-    }
+    found: dict[str, Material] = {}
+    for tissue, values in parameters.items():
+        own = stated.in_solver_units(values)
+        if stated.material is not None:
+            found[tissue] = stated.material(**own, kappa_ratio=kappa_ratio)
+            continue
+        fibre = {name: own.pop(name) for name in ("k1", "k2") if name in own}
+        c, m, *relaxation = own.values()
+        ground = OgdenQLV(c, m, relaxation[::2], relaxation[1::2], kappa_ratio)
+        found[tissue] = Fibred(ground, **fibre) if fibre and tissue in fibred else ground
+    return found
+
+
+def fibre_field(fibres: Iterable[tuple[str, Vector]], mesh: Mesh) -> Array | None:
+    """The fibres' direction in each cell (m, 3); any where a tissue has none, None where all have none."""
+    found = None
+    for tissue, direction in fibres:
+        if tissue in mesh.region_names:
+            found = np.tile([1.0, 0.0, 0.0], (len(mesh.cells), 1)) if found is None else found
+            found[mesh.regions == mesh.region_names.index(tissue)] = direction
+    return found
 
 
 def materials_of(model: SiteModel, parameters: Parameters) -> dict[str, Material]:
     """The tissues of a site for the solver, whose law may be the study's own."""
     load_extensions(model.extensions)
-    return materials(parameters, model.kappa_ratio, model.law)
+    return materials(parameters, model.kappa_ratio, model.law, dict(model.fibres))
 
 
 def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
@@ -103,7 +123,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         centre, axis = np.array(model.position), np.array(model.axis)
         part = neighbourhood(mesh, centre, model.within_mm)
         mesh, cut = part.mesh, held_cut(part, centre, axis)
-        if not len(cut) and not len(_held(mesh)):  # nothing else carries it
+        if not len(cut) and not len(mesh.held):  # nothing else carries it
             cut = part.cut
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     faces = mesh.face_sets["skin"]
@@ -112,17 +132,14 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     return Problem(
         mesh=mesh,
         materials=materials_of(model, parameters),
-        fixed=np.union1d(_held(mesh), cut),
+        fixed=np.union1d(mesh.held, cut),
         contact_faces=faces[near],
         indenter=indenter,
         history=model.history,
         friction=model.indenter.friction,
         element=model.element,
+        fibres=fibre_field(model.fibres, mesh),
     )
-
-
-def _held(mesh: Mesh) -> NDArray[np.int64]:
-    return np.unique(np.concatenate([n for s, n in mesh.node_sets.items() if s.startswith("fixed_")]))
 
 
 def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:

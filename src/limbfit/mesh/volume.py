@@ -59,6 +59,12 @@ class Mesh:
         """Corner nodes of each cell: (m, 4) for tetrahedra, (m, 8) for hexahedra."""
         return self.cells[:, : self.kind.corners]
 
+    @property
+    def held(self) -> NDArray[np.int64]:
+        """Nodes (k,) that do not move: those of all sets whose names begin with ``fixed_``."""
+        sets = [nodes for name, nodes in self.node_sets.items() if name.startswith("fixed_")]
+        return np.unique(np.concatenate(sets)) if sets else np.empty(0, dtype=np.int64)
+
     def with_points(self, points: NDArray[np.float64]) -> Mesh:
         return replace(self, points=points)
 

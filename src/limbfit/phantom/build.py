@@ -25,7 +25,7 @@ import numpy as np
 from ..anatomy.surfaces.surfaces import save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import MESHES, ForceJob, TrueForce, site_force
+from .forces import DISCRETISATIONS, ForceJob, MeshJob, TrueForce, site_force, site_mesh
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, Limb, make_limb
 from .mri import DETAIL_GRIDS, make_grid, write_series
 from .record import Ramp, record
@@ -35,7 +35,7 @@ from .socket import write_socket
 from .studyfile import study_text
 from .surfaces import true_anatomy
 
-Mapping = Callable[[Callable[[ForceJob], TrueForce], Iterable[ForceJob]], Iterable[TrueForce]]
+Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]
 
 PARAMETER_BASE: Parameters = {
@@ -84,7 +84,8 @@ def make_phantom(
     sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
     fat : three tissues, skin of 2 mm over fat of 4 mm over muscle, instead of two.
     socket : also a rectified socket for the limb with a liner, as a file that the study names.
-    mapping : like ``map``; given one that works in several processes, sites are simulated side by side.
+    mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
+        side.
     progress : called with what is being done, how much of it is done, and of how much.
 
     Returns
@@ -169,19 +170,16 @@ def _write_traces(
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, true_anatomy(limb))
-    settings = replace(MESHES[detail], layers=limb.layers)
-    jobs = [
-        ForceJob(
-            site.name,
-            truth,
-            _triple(site.position),
-            _triple(site.axis),
-            _ramp(site),
-            parameters,
-            settings,
-        )
-        for site in indented
-    ]
+    made = DISCRETISATIONS[detail]
+    settings = replace(made.mesh, layers=limb.layers)
+    places = [(site.name, _triple(site.position), _triple(site.axis)) for site in indented]
+    wanted = [MeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
+    jobs = []
+    tell("meshes", 0, len(wanted))
+    for (name, at, axis), site, mesh in zip(places, indented, mapping(site_mesh, wanted), strict=True):
+        steps = made.steps(site.thickness)
+        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters))
+        tell("meshes", len(jobs), len(wanted))
     tell("forces", 0, len(jobs))
     told = []
     for i, (site, found) in enumerate(zip(indented, mapping(site_force, jobs), strict=True)):
@@ -241,5 +239,9 @@ def _truth(
             "origin_mm": limb.origin.tolist(),
         },
         "markers": [_site_facts(site) for site in everywhere],
-        "mesh": {**asdict(MESHES[detail]), "layers": [asdict(layer) for layer in limb.layers]},
+        "mesh": {
+            **asdict(DISCRETISATIONS[detail].mesh),
+            "layers": [asdict(layer) for layer in limb.layers],
+            "within_mm": DISCRETISATIONS[detail].within_mm,
+        },
     }

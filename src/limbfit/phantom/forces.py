@@ -1,9 +1,9 @@
 """The phantom's true forces: its implicit anatomy, meshed and stepped otherwise than a calibration does.
 
-The mesh comes from the exact surfaces, not from the segmented image, and is finer than the study's; the
-element has twice its quadrature points (FEBio's rule), and like the study's default one mean dilatation
-each: with the pressure as it comes, forces of such meshes are 5 to 20 % too large (docs/convergence.md),
-which a calibration would put into the moduli.
+The mesh comes from the exact surfaces, not from the segmented image, and is finer than the study's where the
+indenter presses; the element has twice its quadrature points (FEBio's rule), and like the study's default one
+mean dilatation each: with the pressure as it comes, forces of such meshes are 5 to 20 % too large
+(docs/convergence.md), which a calibration would put into the moduli.
 """
 
 from __future__ import annotations
@@ -19,31 +19,80 @@ from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_si
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
-from ..indentation import Parameters, SiteModel, build_problem
+from ..indentation import Parameters, SiteModel, build_problem, neighbourhood
+from ..mesh import Mesh
 from ..study import IndenterTable
 from .record import Ramp
 from .sites import INDENTER_EDGE_MM, INDENTER_MM
 
 ELEMENT = "tet10g8p0"
-PENALTY_PER_MM = 400.0  # the indenter sinks in by less than a hundredth of the depth everywhere
-STEPS = StepControl(load_steps=12, unload_steps=16, penalty=PENALTY_PER_MM, hold_penalty=True)
-MESHES = {
-    "coarse": MeshSettings(edge_near_mm=2.8, edge_far_mm=28.0, near_radius_mm=14.0, growth=0.8, flatness=1.6),
-    "paper": MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """How true forces are made.
+
+    ``within_mm``: tissue farther than that from the site is left out, and what is cut is free: bone holds it.
+    ``softest_per_mm`` (1/mm): contact is `STIFFEST_PER_MM` stiff over thin tissue, and softer over thick
+    tissue, but no softer than that: the indenter sinks in by less than a hundredth of the depth everywhere.
+    """
+
+    mesh: MeshSettings
+    within_mm: float | None
+    load_steps: int
+    unload_steps: int
+    softest_per_mm: float
+
+    def steps(self, tissue_mm: float) -> StepControl:
+        """Steps and contact over so much tissue."""
+        penalty = float(np.clip(PENALTY_TIMES_TISSUE / tissue_mm, self.softest_per_mm, STIFFEST_PER_MM))
+        return StepControl(
+            load_steps=self.load_steps, unload_steps=self.unload_steps, penalty=penalty, hold_penalty=True
+        )
+
+
+STIFFEST_PER_MM, PENALTY_TIMES_TISSUE = 400.0, 3200.0
+DISCRETISATIONS = {
+    "coarse": Discretisation(
+        MeshSettings(edge_near_mm=3.0, edge_far_mm=28.0, near_radius_mm=14.0, growth=1.0, flatness=1.9),
+        within_mm=100.0,
+        load_steps=12,
+        unload_steps=16,
+        softest_per_mm=100.0,
+    ),
+    "paper": Discretisation(
+        MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
+        within_mm=None,
+        load_steps=12,
+        unload_steps=16,
+        softest_per_mm=STIFFEST_PER_MM,
+    ),
 }
 
 
 @dataclass(frozen=True)
-class ForceJob:
-    """One indentation to be simulated: where the anatomy is stored, place, ramp, the tissues' parameters."""
+class MeshJob:
+    """A site to be meshed: where the anatomy is stored, and where the site is in it."""
 
     site: str
     anatomy: Path
     position: tuple[float, float, float]
     axis: tuple[float, float, float]
+    settings: MeshSettings
+    within_mm: float | None
+
+
+@dataclass(frozen=True)
+class ForceJob:
+    """One indentation to be simulated: its mesh, place, ramp, steps, and the tissues' parameters."""
+
+    site: str
+    mesh: Mesh
+    position: tuple[float, float, float]
+    axis: tuple[float, float, float]
     ramp: Ramp
+    steps: StepControl
     parameters: Parameters
-    mesh: MeshSettings
 
 
 @dataclass(frozen=True)
@@ -63,16 +112,22 @@ def _base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     return anatomy, base_mesh(anatomy, settings)
 
 
+def site_mesh(job: MeshJob) -> Mesh:
+    """Mesh one site, and keep the tissue that its force depends on."""
+    anatomy, base = _base(job.anatomy, job.settings)
+    position = np.array(job.position)
+    mesh, _ = mesh_site(anatomy, position, np.array(job.axis), job.settings, base)
+    return mesh if job.within_mm is None else neighbourhood(mesh, position, job.within_mm).mesh
+
+
 def site_force(job: ForceJob) -> TrueForce:
-    """Mesh and solve one site.
+    """Solve one site.
 
     Raises
     ------
     RunError
         When the simulation does not complete.
     """
-    anatomy, base = _base(job.anatomy, job.mesh)
-    mesh, _ = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.mesh, base)
     knots_s, knots_mm = job.ramp.knots
     model = SiteModel(
         name=job.site,
@@ -84,14 +139,16 @@ def site_force(job: ForceJob) -> TrueForce:
         knots_mm=knots_mm,
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
-    problem = build_problem(model, mesh, job.parameters)
-    result = solve(replace(problem, element=ELEMENT), steps=STEPS)
+    problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
+    result = solve(problem, steps=job.steps)
     if not result.completed:
         raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
     times = np.linspace(0.0, knots_s[-1], 401)
     facts: dict[str, float | int | str] = {
         "element": ELEMENT,
-        "nodes": len(mesh.points),
-        "cells": len(mesh.cells),
+        "nodes": len(job.mesh.points),
+        "cells": len(job.mesh.cells),
+        "steps": int(result.statistics["steps"]),
+        "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
     return TrueForce(job.site, times, result.force_at(times), facts)

@@ -18,6 +18,7 @@ _GREEK = {
     "mu": "μ",
     "tau": "τ",
 }
+_BELOW = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -40,9 +41,10 @@ def fixed(value: Any, decimals: int = 1) -> str:
 
 
 def symbol(key: str) -> str:
-    """A parameter as formulas write it: ``tau_s`` is τ."""
+    """A parameter as formulas write it: ``tau_s`` is τ, ``tau2_s`` τ₂."""
     name, _ = split_key(key)
-    return _GREEK.get(name, name)
+    letter = name.rstrip("0123456789")
+    return _GREEK.get(letter, letter) + name[len(letter) :].translate(_BELOW)
 
 
 def unit_of(key: str) -> str:

@@ -1,7 +1,8 @@
 """The socket's shape: rectified from a limb or read from a file, its regions, its wall for printing."""
 
+from .areas import Area, Zone
 from .reading import read_socket
-from .rectify import Area, Recipe, rectified
+from .rectify import Recipe, rectified
 from .shape import Socket, circumference
 
-__all__ = ["Area", "Recipe", "Socket", "circumference", "read_socket", "rectified"]
+__all__ = ["Area", "Recipe", "Socket", "Zone", "circumference", "read_socket", "rectified"]

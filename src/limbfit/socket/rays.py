@@ -138,7 +138,7 @@ def profile(outer: Surface, frame: Frame) -> Profile:
     below = np.linspace(rays.lowest, 0.0, max(8, round(-rays.lowest / STEP_MM)), endpoint=False)
     stations = np.concatenate([below, np.linspace(0.0, top, max(8, round(top / STEP_MM)))])
     angles = -np.pi + 2 * np.pi * np.arange(ANGLES) / ANGLES
-    radius, folds = _cast(local, rays, stations, angles)
+    radius, folds = radii(local, rays, stations, angles)
     if np.isnan(radius).any():
         k = int(np.isnan(radius).any(axis=1).argmax())
         place = frame.to_patient(rays.middle(stations[k]))
@@ -146,7 +146,8 @@ def profile(outer: Surface, frame: Frame) -> Profile:
             f"a ray from the limb's middle line at ({_words(place)}) mm leaves the limb without meeting it",
             remedy="close the surface, or move the proximal cut nearer to the knee",
         )
-    return Profile(rays, stations, angles, _smooth(radius, stations), folds)
+    radius = smooth(radius, stations, float(np.median(radius)), SMOOTH_MM)
+    return Profile(rays, stations, angles, radius, folds)
 
 
 def _words(point: Array) -> str:
@@ -193,8 +194,14 @@ def hits_of(surface: Surface, starts: Array, ways: Array) -> list[Array]:
     return found
 
 
-def _cast(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
-    """The radius at which each ray leaves the surface for good, and how far in it left it before."""
+def radii(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
+    """Where each ray leaves a surface (limb frame) for good, and how far in it left it before.
+
+    Returns
+    -------
+    radius : (stations, angles) mm; NaN where a ray does not meet the surface.
+    folds : (stations, angles) mm.
+    """
     ways = rays.direction(angles[None, :], stations[:, None])
     starts = np.broadcast_to(rays.middle(stations)[:, None], ways.shape)
     hits = hits_of(local, starts.reshape(-1, 3), ways.reshape(-1, 3))
@@ -203,12 +210,15 @@ def _cast(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[A
     return radius.reshape(ways.shape[:2]), folds.reshape(ways.shape[:2])
 
 
-def _smooth(radius: Array, stations: Array) -> Array:
-    """Without roughness shorter than ``SMOOTH_MM``; across the pole a ray goes on at the other side."""
-    pad = 6
-    beyond = np.roll(radius[1 : pad + 1][::-1], ANGLES // 2, axis=1)
-    padded = np.vstack([beyond, radius])
-    across = SMOOTH_MM / (2 * np.pi / ANGLES * np.median(radius))
-    return np.asarray(
-        gaussian_filter(padded, (SMOOTH_MM / STEP_MM, across), mode=("nearest", "wrap"))[pad:], dtype=float
+def smooth(field: Array, stations: Array, radius: float, size_mm: float) -> Array:
+    """A field (stations, angles) around a limb of a ``radius``, without what is shorter than ``size_mm``.
+
+    Across the pole a ray goes on at the other side.
+    """
+    pad = max(6, round(4.0 * size_mm / STEP_MM))
+    beyond = np.roll(field[1 : pad + 1][::-1], ANGLES // 2, axis=1)
+    across = size_mm / (2 * np.pi / ANGLES * radius)
+    padded = gaussian_filter(
+        np.vstack([beyond, field]), (size_mm / STEP_MM, across), mode=("nearest", "wrap")
     )
+    return np.asarray(padded[pad:], dtype=float)

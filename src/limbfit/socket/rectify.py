@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface, self_intersections
 from ..errors import SurfaceError
+from .areas import Area, Zone
 from .clearance import cleared
+from .offsets import Offsets
 from .rays import FOLD_MM, Profile, profile
 from .rings import spaced, stitched
 from .shape import Socket
@@ -25,44 +26,9 @@ Ints = NDArray[np.int64]
 FLARE_DEGREES = 60.0  # how far the brim turns outwards
 FLARE_ROWS = 3
 FEWEST_AROUND = 6
-OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some
 DISTAL_SHARE = 1.0  # of the end's radius: over what height the clearance at the distal end fades out
+MATCHING_ROUNDS, VOLUME_SHARE = 5, 1e-3  # of finding the reduction that leaves a volume
 STEEPEST = 0.75  # of that height: the largest clearance, so that no part of the face moves past another
-
-
-@dataclass(frozen=True)
-class Area:
-    """A round area of the face that presses in (positive depth) or gives relief.
-
-    Attributes
-    ----------
-    position : (3,) its middle, LPS mm, on the limb or near it.
-    radius_mm : where its depth has faded to nothing.
-    depth_mm : at its middle, along the limb's normal.
-
-    Raises
-    ------
-    SurfaceError
-        Where its sides would be steeper than 45 degrees.
-    """
-
-    name: str
-    position: Array
-    radius_mm: float
-    depth_mm: float
-
-    def __post_init__(self) -> None:
-        steepest = 1.717 / self.radius_mm * abs(self.depth_mm)  # at 1/sqrt(5) of the radius
-        if steepest > 1.0:
-            raise SurfaceError(
-                f"the sides of area {self.name!r} would be steeper than 45 degrees",
-                remedy=f"give a radius of {1.717 * abs(self.depth_mm):.1f} mm or more, or less depth",
-            )
-
-    def depth(self, points: Array) -> Array:
-        """(n,) mm at points (n, 3): ``(1 - r^2/R^2)^3``, which has no kink in slope or curvature."""
-        apart = np.linalg.norm(points - np.asarray(self.position, dtype=float), axis=1) / self.radius_mm
-        return self.depth_mm * np.maximum(1.0 - apart**2, 0.0) ** 3
 
 
 @dataclass(frozen=True)
@@ -77,15 +43,17 @@ class Recipe:
     flare_mm : radius of the brim's rounding outwards; 0: none.
     distal : ``"clearance"`` leaves ``distal_clearance_mm`` free under the limb's end, ``"bearing"`` does not.
     edge_mm : edge length of the triangles.
+    offsets : moves along the limb's rays, instead of the reduction.
     """
 
     trim: Trim
     reduction_percent: float = 3.0
-    areas: Sequence[Area] = ()
+    areas: Sequence[Area | Zone] = ()
     flare_mm: float = 6.0
     distal: Literal["clearance", "bearing"] = "clearance"
     distal_clearance_mm: float = 5.0
     edge_mm: float = 4.0
+    offsets: Offsets | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +87,38 @@ def rectified(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
     _refuse_folds(limb, lines, frame)
     drawn = _drawn(lines, recipe)
     face = Surface(frame.to_patient(drawn.points), drawn.faces)
-    recipe = replace(recipe, areas=_on_face(recipe.areas, face))
+    recipe = replace(recipe, areas=[area.on(face) for area in recipe.areas])
     points = frame.to_patient(_shaped(drawn, limb, frame, recipe))
     _refuse_crossing(Surface(points, drawn.faces), recipe)
     clear = frame.to_patient(cleared(frame.to_limb(points), drawn.faces, limb, outer, frame))
     return Socket(points, drawn.faces, clear, drawn.brim)
+
+
+def reduced_to(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) -> tuple[Socket, float]:
+    """The face without areas whose uniform reduction leaves a volume, and that reduction in percent.
+
+    The volume is met within ``VOLUME_SHARE``.
+
+    Raises
+    ------
+    SurfaceError
+        As `rectified`.
+    """
+    plain = replace(recipe, areas=(), offsets=None)
+    reductions = [plain.reduction_percent]
+    roots: list[float] = []  # of volumes: nearly linear in the reduction
+    for _ in range(MATCHING_ROUNDS):
+        face = rectified(outer, frame, replace(plain, reduction_percent=reductions[-1]))
+        roots.append(face.volume_mm3**0.5)
+        short = volume_mm3**0.5 - roots[-1]
+        if abs(short) < 0.5 * VOLUME_SHARE * roots[-1]:
+            break
+        if len(roots) == 1:
+            slope = -roots[-1] / (100.0 - reductions[-1])
+        else:
+            slope = (roots[-1] - roots[-2]) / (reductions[-1] - reductions[-2])
+        reductions.append(reductions[-1] + short / slope)
+    return face, reductions[len(roots) - 1]
 
 
 def _refuse_folds(limb: Profile, lines: Trimmed, frame: Frame) -> None:
@@ -177,23 +172,6 @@ def _carried(dense: Array, values: Array, shares: Array) -> Array:
     return np.column_stack([np.interp(shares, length, column) for column in around.T])
 
 
-def _on_face(areas: Sequence[Area], face: Surface) -> list[Area]:
-    """The areas with their middles on the drawn face (LPS), which a liner keeps off the skin."""
-    moved = []
-    for area in areas:
-        position = np.asarray(area.position, dtype=float)
-        _, near, foot = igl.point_mesh_squared_distance(position[None], face.points, face.faces)
-        normal, apart = face.face_normals[near[0]], position - foot[0]
-        beside = float(np.linalg.norm(apart - (apart @ normal) * normal))
-        if beside > max(5.0, 0.25 * area.radius_mm) or abs(apart @ normal) > OFF_FACE_MM:
-            raise SurfaceError(
-                f"area {area.name!r} lies {np.linalg.norm(apart):.0f} mm off the socket's face",
-                remedy="give a position on the limb below the brim (LPS, mm), or move the trimline up",
-            )
-        moved.append(replace(area, position=foot[0]))
-    return moved
-
-
 def _shaped(drawn: Drawn, limb: Profile, frame: Frame, recipe: Recipe) -> Array:
     """The drawn points (limb frame), rectified; distances add up along the limb's own normals."""
     points = drawn.points
@@ -201,6 +179,8 @@ def _shaped(drawn: Drawn, limb: Profile, frame: Frame, recipe: Recipe) -> Array:
     middle = limb.rays.middle(points[:, 2] - limb.rays.centre_z)
     middle[:, 2] = points[:, 2]
     moves = -0.01 * recipe.reduction_percent * (points - middle)
+    if recipe.offsets is not None:
+        moves = recipe.offsets.moves(points)
     in_patient = frame.to_patient(points)
     for area in recipe.areas:
         moves -= area.depth(in_patient)[:, None] * normals
@@ -242,7 +222,7 @@ def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
     place = face.triangles[crossing[0, 0]].mean(axis=0)
     near = min(
         recipe.areas,
-        key=lambda area: float(np.linalg.norm(place - np.asarray(area.position)) / area.radius_mm),
+        key=lambda area: area.nearness(place),
         default=None,
     )
     words = ", ".join(f"{x:.0f}" for x in place)
@@ -250,5 +230,5 @@ def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
         f"the socket's face would cross itself at ({words}) mm",
         remedy="lower reduction_percent or flare_mm"
         if near is None
-        else f"lower the depth of area {near.name!r} or make it wider",
+        else f"lower the depth of {near.name!r} or make it wider",
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.triangles import Surface, self_intersections
 from ..errors import SurfaceError
+from .rays import hits_of
 from .shape import Socket
 
 Array = NDArray[np.float64]
@@ -20,6 +21,7 @@ BRIM_STEPS = 6  # of the half circle between the two sides
 THINNEST = 0.9  # of the thickness that was asked for
 AROUND = 96  # edges of the adapter's cylinder
 SLIVER_MM = 0.005  # what is shorter where adapter and wall meet would collapse in an STL file
+BEHIND_MM = 10 * SLIVER_MM  # the face, which may have moved by that much: where measuring its wall begins
 
 
 def wall(
@@ -58,6 +60,18 @@ def wall(
     return _surface((shell + (_manifold(block, "adapter") - cavity)).set_tolerance(SLIVER_MM))
 
 
+def thickness(body: Surface, socket: Socket) -> Array:
+    """How thick the wall is behind each triangle (m,) of a socket's face, along its normal, mm.
+
+    Parameters
+    ----------
+    body : of `wall`, LPS mm.
+    """
+    outwards = -socket.surface.face_normals
+    starts = socket.surface.triangles.mean(axis=1) + BEHIND_MM * outwards
+    return np.array([met[0] for met in hits_of(body, starts, outwards)]) + BEHIND_MM
+
+
 def _shell(socket: Socket, thickness: float) -> Surface:
     """Both sides and the half circle that joins them along the brim."""
     inner, outwards = socket.points, -socket.surface.vertex_normals
@@ -68,7 +82,7 @@ def _shell(socket: Socket, thickness: float) -> Surface:
     if least < THINNEST * thickness or len(self_intersections(body)):
         raise SurfaceError(
             f"a wall of {thickness:g} mm would fold outside the socket's narrow places ({least:.1f} mm)",
-            remedy="make it thinner, or the areas of the socket wider or less deep",
+            remedy="make it thinner, the flare larger, or the areas of the socket wider or less deep",
         )
     return body
 

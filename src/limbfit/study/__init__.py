@@ -4,6 +4,7 @@ Relative paths are relative to the study file and must stay inside its folder's 
 ``results/`` beside it.
 """
 
+from .acquisition import AcquireTable
 from .loading import load_study
 from .material import MaterialTable
 from .records import Indentation, Record, Site
@@ -11,6 +12,7 @@ from .tables import IndenterTable, SolverTable, Vector
 from .whole import Study
 
 __all__ = [
+    "AcquireTable",
     "Indentation",
     "IndenterTable",
     "MaterialTable",

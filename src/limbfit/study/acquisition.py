@@ -31,6 +31,7 @@ class AcquireTable(TomlTable):
     precondition: Annotated[int, Field(ge=0, le=50)] = 0
     repeats: Annotated[int, Field(ge=1, le=50)] = 1
     ramp_speed_mm_s: Positive = 0.96
+    hold_s: Annotated[float, Field(ge=0, le=599)] = 0.0
     retract_speed_mm_s: Annotated[float, Field(gt=0, le=100)] = 20.0
     force_limit_N: Annotated[float, Field(gt=0, le=45)] = 25.0
     clamp_limit_N: Annotated[float, Field(gt=0, le=45)] = 25.0
@@ -46,6 +47,8 @@ class AcquireTable(TomlTable):
         for name in ("clamp", "approach", "search", "ramp"):
             if getattr(self, f"{name}_speed_mm_s") > self.speed_limit_mm_s:
                 raise ValueError(f"{name}_speed_mm_s is over speed_limit_mm_s")
+        if self.hold_s >= self.time_limit_s:
+            raise ValueError("hold_s is not below time_limit_s: the hold would end in a stop")
         if self.search_force_N >= self.force_limit_N:
             raise ValueError("search_force_N is not below force_limit_N: the search would end in a stop")
         if self.search_depth_mm >= self.depth_limit_mm:

@@ -41,6 +41,9 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     _load_extensions(content, file)
     try:
         study = Study(**content, file=file, notes=notes)
+        idle = [name for name in study.indenters if name not in study.used_indenters]
+        told = [f"indenters.{name}: no record names it; only limbfit design --protocol does" for name in idle]
+        study = study.model_copy(update={"notes": (*notes, *told)})
     except ValidationError as error:
         raise _study_error(error, file) from None
     _check_paths(study, recorded)
@@ -105,7 +108,7 @@ def _study_error(error: ValidationError, file: Path) -> StudyError:
 def _check_paths(study: Study, recorded: bool) -> None:
     """Every input that the study names must exist before anything runs."""
     for place, path in study.inputs.items():
-        if not recorded and place.startswith("sites."):
+        if not recorded and place.startswith(("sites.", "records.")):
             continue
         if not study.path(path).exists():
             raise StudyError(f"{path} does not exist", file=study.file, place=place)

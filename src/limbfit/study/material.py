@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ..errors import InputError
 from ..laws import LAWS, OGDEN
-from .tables import Positive, TomlTable
+from .tables import Positive, TomlTable, Vector
 
 KAPPA_RATIO = (10.0, 1e4)
 End = Literal["lower", "start", "upper"]
@@ -26,7 +26,8 @@ class TissueRange(TomlTable):
 class MaterialTable(TomlTable):
     """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
 
-    ``tissues`` overrides them, tissue by tissue (see :meth:`of`).
+    ``tissues`` overrides them, tissue by tissue (see :meth:`of`).  ``fibres``: their direction in the tissues
+    that have some, a vector or that of the limb's axis.
     """
 
     law: str = OGDEN
@@ -35,6 +36,7 @@ class MaterialTable(TomlTable):
     lower: dict[str, Positive] = Field(default={})
     upper: dict[str, Positive] = Field(default={})
     tissues: dict[str, TissueRange] = Field(default={})
+    fibres: dict[str, Literal["axis"] | Vector] = Field(default={})
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -60,6 +62,14 @@ class MaterialTable(TomlTable):
         given = {which: content.get(which, {}) for which in _ENDS}
         filled = {which: known[which] | values for which, values in given.items() if isinstance(values, dict)}
         return content | filled
+
+    @field_validator("fibres")
+    @classmethod
+    def _directed(cls, fibres: dict[str, Any]) -> dict[str, Any]:
+        for tissue, direction in fibres.items():
+            if direction != "axis" and not any(direction):
+                raise ValueError(f'{tissue}: a direction of no length; give [x, y, z] or "axis"')
+        return fibres
 
     @field_validator("kappa_ratio")
     @classmethod

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -66,10 +66,16 @@ class Site(_Stated):
 
 
 class RecordTable(_Stated):
-    """A record of ``site``, beside others there; ``name`` is its own among those."""
+    """A record of ``site``, beside others there; ``name`` is its own among those.
+
+    ``depth_mm``, ``speed_mm_s`` and ``hold_s`` are how it is to be made, where not as `AcquireTable` states.
+    """
 
     site: str
     trace: Path
+    depth_mm: Positive | None = None
+    speed_mm_s: Positive | None = None
+    hold_s: Annotated[float, Field(ge=0)] | None = None
 
     @field_validator("name")
     @classmethod
@@ -96,6 +102,9 @@ class Record:
     indenter: str | None = None
     control: Control = "displacement"
     of_site: int = 1
+    depth_mm: float | None = None  # how it is to be made
+    speed_mm_s: float | None = None
+    hold_s: float | None = None
 
     @property
     def forced(self) -> bool:
@@ -126,17 +135,29 @@ Indentation = Record | Site  # a site is one where it plans an indentation
 
 def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
     """The records of a site: its own, then those of the study's tables that name it."""
-    stated: list[tuple[str, str, _Stated]] = []
+    stated: list[tuple[str, str, _Stated | RecordTable]] = []
     if site.trace is not None:
         stated.append((site.name, f"sites.{site.name}", site))
     for table in tables:
         if table.site == site.name:
             name = f"{site.name}-{table.name}"
             stated.append((name, f"records.{name}", table))
-    return tuple(
-        Record(
-            name, site, one.trace, key, one.touch_down_s, one.peak_s, one.indenter, one.control, len(stated)
-        )
-        for name, key, one in stated
-        if one.trace is not None
-    )
+    found = []
+    for name, key, one in stated:
+        if one.trace is not None:
+            record = Record(
+                name,
+                site,
+                one.trace,
+                key,
+                one.touch_down_s,
+                one.peak_s,
+                one.indenter,
+                one.control,
+                len(stated),
+            )
+            if isinstance(one, RecordTable):
+                depth, speed, hold = one.depth_mm, one.speed_mm_s, one.hold_s
+                record = replace(record, depth_mm=depth, speed_mm_s=speed, hold_s=hold)
+            found.append(record)
+    return tuple(found)

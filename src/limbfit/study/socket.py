@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 
 from .friction import Friction
+from .socket_design import SocketDesignTable
 from .tables import Plane, Positive, TomlTable, Vector
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9 ().,_-]{0,39}$"
@@ -84,15 +84,6 @@ class SocketLoadTable(TomlTable):
         return self
 
 
-@dataclass(frozen=True)
-class SocketStep:
-    """A stretch of the socket's history, ``donning`` or a load: how long it comes on, and then stays."""
-
-    name: str
-    ramp_s: float
-    hold_s: float
-
-
 class SocketTable(TomlTable):
     """A socket from a file or rectified from the limb; every key has a default.
 
@@ -123,14 +114,7 @@ class SocketTable(TomlTable):
     body_weight_N: Annotated[float, Field(ge=50, le=3000)] = 800.0
     loads: tuple[SocketLoadTable, ...] = (SocketLoadTable(name="single stance", preset="single stance"),)
     regions: tuple[SocketRegionTable, ...] = ()
-
-    @property
-    def steps(self) -> tuple[SocketStep, ...]:
-        """Donning with its hold, and each load with its own, in order."""
-        return (
-            SocketStep("donning", self.donning_s, self.hold_s),
-            *(SocketStep(load.name, load.duration_s, load.hold_s) for load in self.loads),
-        )
+    design: SocketDesignTable = SocketDesignTable()
 
     @model_validator(mode="after")
     def _trimmed_once(self) -> SocketTable:

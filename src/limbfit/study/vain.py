@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StudyError
+from ..laws import FIBRED
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
 from .records import Site
@@ -159,6 +160,12 @@ VAIN: tuple[Vain, ...] = (
         "it is that of a square indenter",
     ),
     Vain(
+        ("material.fibres",),
+        lambda s: s.material.law != FIBRED,
+        "the tissues' law has no fibres",
+        f'give material.law = "{FIBRED}", or leave it out',
+    ),
+    Vain(
         tuple(f"socket.{key}" for key in _SHAPE),
         lambda s: s.socket.file is not None,
         "the socket's shape is that of socket.file",
@@ -233,13 +240,6 @@ def refuse_vain(study: Study, content: Mapping[str, Any]) -> None:
             if _states(content, key) and rule.when(study):
                 raise _error(study.file, key, rule.why, rule.remedy)
     for name, indenter in study.indenters.items():
-        if name not in study.used_indenters:
-            raise _error(
-                study.file,
-                f"indenters.{name}",
-                "no record and no planned indentation names it",
-                "leave it out",
-            )
         if "edge_radius_mm" in content["indenters"][name] and not SHAPES[indenter.shape].has_edge:
             place = f"indenters.{name}.edge_radius_mm"
             raise _error(study.file, place, "the indenter has no edge to round", "leave it out")

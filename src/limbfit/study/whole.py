@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from ..errors import InputError, StudyError
-from ..laws import LAWS, OGDEN, Parameters, TissueLaw, flat_names, to_parameters, to_vector
+from ..laws import (
+    FIBRE_KEYS,
+    FIBRED,
+    LAWS,
+    OGDEN,
+    Parameters,
+    TissueLaw,
+    flat_names,
+    is_ogden,
+    to_parameters,
+    to_vector,
+)
 from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .material import MaterialTable
@@ -33,6 +45,7 @@ from .tables import (
     TomlTable,
     TracesTable,
     UncertaintyTable,
+    Vector,
 )
 
 
@@ -100,6 +113,22 @@ class Study(TomlTable):
     def law(self) -> TissueLaw:
         """The law of all tissues."""
         return LAWS[self.material.law]
+
+    @property
+    def fibres(self) -> dict[str, Literal["axis"] | Vector]:
+        """Direction of the fibres in the tissues that have some: the limb's axis in the core by default."""
+        if self.material.law != FIBRED:
+            return {}
+        return self.material.fibres or {self.geometry.core: "axis"}
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """The parameters that stay at their start: those stated, and of fibres that a tissue has not."""
+        if self.material.law != FIBRED:
+            return self.calibration.fixed
+        bare = [tissue for tissue in self.tissues if tissue not in self.fibres]
+        without = (f"{tissue}.{key}" for tissue in bare for key in FIBRE_KEYS)
+        return tuple(dict.fromkeys((*self.calibration.fixed, *without)))
 
     @property
     def extensions(self) -> tuple[Path, ...]:
@@ -289,6 +318,10 @@ class Study(TomlTable):
             raise ValueError(
                 f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
             )
+        for tissue in material.fibres:
+            if tissue not in tissues:
+                known = ", ".join(tissues)
+                raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
         for name in material.keys:
             lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
             upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
@@ -311,7 +344,7 @@ class Study(TomlTable):
     def _priors_of_people(self) -> Study:
         if self.calibration.priors is None:
             return self
-        if self.material.law != OGDEN:
+        if not is_ogden(self.material.law):
             raise ValueError(
                 f'calibration.priors: people are described by the law "{OGDEN}", the study has '
                 f'"{self.material.law}"; leave it out, or state calibration.prior'

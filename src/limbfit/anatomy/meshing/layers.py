@@ -20,7 +20,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -237,13 +236,9 @@ def _thinned(fields: LimbFields) -> LimbFields:
 
 def signed_distance(surface: Surface, points: Array) -> Level:
     """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside, and gradient."""
-    if not len(points):
-        return np.zeros(0), np.zeros((0, 3))
-    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-    query = np.ascontiguousarray(points, dtype=float)
-    distance, face, nearest, _ = igl.signed_distance(query, surface.points, surface.faces, kind)
+    distance, face, nearest = surface.search.signed(points)
     close = np.abs(distance) < NORMAL_WITHIN_MM
-    gradient = (query - nearest) / np.where(close, 1.0, distance)[:, None]
+    gradient = (points - nearest) / np.where(close, 1.0, distance)[:, None]
     a, b, c = np.moveaxis(surface.triangles[face[close]], 1, 0)
     normal = np.cross(b - a, c - a)
     gradient[close] = normal / np.linalg.norm(normal, axis=1, keepdims=True)

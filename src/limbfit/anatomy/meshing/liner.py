@@ -40,7 +40,9 @@ def under_liner(
     long = prolonged(skin)
     liner = capped(_contour(long, thickness_mm), np.zeros(3), np.array([0.0, 0.0, 1.0]), EDGE_MM)
     below = np.flatnonzero(liner.points[:, 2] < -EDGE_MM / 10)
-    liner.points[below] = _at_distance(long, liner.points[below], thickness_mm)
+    points = liner.points.copy()
+    points[below] = _at_distance(long, points[below], thickness_mm)
+    liner = replace(liner, points=points)
     depth = None
     if fat_depth_mm is not None:
         depth = carried(skin, fat_depth_mm[None], liner.points)[0] + thickness_mm

@@ -224,17 +224,20 @@ def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: M
     axial = offset @ axis
     lateral = np.linalg.norm(offset - axial[:, None] * axis, axis=1)
     distance = np.hypot(lateral, DEPTH_RATIO * axial)
-    beyond = np.maximum(distance - settings.near_radius_mm, 0.0)
-    size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
-    return np.minimum(size, limit)
+    return _graded(np.maximum(distance - settings.near_radius_mm, 0.0), limit, settings)
 
 
 def limb_size(base: BaseMesh, fine_to_mm: float, settings: MeshSettings) -> Array:
     """Wanted edge length (n,) at a whole limb's grid points: short under its layers, not near the cut."""
     points = base.grid.points
     beyond = np.maximum(points[:, 2] + fine_to_mm, 0.0) + np.maximum(base.fields.layer(points)[0], 0.0)
+    return _graded(beyond, base.size_limit, settings)
+
+
+def _graded(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
+    """Edge length (n,) at distances (n,) beyond where it is shortest, at most ``limit`` (n,)."""
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
-    return np.minimum(size, base.size_limit)
+    return np.minimum(size, limit)
 
 
 def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from ...mesh import Mesh, dihedral_angles
-from .background import volumes
+from ...mesh import Mesh
+from ..surfaces.triangles import Surface
 from .columns import Columns
 from .layers import LimbFields
 from .projection import guarded, projected
@@ -23,6 +22,9 @@ SWEEPS = 6
 STEPS = (0.3, 0.15, 0.05)  # of the shortest edge at the node
 DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
 DIRECTIONS = DIRECTIONS[np.any(DIRECTIONS != 0, axis=1)]
+# The corners of a tetrahedron opposite to each, in an order that keeps its sense; pairs of its faces.
+OPPOSITE = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+PAIRS = np.triu_indices(4, 1)
 
 
 @dataclass(frozen=True)
@@ -35,20 +37,18 @@ class Ways:
     ----------
     normals : (n, 3) of the planes; zero where a node moves freely.
     depth : (n,) below the skin, mm; nan outside the layers.
-    skin : points (k, 3), triangles (f, 3), and a tree of these.
+    skin : the surface that they go along.
     """
 
     normals: Array
     depth: Array
-    skin: tuple[Array, Ints, igl.AABB]
+    skin: Surface
 
     @classmethod
     def of(cls, points: Array, normals: Array, in_layers: NDArray[np.bool_], fields: LimbFields) -> Ways:
-        skin, tree = (fields.skin.points, fields.skin.faces), igl.AABB()
-        tree.init(*skin)
         depth = np.full(len(points), np.nan)
-        depth[in_layers] = np.sqrt(tree.squared_distance(*skin, points[in_layers])[0])
-        return cls(normals, depth, (*skin, tree))
+        depth[in_layers] = np.sqrt(fields.skin.search.nearest(points[in_layers])[0])
+        return cls(normals, depth, fields.skin)
 
     def places(self, node: int, here: Array, moves: Array) -> Array:
         """Places (k, 3) of a node after ``moves`` (k, 3) from ``here``."""
@@ -56,8 +56,7 @@ class Ways:
         places = here + moves - (moves @ normal)[:, None] * normal
         if np.isnan(depth):
             return np.asarray(places)
-        points, faces, tree = self.skin
-        squared, _, nearest = tree.squared_distance(points, faces, places)
+        squared, _, nearest = self.skin.search.nearest(places)
         share = depth / np.maximum(np.sqrt(squared), 1e-12)
         return np.asarray(nearest + share[:, None] * (places - nearest))
 
@@ -116,35 +115,49 @@ def improved(points: Array, tets: Ints, goal_deg: float, ways: Ways, movable: ND
     points = points.copy()
     order = np.argsort(tets, axis=None, kind="stable")
     starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
-    worst = _worst_angle(points[tets])
+    worst = worst_angles(points[tets[:, 0], None], points[tets[:, 1:]])[:, 0]
     for _ in range(SWEEPS):
         before = points.copy()
         nodes = np.unique(tets[worst < goal_deg])
         for node in nodes[movable[nodes]]:
-            star = order[starts[node] : starts[node + 1]] // 4
-            points[node] = _best_place(points, tets[star], node, ways)
-            worst[star] = _worst_angle(points[tets[star]])
+            at = order[starts[node] : starts[node + 1]]
+            star, corner = at // 4, at % 4
+            opposite = np.take_along_axis(tets[star], OPPOSITE[corner], axis=1)
+            points[node], worst[star] = _best_place(points, opposite, node, ways)
         if np.array_equal(before, points):
             break
     return points
 
 
-def _best_place(points: Array, star: Ints, node: int, ways: Ways) -> Array:
-    """Where the smallest angle of the star about a node is greatest, among a pattern of places."""
-    here, corners, mine = points[node], points[star], star == node
-    reach = np.linalg.norm(corners - here, axis=2)[~mine].min()
+def _best_place(points: Array, opposite: Ints, node: int, ways: Ways) -> tuple[Array, Array]:
+    """Where the smallest angle of the tetrahedra about a node is greatest, among a pattern of places.
+
+    ``opposite`` (s, 3) are their other nodes.  Also the smallest angle (s,) of each with the node there.
+    """
+    here, others = points[node], points[opposite]
+    reach = np.linalg.norm(others - here, axis=2).min()
     moves = np.concatenate([step * reach * DIRECTIONS for step in STEPS])
     places = np.vstack([here, ways.places(node, here, moves)])
-    trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
-    angle = _worst_angle(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
-    return np.asarray(places[int(np.argmax(angle))])
+    angles = worst_angles(places, others)
+    best = int(np.argmax(angles.min(axis=0)))
+    return places[best], angles[:, best]
 
 
-def _worst_angle(corners: Array) -> Array:
-    """Smallest dihedral angle (m,) of tetrahedra (m, 4, 3), degrees; -1 where inverted."""
-    flat = corners.reshape(-1, 3)
-    tets = np.arange(len(flat)).reshape(-1, 4)
-    sound = volumes(flat, tets) > 1e-12
-    angle = np.full(len(tets), -1.0)
-    angle[sound] = dihedral_angles(flat, tets[sound]).min(axis=1)
-    return angle
+def worst_angles(tips: Array, bases: Array) -> Array:
+    """Smallest dihedral angle (s, k) of tetrahedra between a tip and a base, degrees; -1 where inverted.
+
+    Parameters
+    ----------
+    tips : (k, 3), each with every base, or (s, 1, 3), one of each base.
+    bases : (s, 3, 3), counter-clockwise seen from the tip's far side.
+    """
+    edges = np.moveaxis(bases[:, None] - tips[..., None, :], (2, 3), (1, 0))  # axis, corner, then (s, k)
+    after, last = edges[:, [1, 2, 0]], edges[:, [2, 0, 1]]
+    # Area vectors of the faces at the tip; that of the base closes the sum.
+    sides = after[[1, 2, 0]] * last[[2, 0, 1]] - after[[2, 0, 1]] * last[[1, 2, 0]]
+    volume = (edges[:, 0] * sides[:, 0]).sum(axis=0) / 6.0
+    normals = np.concatenate([sides, -sides.sum(axis=1, keepdims=True)], axis=1)
+    normals /= np.sqrt((normals * normals).sum(axis=0)) + np.finfo(float).tiny
+    cosine = -(normals[:, PAIRS[0]] * normals[:, PAIRS[1]]).sum(axis=0).min(axis=0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return np.where(volume > 1e-12, angle, -1.0)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -17,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...errors import SiteError
+from ..surfaces.search import Search
 from ..surfaces.triangles import Surface, half_edges
 
 Array = NDArray[np.float64]
@@ -168,16 +168,14 @@ class _Skin:
 
     def __init__(self, surface: Surface) -> None:
         self.surface = surface
-        self.points, self.faces = np.ascontiguousarray(surface.points), np.ascontiguousarray(surface.faces)
         self.normals, self.areas = surface.face_normals, surface.face_areas
         self.centres = surface.triangles.mean(axis=1)
         self.cap = cap_faces(surface)
-        self.open_faces = np.ascontiguousarray(self.faces[~self.cap])
+        self.open = Search(surface.points, surface.faces[~self.cap])
 
     def height(self, points: Array) -> Array:
         """Signed distance (n,), positive outside."""
-        sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-        return igl.signed_distance(np.ascontiguousarray(points), self.points, self.faces, sign)[0]
+        return self.surface.search.signed(points)[0]
 
     def near_cap(self, points: Array) -> NDArray[np.bool_]:
         """Which points (n,) lie beyond the cap's plane or just under it."""
@@ -186,10 +184,10 @@ class _Skin:
     def foot(self, points: Array, weights: Array) -> tuple[Array, Array]:
         """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
         centre = np.average(points, axis=0, weights=weights)[None]
-        (foot,) = igl.point_mesh_squared_distance(centre, self.points, self.open_faces)[2]
+        (foot,) = self.open.nearest(centre)[2]
         near = ~self.cap & (np.linalg.norm(self.centres - foot, axis=1) < NORMAL_RADIUS_MM)
         if not near.any():
-            near = np.arange(len(self.faces)) == np.linalg.norm(self.centres - foot, axis=1).argmin()
+            near = np.arange(len(self.centres)) == np.linalg.norm(self.centres - foot, axis=1).argmin()
         normal = (self.normals[near] * self.areas[near, None]).sum(axis=0)
         return foot, normal / np.linalg.norm(normal)
 

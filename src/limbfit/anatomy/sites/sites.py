@@ -30,7 +30,7 @@ def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = No
     if query.shape != (3,) or not np.isfinite(query).all():
         raise SiteError("a position has three finite coordinates", place=name, remedy="give LPS millimetres")
     skin = anatomy.skin
-    squared, _, nearest = igl.point_mesh_squared_distance(query[None], skin.points, skin.faces)
+    squared, _, nearest = skin.search.nearest(query[None])
     distance = float(np.sqrt(squared[0]))
     if distance > FARTHEST_MM:
         raise SiteError(
@@ -68,7 +68,7 @@ def indenter_axis(skin: Surface, position: ArrayLike, width: float, edge: ArrayL
     """
     centre = np.asarray(position, dtype=float)
     points, normals = _samples(skin, centre, width)
-    face = igl.point_mesh_squared_distance(centre[None], skin.points, skin.faces)[1]
+    face = skin.search.nearest(centre[None])[1]
     axis = _unit(-_area_vectors(skin.points[skin.faces[face]])[0])
     for _ in range(AXIS_STEPS):
         across = square_edges(axis, edge) @ (points - centre).T

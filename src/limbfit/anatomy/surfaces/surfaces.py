@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import igl
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
@@ -251,12 +250,8 @@ def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
 
 
 def signed_distance(surface: Surface, points: ArrayLike) -> Array:
-    """(n,) distance of points to a closed surface, mm, negative inside (fast winding number)."""
-    query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-    distance = igl.signed_distance(
-        query, surface.points, surface.faces, sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-    )[0]
-    return np.asarray(distance).ravel()
+    """(n,) distance of points to a closed surface, mm, negative inside."""
+    return surface.search.signed(points)[0]
 
 
 def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import igl
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
@@ -120,8 +119,7 @@ def sloped(surface: Surface, values: Array, slope: float) -> Array:
 
 def carried(surface: Surface, values: Array, points: Array) -> Array:
     """Values (k, n) at a surface's vertices, interpolated at the surface points nearest to points (m, 3)."""
-    query = np.ascontiguousarray(points, dtype=float)
-    _, face, nearest = igl.point_mesh_squared_distance(query, surface.points, surface.faces)
+    _, face, nearest = surface.search.nearest(points)
     a, b, c = np.moveaxis(surface.triangles[face], 1, 0)
     normal = np.cross(b - a, c - a)
     parts = [np.cross(c - b, nearest - b), np.cross(a - c, nearest - c), np.cross(b - a, nearest - a)]

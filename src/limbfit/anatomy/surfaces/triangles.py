@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ...errors import SurfaceError
+from .search import Search
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -27,7 +29,10 @@ _LARGEST_MM = 3000.0
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles in LPS mm: ``points`` (n, 3), ``faces`` (m, 3), counter-clockwise seen from outside."""
+    """Triangles in LPS mm: ``points`` (n, 3), ``faces`` (m, 3), counter-clockwise seen from outside.
+
+    Neither may be changed in place: ``search`` would not follow.
+    """
 
     points: Array
     faces: Faces
@@ -35,6 +40,15 @@ class Surface:
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", np.asarray(self.points, dtype=np.float64))
         object.__setattr__(self, "faces", np.asarray(self.faces, dtype=np.int64))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the trees, which no other process can be sent."""
+        return {"points": self.points, "faces": self.faces}
+
+    @cached_property
+    def search(self) -> Search:
+        """Its trees for nearest points and signed distances."""
+        return Search(self.points, self.faces)
 
     @property
     def triangles(self) -> Array:

@@ -15,12 +15,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..lanes import COMPILED, LANES, block_places, prefetch, workspace
+from .fibres import add_stress, add_weighted_moduli
 from .laws import Tables
 from .response import elastic_response, kirchhoff, pressures, weighted_moduli
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
-Elements = tuple[Indices, Array, Array, Indices]
+Elements = tuple[Indices, Array, Array, Indices, Array]
 
 
 def assemble(
@@ -39,7 +40,8 @@ def assemble(
 
     Parameters
     ----------
-    elements : cells (m, k), gradients (m, q, 3, k) 1/mm, weights (m, q) mm^3, regions (m,).
+    elements : cells (m, k), gradients (m, q, 3, k) 1/mm, weights (m, q) mm^3, regions (m,), directions of
+        fibres (m, 3), or (0, 3) without.
     mean : one volume ratio and pressure per element.
     tables : `Laws.tables`; scale (r,) : s.
     history (m, q, 6) : K, MPa.
@@ -48,7 +50,7 @@ def assemble(
 
     Returns infinity where an element is inverted; residual and data are then not to be used.
     """
-    cells, _, weights, _ = elements
+    cells, _, weights, _, _ = elements
     nodes = cells.shape[1]
     *records, _ = workspace(nodes, weights.shape[1], tables[0].shape[1])
     places, past = (block_places(nodes), positions), (scale, history)
@@ -66,7 +68,7 @@ def _assemble(  # type: ignore[no-untyped-def]
     elements, mean, tables, past, u, tangent, places, residual, data, records
 ):
     """The kernel of `assemble`."""
-    cells, _, weights, regions = elements
+    cells, _, weights, regions, fibres = elements
     entries, positions = places
     points, law, numbers, at_points, forces, element, blocks = records
     stiffness = blocks.view(np.float64)
@@ -83,6 +85,8 @@ def _assemble(  # type: ignore[no-untyped-def]
             _no_force(forces[a])
         for t in range(q):
             kirchhoff(points[t])
+            if len(fibres):
+                add_stress(points[t])
             for l in range(LANES):
                 energy += points[t].energy[l]
             for a in range(k):
@@ -96,6 +100,8 @@ def _assemble(  # type: ignore[no-untyped-def]
         _ask_for(positions[start], k, data)
         for t in range(q):
             weighted_moduli(points[t], element[0])
+            if len(fibres):
+                add_weighted_moduli(points[t], element[0])
         _stiffness(points, at_points, forces, element[0], blocks)
         for l in range(count):
             if start + l + 1 < m:
@@ -110,7 +116,7 @@ def _assemble(  # type: ignore[no-untyped-def]
 @njit(**COMPILED)
 def _gather(elements, start, past, points, at_points):  # type: ignore[no-untyped-def]
     """Read weights, what is past and gradients of the elements from ``start`` on into lanes."""
-    cells, grads, weights, regions = elements
+    cells, grads, weights, regions, _ = elements
     scale, history = past
     m, k = cells.shape
     for l in range(LANES):

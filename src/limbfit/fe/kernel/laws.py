@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..materials import Material
 
 Array = NDArray[np.float64]
-Tables = tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]
+Tables = tuple[Array, Array, NDArray[np.int64], NDArray[np.int64], Array]
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,18 @@ class Laws:
     parameter_index: NDArray[np.int64]
     moduli: Array
     modulus_gradient: Array
+    fibre: Array
+    d_fibre: Array
 
     @property
     def tables(self) -> Tables:
-        """``numbers (r, k), kappa (r,), law (r,), elastic (r, 2)``, as the kernels take them."""
-        return self.numbers, self.kappa, self.law, self.elastic
+        """``numbers (r, k), kappa (r,), law (r,), elastic (r, 2), fibre (r, 2)``, as kernels take them."""
+        return self.numbers, self.kappa, self.law, self.elastic, self.fibre
+
+    @property
+    def fibred(self) -> bool:
+        """Whether a region has fibres."""
+        return bool((self.fibre[:, 0] > 0.0).any())
 
     @property
     def modulus(self) -> float:
@@ -59,12 +66,13 @@ class Laws:
         # What is left over is an Ogden term, or a relaxation, of no size.
         numbers, prony = np.tile([0.0, 1.0], (R, K))[:, :K], np.tile([0.0, 1.0], (R, L, 1))
         d_numbers, d_prony, d_kappa = np.zeros((R, P, K)), np.zeros((R, P, L, 2)), np.zeros((R, P))
+        d_fibre = np.zeros((R, P, 2))
         index, at = np.full((R, P), -1), 0
         for r, (table, slope) in enumerate(zip(tables, slopes)):
             numbers[r, : len(table.numbers)], prony[r, : len(table.prony)] = table.numbers, table.prony
             for p, d in enumerate(slope):
                 d_numbers[r, p, : len(d.numbers)], d_prony[r, p, : len(d.prony)] = d.numbers, d.prony
-                d_kappa[r, p] = d.kappa
+                d_kappa[r, p], d_fibre[r, p] = d.kappa, d.fibre
                 index[r, p] = at
                 at += 1
         moduli = np.array([m.instantaneous_modulus for m in materials])
@@ -74,5 +82,5 @@ class Laws:
         elastic = np.array([t.elastic.addresses for t in tables], dtype=np.int64)
         return cls(
             np.ascontiguousarray(numbers), kappa, law, elastic, prony, d_numbers, d_kappa, d_prony, index,
-            moduli, gradient,
+            moduli, gradient, np.array([t.fibre for t in tables], dtype=float), d_fibre,
         )  # fmt: skip

@@ -11,6 +11,7 @@ from numba import njit
 from ..lanes import COMPILED, LANES, call_with_three, call_with_two, logarithm
 from ..materials.elastic import mean_exponential
 from ..materials.volumetric import volumetric
+from .fibres import pull
 from .kinematics import deform, invert, principal_axes
 
 
@@ -19,11 +20,11 @@ def elastic_response(elements, start, tables, u, points, law, numbers):  # type:
     """F, principal axes and `respond` at the points of the elements from ``start`` on; the last one again
     where there are no more.
 
-    ``elements``: cells (m, k), gradients (m, q, 3, k), weights, regions (m,).  Returns whether none is
-    inverted.
+    ``elements``: cells (m, k), gradients (m, q, 3, k), weights, regions (m,), fibres (m, 3) or none.
+    Returns whether none is inverted.
     """
-    cells, grads, _, regions = elements
-    stated, addresses = tables[0], tables[3]
+    cells, grads, _, regions, fibres = elements
+    stated, addresses, fibre = tables[0], tables[3], tables[4]
     m = len(cells)
     for l in range(LANES):
         el = min(start + l, m - 1)
@@ -31,6 +32,10 @@ def elastic_response(elements, start, tables, u, points, law, numbers):  # type:
         law.response[l], law.rates[l] = addresses[region, 0], addresses[region, 1]
         for k in range(numbers.shape[0]):
             numbers[k].v[l] = stated[region, k]
+        if len(fibres):
+            for i in range(3):
+                law.along[i, l] = fibres[el, i]
+            law.fibre[0, l], law.fibre[1, l] = fibre[region, 0], fibre[region, 1]
         for q in range(points.shape[0]):
             deform(points[q], l, cells[el], grads[el, q], u)
     for q in range(points.shape[0]):
@@ -41,6 +46,8 @@ def elastic_response(elements, start, tables, u, points, law, numbers):  # type:
                 return False
         principal_axes(p)
         respond(p, law, numbers)
+        if len(fibres):
+            pull(p, law)
     return True
 
 
@@ -130,7 +137,7 @@ def pressures(weights, regions, tables, mean, start, points, element):  # type: 
 
     ``factor`` of the element is ``d(p)/d(theta) / V = (d(theta U')/d(ln theta) - theta U')/(theta^2 V)``.
     """
-    _, kappa, law, _ = tables
+    _, kappa, law, _, _ = tables
     m, q = weights.shape
     for l in range(LANES):
         el = min(start + l, m - 1)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from .elastic import ElasticLaw, lane_function, mean_exponential
+from .fibred import Fibred
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenQLV
-from .material import LawTable, Material, Uncoupled
+from .material import LawTable, Material, PronyTerms, Uncoupled
 from .viscoelastic import ORDER_IN_TIME, prony_factors
 from .volumetric import VOLUMETRIC_LAWS
 
@@ -12,12 +13,14 @@ __all__ = [
     "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
     "ElasticLaw",
+    "Fibred",
     "LawTable",
     "Material",
     "MooneyRivlin",
     "NeoHookean",
     "Ogden",
     "OgdenQLV",
+    "PronyTerms",
     "Uncoupled",
     "lane_function",
     "mean_exponential",

@@ -1,7 +1,7 @@
 """The material laws, each with its parameters; their moduli follow FEBio's conventions.
 
 ==================  ===================================================================================
-`OgdenQLV`          ``c/m^2 sum_i (lt_i^m + lt_i^-m - 2)``, one relaxation term: the paper's tissue
+`OgdenQLV`          ``c/m^2 sum_i (lt_i^m + lt_i^-m - 2)``: the paper's tissue
 `Ogden`             ``sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``, up to six terms
 `NeoHookean`        ``mu/2 (I1 - 3)``
 `MooneyRivlin`      ``c1 (I1 - 3) + c2 (I2 - 3)``
@@ -14,7 +14,9 @@ Source: FEBio user manual, uncoupled materials.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -54,39 +56,66 @@ class OgdenSum(Uncoupled):
         """Its derivative (p,)."""
         return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
 
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The material with other values of some of its parameters, by name."""
+        named = dict(zip(self.parameter_names, self.parameters, strict=True)) | dict(values)
+        every = tuple(map(float, named.values()))
+        elastic = len(self.elastic_parameters)
+        prony = tuple(zip(every[elastic::2], every[elastic + 1 :: 2], strict=True))
+        return cast("Self", replace(cast("Any", self), **self._fields(every[:elastic], prony)))
+
+    def _fields(self, elastic: tuple[float, ...], prony: PronyTerms) -> dict[str, Any]:
+        """The fields of the class that hold these parameters."""
+        return {**dict(zip(self.parameter_names, elastic, strict=False)), "prony": prony}
+
 
 @dataclass(frozen=True)
 class OgdenQLV(OgdenSum):
-    """The paper's tissue: symmetric second-order Ogden with one relaxation term.
+    """The paper's tissue: symmetric second-order Ogden with relaxation.
 
-    ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``.
+    ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``, or with
+    several terms ``1 + sum_l gamma_l exp(-t/tau_l)``. The parameters are ``c, m, gamma, tau``, or
+    ``c, m, gamma1, tau1, gamma2, ...``.
 
     Parameters
     ----------
     c : long-term shear modulus of small strains, MPa.
     m : exponent.
-    gamma : relaxation amplitude, dimensionless (0: elastic).
-    tau : relaxation time, s.
+    gamma : relaxation amplitude, dimensionless (0: elastic); one for each term where there are several.
+    tau : relaxation time, s; as many.
     kappa_ratio : bulk modulus over ``c``; the bulk modulus moves with ``c``.
     """
 
     c: float
     m: float
-    gamma: float
-    tau: float
+    gamma: float | Sequence[float]
+    tau: float | Sequence[float]
     kappa_ratio: float = 100.0
 
-    parameter_names = ("c", "m", "gamma", "tau")
     volumetric = "log"
 
     def __post_init__(self) -> None:
-        for name in ("c", "m", "tau", "kappa_ratio"):
+        for name in ("gamma", "tau"):
+            object.__setattr__(self, name, _one_or_several(name, getattr(self, name)))
+        if np.shape(self.gamma) != np.shape(self.tau):
+            raise ProblemError(
+                f"{np.size(self.gamma)} gamma and {np.size(self.tau)} tau", remedy="give as many of each"
+            )
+        for name in ("c", "m", "kappa_ratio"):
             positive(name, getattr(self, name))
-        not_negative("gamma", self.gamma)
+        for name, value in zip(self.parameter_names[2:], self.parameters[2:], strict=True):
+            (not_negative if name.startswith("gamma") else positive)(name, value)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        if np.ndim(self.gamma) == 0:
+            return "c", "m", "gamma", "tau"
+        return "c", "m", *_numbered(("gamma", "tau"), np.size(self.gamma))
 
     @property
     def prony(self) -> PronyTerms:
-        return ((self.gamma, self.tau),)
+        gamma, tau = np.atleast_1d(self.gamma), np.atleast_1d(self.tau)
+        return tuple(zip(gamma.tolist(), tau.tolist(), strict=True))
 
     @property
     def elastic_parameters(self) -> tuple[float, ...]:
@@ -97,6 +126,10 @@ class OgdenQLV(OgdenSum):
 
     def ogden_term_derivatives(self) -> Array:
         return np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
+
+    def _fields(self, elastic: tuple[float, ...], prony: PronyTerms) -> dict[str, Any]:
+        gamma, tau = zip(*prony, strict=True)
+        return {"c": elastic[0], "m": elastic[1], "gamma": gamma, "tau": tau}
 
 
 @dataclass(frozen=True)
@@ -148,6 +181,9 @@ class Ogden(OgdenSum):
     def ogden_term_derivatives(self) -> Array:
         count = 2 * len(self.terms)
         return np.eye(count).reshape(count, -1, 2)
+
+    def _fields(self, elastic: tuple[float, ...], prony: PronyTerms) -> dict[str, Any]:
+        return {"terms": tuple(zip(elastic[::2], elastic[1::2], strict=True)), "prony": prony}
 
 
 @dataclass(frozen=True)
@@ -220,6 +256,17 @@ class MooneyRivlin(OgdenSum):
 
     def ogden_term_derivatives(self) -> Array:
         return np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [4.0, 0.0]]])
+
+
+def _one_or_several(name: str, values: float | Sequence[float]) -> float | tuple[float, ...]:
+    """A number, or several as a tuple."""
+    try:
+        found = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.ndim > 1 or not found.size:
+        raise ProblemError(f"material parameter {name} = {values} is no number, nor several")
+    return float(found.reshape(-1)[0]) if found.size == 1 else tuple(found.tolist())
 
 
 def _prony_names(material: Uncoupled) -> tuple[str, ...]:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,8 @@ class LawTable:
     """What the kernels know of a material, or a derivative of it.
 
     ``numbers (k,)``: what the ``elastic`` law is given; ``kappa``: bulk modulus (MPa);
-    ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law.
+    ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law; ``fibre``: k1
+    (MPa) and k2 of its fibres, k1 = 0 without.
     """
 
     numbers: Array
@@ -39,6 +40,7 @@ class LawTable:
     prony: Array
     volumetric: int = 0
     elastic: ElasticLaw = OGDEN
+    fibre: tuple[float, float] = (0.0, 1.0)
 
     @property
     def has_terms(self) -> bool:
@@ -90,6 +92,9 @@ class Material(Protocol):
     def derivatives(self) -> tuple[LawTable, ...]:
         """Derivative of the table with respect to each parameter."""
 
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The material with other values of some of its parameters, by name."""
+
 
 class Uncoupled(ABC):
     """The tables of a law that says which numbers its `ElasticLaw` has, and its shear modulus.
@@ -115,6 +120,11 @@ class Uncoupled(ABC):
     @abstractmethod
     def prony(self) -> PronyTerms:
         """Amplitude g_l and relaxation time tau_l (s) of each relaxation term."""
+
+    @property
+    @abstractmethod
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the `parameters`."""
 
     @property
     @abstractmethod
@@ -169,11 +179,15 @@ class Uncoupled(ABC):
         """Derivative of the table with respect to each parameter."""
         still, slopes = np.zeros((len(self.prony), 2)), self.shear_modulus_gradient
         elastic = [
-            LawTable(numbers, float(self.kappa_ratio * slope), still)
+            LawTable(numbers, float(self.kappa_ratio * slope), still, fibre=(0.0, 0.0))
             for numbers, slope in zip(self.number_derivatives(), slopes, strict=True)
         ]
         rest, units = np.zeros_like(self.numbers()), np.eye(2 * len(self.prony))
-        return *elastic, *(LawTable(rest, 0.0, unit.reshape(-1, 2)) for unit in units)
+        return *elastic, *(LawTable(rest, 0.0, unit.reshape(-1, 2), fibre=(0.0, 0.0)) for unit in units)
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The material with other values of some of its parameters, by name; here fields of a dataclass."""
+        return cast("Self", replace(cast("Any", self), **values))
 
     def _check_shared(self) -> None:
         """Raise `ProblemError` where what all laws share is impossible."""

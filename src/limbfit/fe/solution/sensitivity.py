@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..history import Memory
+from ..kernel.fibres import add_moduli_at_rest, add_stress_at_rest
 from ..kernel.laws import Laws
 from ..kernel.response import elastic_response, elastic_stress, moduli, pressures, stress_rates
 from ..lanes import LANES, workspace
@@ -69,7 +70,8 @@ class MemoryDerivative:
     ) -> Explicit:
         """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
         bends = laws.d_numbers.any(axis=2)  # parameters of the elastic law
-        derivatives = laws.d_numbers, bends, laws.d_kappa / laws.kappa[:, None], laws.parameter_index
+        by_kappa = laws.d_kappa / laws.kappa[:, None]
+        derivatives = laws.d_numbers, bends, by_kappa, laws.parameter_index, laws.d_fibre
         coefficients = _step_coefficients(laws, dt, memory.duration)
         past = memory.elastic if memory.before is None else memory.before
         elastic, stress = np.zeros_like(self.elastic), np.empty_like(memory.elastic)
@@ -194,9 +196,9 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
     earlier, ``d_past`` its derivative.  The elastic law is asked for `LANES` elements at once.  Rows of the
     work arrays hold three components of all parameters and are padded to whole vectors.
     """
-    cells, grads, weights, regions = elements
+    cells, grads, weights, regions, fibres = elements
     points, law, numbers, element, rates = records
-    d_numbers, bends, d_kappa, index = d_tables
+    d_numbers, bends, d_kappa, index, d_fibre = d_tables
     on_prony, on_elastic, on_before, d_on_prony, d_scale, d_back = coefficients
     m, k = cells.shape
     n, P = len(numbers), forces.shape[2]
@@ -211,6 +213,9 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
             elastic_stress(points[q])
             stress_rates(points[q], law[0], numbers, rates[q * n : (q + 1) * n])
             moduli(points[q], element[0])
+            if len(fibres):
+                add_stress_at_rest(points[q])
+                add_moduli_at_rest(points[q], element[0])
         for el in range(start, min(start + LANES, m)):
             l, region = el - start, regions[el]
             fe[:] = 0.0
@@ -237,6 +242,13 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
                         for i in range(n):
                             for t in range(6):
                                 part[t] += d_numbers[region, j, i] * rates[q * n + i].S[t, l]
+                    if len(fibres):
+                        rate = d_fibre[region, j, 0] * at.pull_rates[0, l]
+                        rate += d_fibre[region, j, 1] * at.pull_rates[1, l]
+                        for t in range(6):
+                            x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
+                            dyad = at.fibre_at_rest[x, l] * at.fibre_at_rest[y, l]
+                            part[t] += rate * (dyad - inverse[t] / 3.0)
                     d_JU = d_kappa[region, j] * at.pressure[l]
                     for t in range(6):
                         total = scale[region] * part[t] + d_JU * inverse[t]

@@ -1,4 +1,4 @@
-"""Materials of FEBio as limbfit's: uncoupled hyperelastic laws, with Prony terms around them.
+"""Materials of FEBio as limbfit's: uncoupled hyperelastic laws, fibres beside and Prony terms around them.
 
 Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
 """
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from ...fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from ...fe import Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from ...fe.materials import Uncoupled
 from .tree import Node
 
 Array = NDArray[np.float64]
@@ -23,7 +24,8 @@ ELASTIC = {
     "Mooney-Rivlin": {"c1", "c2"},
     "incomp neo-Hookean": {"G"},
 }
-_SHARED = {"k", "density", "pressure_model", "laugon", "atol"}
+_SHARED = {"k", "density", "pressure_model", "laugon", "atol", "mat_axis"}
+_MIXTURE, _FIBRE = "uncoupled solid mixture", "fiber-exp-pow-uncoupled"
 _RELAXING = {"g0", "elastic"} | {f"{letter}{i}" for letter in "gt" for i in range(1, 7)}
 _VOLUMETRIC = {
     "": "log", "default": "log", "0": "log",
@@ -81,12 +83,12 @@ def read_materials(
 
 def _law(node: Node) -> Material:
     kind = node.attribute("type")
-    if kind in ELASTIC:
-        return _elastic(node, 1.0, (), node.number("k", 0.0), _volumetric(node))
+    if kind in ELASTIC or kind == _MIXTURE:
+        return _hyperelastic(node, 1.0, (), node.number("k", 0.0), _volumetric(node))
     if kind != "uncoupled viscoelastic":
         raise _unknown(node, kind)
     elastic = node.child("elastic")
-    if elastic.attribute("type") not in ELASTIC:
+    if elastic.attribute("type") not in (*ELASTIC, _MIXTURE):
         raise _unknown(elastic, elastic.attribute("type"))
     _only(node, _RELAXING | _SHARED)
     g0 = node.number("g0", 1.0)
@@ -98,7 +100,30 @@ def _law(node: Node) -> Material:
     if elastic.find("pressure_model") is not None and _volumetric(elastic) != law:
         raise elastic.refuse("its pressure_model differs from that of the material around it")
     # The wrapper adds its own k to the elastic material's; g0 scales the deviatoric part only.
-    return _elastic(elastic, g0, terms, node.number("k", 0.0) + elastic.number("k", 0.0), law)
+    return _hyperelastic(elastic, g0, terms, node.number("k", 0.0) + elastic.number("k", 0.0), law)
+
+
+def _hyperelastic(
+    node: Node, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
+) -> Material:
+    """`_elastic`, and fibres beside it in a mixture."""
+    if node.attribute("type") != _MIXTURE:
+        return _elastic(node, scale, prony, k, law)
+    _only(node, {"solid"} | _SHARED)
+    solids = node.all("solid")
+    fibres = [one for one in solids if one.attribute("type") == _FIBRE]
+    grounds = [one for one in solids if one.attribute("type") in ELASTIC]
+    if not len(fibres) == len(grounds) == 1 or len(solids) != 2:
+        raise node.refuse(f"a mixture is read of one {_FIBRE} and one of {', '.join(ELASTIC)}")
+    (fibre,), (ground,) = fibres, grounds
+    for one in solids:
+        if one.number("k", 0.0) != 0.0:
+            raise one.refuse("has a bulk modulus of its own in a mixture", "give that of the mixture alone")
+    _only(fibre, {"ksi", "alpha", "beta", "k", "density"})
+    if fibre.number("beta") != 2.0:
+        raise fibre.child("beta").refuse("limbfit's fibres have beta = 2")
+    made = _elastic(ground, scale, prony, k, law)
+    return Fibred(made, scale * fibre.number("ksi"), fibre.number("alpha"))
 
 
 def _unknown(node: Node, kind: str) -> ProblemError:
@@ -120,7 +145,7 @@ def _only(node: Node, known: set[str]) -> None:
         if child.tag not in known:
             raise child.refuse("this parameter of the material is not known")
         varies = child.attributes.get("lc") or child.attributes.get("type") not in (None, "const")
-        if varies and child.tag != "elastic":
+        if varies and child.tag not in ("elastic", "solid", "mat_axis"):
             raise child.refuse("a parameter that changes in time or space is not supported")
     if node.flag("laugon"):
         raise node.child("laugon").refuse("augmented incompressibility is not supported")
@@ -128,7 +153,7 @@ def _only(node: Node, known: set[str]) -> None:
 
 def _elastic(
     node: Node, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
-) -> Material:
+) -> Uncoupled:
     """The law of ``node``, its moduli times ``scale``, with bulk modulus ``k`` (MPa)."""
     kind = node.attribute("type")
     _only(node, ELASTIC[kind] | _SHARED)
@@ -144,10 +169,10 @@ def _elastic(
     terms = [(scale * node.number(f"c{i}", 0.0), node.number(f"m{i}", 1.0)) for i in range(1, 7)]
     terms = [term for term in terms if term[0] != 0.0]
     ratio = k / _modulus(node, sum(c for c, _ in terms) / 2.0)
-    if len(terms) == 2 and law == "log" and len(prony) < 2:
+    if len(terms) == 2 and law == "log":
         (c, m), (other, minus) = terms
         if (c, m) == (other, -minus) and m > 0.0:
-            gamma, tau = prony[0] if prony else (0.0, 1.0)
+            gamma, tau = zip(*prony or ((0.0, 1.0),), strict=True)
             return OgdenQLV(c, m, gamma, tau, ratio)
     return Ogden(tuple(terms), kappa_ratio=ratio, **shared)
 

@@ -17,6 +17,7 @@ from ...errors import ProblemError
 from ...fe import Material
 from .controls import Phase, read_phases
 from .curves import Curve, read_curves
+from .fibres import read_fibres
 from .geometry import Geometry, Indices, Part, node_set, read_geometry
 from .materials import RigidBody, read_materials
 from .motions import RigidCondition, amount, body_of, curved, read_conditions
@@ -27,10 +28,10 @@ from .tree import Node, read_tree
 Array = NDArray[np.float64]
 COMPONENTS = ("x", "y", "z")
 CONTACTS = ("sliding-elastic", "sliding-facet-on-facet", "sliding-node-on-facet")
-_EMPTY = ("Initial", "Constraints", "Discrete", "MeshAdaptor", "MeshData", "Include")
+_EMPTY = ("Initial", "Constraints", "Discrete", "MeshAdaptor", "Include")
 _READ = (
     "Module", "Control", "Globals", "Material", "Mesh", "MeshDomains", "Boundary", "Rigid", "Contact",
-    "Loads", "LoadData", "Step", "Output",
+    "Loads", "LoadData", "MeshData", "Step", "Output",
 )  # fmt: skip
 # Read by `_tied`, and what only shells have.
 _ELSEWHERE = ("rigid", "zero rotation", "zero shell displacement")
@@ -89,7 +90,8 @@ class FebModel:
 
     ``materials`` are the deformable ones, ``rigid`` the others, both by name; ``motions`` those of nodes,
     ``conditions`` those of rigid bodies; ``carried`` nodes of tissue that move with a rigid body, by its
-    name; ``notes`` what was read and has no meaning for limbfit.
+    name; ``notes`` what was read and has no meaning for limbfit; ``fibres`` their direction in each
+    cell of the parts that have some.
     """
 
     geometry: Geometry
@@ -104,6 +106,7 @@ class FebModel:
     phases: tuple[Phase, ...]
     requests: tuple[Request, ...]
     notes: tuple[str, ...]
+    fibres: Mapping[str, Array]
 
     def parts_of(self, materials: Mapping[str, object]) -> dict[str, Part]:
         """The parts made of any of these materials."""
@@ -162,6 +165,7 @@ def _model(root: Node) -> FebModel:
         read_phases(root, curves),
         requests,
         (*unread, *notes),
+        read_fibres(root, materials, geometry.parts),
     )
 
 

@@ -24,10 +24,12 @@ from ..shared.store import Store, read_json
 from .crossvalidation import run_crossvalidate
 from .cube import COMPRESSION_PERCENT, run_cube
 from .design import run_design
+from .protocol import run_protocol
 from .refinement import FACTORS, run_refinement
 from .regions import run_regions
 from .sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
 from .socket import run_socket
+from .socket_design import run_socket_design
 from .uncertainty import run_uncertainty
 
 
@@ -107,11 +109,32 @@ _OWN: tuple[Experiment, ...] = (
         options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
     ),
     Experiment(
+        "protocol",
+        run_protocol,
+        needs=("sites", "traces", "mesh"),
+        tables=("material", "solver", "calibration", "acquire", *_INDENTERS),
+        site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter"),
+        record_keys=_RECORD,
+        options={
+            **{"minutes": 25.0, "setup_s": 60.0, "rest_s": 30.0, "speeds_mm_s": [], "holds_s": []},
+            **{"depth_mm": None, "determine": [], "criterion": "D", "draws": 3, "seed": 0},
+            **{"parameters": {}, "parameters_from": "", "noise": {}},
+        },
+    ),
+    Experiment(
         "socket",
         run_socket,
         needs=("surfaces",),
         tables=("socket", "geometry", "mesh", "material"),
-        options={"parameters": {}, "parameters_from": ""},
+        apart=("socket.design",),
+        options={"parameters": {}, "parameters_from": "", "covariance_log": None},
+    ),
+    Experiment(
+        "socket_design",
+        run_socket_design,
+        needs=("surfaces",),
+        tables=("socket", "geometry", "mesh", "material"),
+        options={"parameters": {}, "parameters_from": "", "optimise": [], "simulations": 0},
     ),
 )
 

@@ -18,6 +18,7 @@ from ...bench.blocks import HEX, boxes
 from ...errors import InputError, RunError
 from ...fe import History, Material, Problem, StepControl, Support, System, iterate
 from ...fe.kernel.laws import Laws
+from ...fe.materials import PronyTerms
 from ...fe.observables import element_fields
 from ...indentation import materials
 from ...laws import KPA, LAWS, OGDEN
@@ -102,6 +103,12 @@ def compress_cube(
 
 def run_cube(context: Context, folder: Path, *, compression_percent: float) -> dict[str, Any]:
     """The experiment: this study's identified tissues beside the published ones."""
+    if context.study.fibres:
+        raise InputError(
+            "the cube compares isotropic tissues, and this study has fibres",
+            file=context.study.file,
+            place="material.law",
+        )
     context.tell("cube", 0, 1, "compressing")
     stages = context.stored("calibrate", "calibration.json")["stages"]
     compress_cube(
@@ -122,9 +129,10 @@ def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law:
         kind = "muscle" if i == len(parameters) - 1 else "skin"
         row = {"values": words, "conversion": "none", "source": "this study"}
         found.append(_specimen(f"{tissue} (this study)", kind, own[tissue], LAWS[law].words, row))
-    relaxation = {"skin": (3.57, 0.32), "muscle": (3.47, 0.34)}  # the paper's, where no study gives its own
+    # The paper's, where no study gives its own.
+    relaxation: dict[str, PronyTerms] = {"skin": ((3.57, 0.32),), "muscle": ((3.47, 0.34),)}
     if parameters:
-        first, last = (tuple(list(own.values())[i].table().prony[0]) for i in (0, -1))
+        first, last = (tuple(map(tuple, list(own.values())[i].table().prony)) for i in (0, -1))
         relaxation = {"skin": first, "muscle": last}
     for known in PUBLISHED:
         row = {"values": known.values, "conversion": known.conversion, "source": known.source}

@@ -16,10 +16,10 @@ from ...errors import InputError, RunError, StudyError
 from ...identify.checks.design import Candidate, Design, NoiseModel, candidate, choose, efficiency, evaluate
 from ...identify.checks.design import prior_information as bounds_information
 from ...identify.fit.objective import SiteResponse
-from ...indentation import Parameters, SimulationJob, SiteModel
+from ...indentation import Parameters, SiteModel
 from ...study import Study
 from ..shared.context import Context
-from ..shared.simulations import CURVE_POINTS, experiment_cache, model_of
+from ..shared.simulations import curve_job, experiment_cache, model_of
 from ..shared.store import write_json
 from ..shared.tabular import write_table
 from ..stages.laboratory import unknowns
@@ -55,7 +55,7 @@ def run_design(
     vector = study.vector(parameters)
     models, left_out = _candidate_models(context, depths_mm)
     cache = experiment_cache(context, folder)
-    jobs = [_job(model, study.tissues, vector) for model in models]
+    jobs = [curve_job(model, study.tissues, vector) for model in models]
     model_noise, found = NoiseModel(**noise), []
     for i, (model, simulation) in enumerate(zip(models, cache.run(jobs, context.executor))):
         depth = float(max(model.knots_mm))
@@ -100,11 +100,6 @@ def _at_depth(own: SiteModel, depth: float) -> SiteModel:
     knots_mm = share * np.array([phases[0].start_mm, *(phase.end_mm for phase in phases)])
     knots_s = np.r_[0.0, np.cumsum(seconds)]
     return replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
-
-
-def _job(model: SiteModel, tissues: tuple[str, ...], vector: Array) -> SimulationJob:
-    times = model.curve_times(CURVE_POINTS)
-    return SimulationJob(model, tissues, tuple(map(float, vector)), tuple(map(float, times)))
 
 
 def _content(

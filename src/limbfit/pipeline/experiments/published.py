@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...fe import Ogden
+from ...fe.materials import PronyTerms
 
 KPA = 1e-3  # MPa
 
@@ -39,13 +40,14 @@ class PublishedTissue:
     conversion: str
     source: str
 
-    def material(self, relaxation: tuple[float, float]) -> Ogden:
+    def material(self, relaxation: PronyTerms) -> Ogden:
         """The tissue for the solver, MPa; ``relaxation`` is taken where none was published."""
-        used = relaxation if self.relaxation is None else self.relaxation
+        published = (self.relaxation,) if self.relaxation else ()
+        used = relaxation if self.relaxation is None else published
         shear = 0.5 * sum(c for c, _ in self.terms)
         return Ogden(
             tuple((c * KPA, m) for c, m in self.terms),
-            (used,) if used else (),
+            used,
             kappa_ratio=self.bulk_kPa / shear,
         )
 

@@ -22,7 +22,7 @@ _FEW = 4  # causes of one kind that are named
 def parts_of(stage: Stage, known: Keys, study: Study, keys: Mapping[str, str]) -> Parts:
     """Digests of the settings, inputs, files of code and keys of lower stages that make up a stage's key."""
     stated = study.model_dump(mode="json")
-    settings = dict(_leaves({table: stated[table] for table in stage.tables}, ""))
+    settings = dict(_leaves(stage.read(stated), ""))
     for site in stated["sites"]:
         settings |= dict(_leaves({key: site[key] for key in stage.site_keys}, f"sites.{site['name']}."))
     for row, read in zip(stated["records"], records_read(stage, stated)):

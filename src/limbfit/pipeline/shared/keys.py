@@ -19,7 +19,8 @@ from .store import digest, file_digest
 class Stage:
     """A stage: what it stands on, which tables it reads, and which keys of ``[[sites]]`` and ``[[records]]``.
 
-    Its code is that of `sources.sources_of`.
+    ``apart`` are keys of its tables, such as ``socket.design``, that it does not read. Its code is that of
+    `sources.sources_of`.
     """
 
     name: str
@@ -28,6 +29,14 @@ class Stage:
     tables: tuple[str, ...] = ()
     site_keys: tuple[str, ...] = ()
     record_keys: tuple[str, ...] = ()
+    apart: tuple[str, ...] = ()
+
+    def read(self, stated: Mapping[str, Any]) -> dict[str, Any]:
+        """What it reads of the tables of a study, by their names."""
+        found = {table: stated[table] for table in self.tables}
+        for table, _, key in (name.partition(".") for name in self.apart):
+            found[table] = {name: value for name, value in found[table].items() if name != key}
+        return found
 
 
 def records_read(stage: Stage, stated: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -77,7 +86,7 @@ class Keys:
             extra = [options[stage.name]] if options.get(stage.name) else []
             found[stage.name] = known.get(stage.name) or digest(
                 stage.name,
-                {table: stated[table] for table in stage.tables},
+                stage.read(stated),
                 [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
                 *records_read(stage, stated),
                 None if read is None else {str(path): self.digests[path] for path in read},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
 from ...indentation import Simulation, SimulationJob, SiteModel, simulate
-from ...study import Indentation, Record, Site, Study
+from ...study import Indentation, Record, Site, Study, Vector
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
@@ -132,6 +132,16 @@ def job_digest(job: SimulationJob) -> str:
     )
 
 
+def fibres_of(context: Context) -> tuple[tuple[str, Vector], ...]:
+    """The direction of the fibres in each tissue that has some, of length one."""
+    found = []
+    for tissue, stated in context.study.fibres.items():
+        along = context.stored("surfaces", "surfaces.json")["cut_normal"] if stated == "axis" else stated
+        x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
+        found.append((tissue, (x, y, z)))
+    return tuple(found)
+
+
 def site_model(
     context: Context,
     one: Indentation,
@@ -169,6 +179,7 @@ def site_model(
         element=study.mesh.element,
         within_mm=study.within_mm if searched else None,
         law=study.material.law,
+        fibres=fibres_of(context),
         extensions=study.extensions,
         extensions_digest=extensions_digest(study.extensions),
     )
@@ -191,6 +202,12 @@ def planned_model(context: Context, site: Site) -> SiteModel:
 def model_of(context: Context, one: Indentation) -> SiteModel:
     """An indentation as it was recorded, or as the study plans it."""
     return recorded_model(context, one) if isinstance(one, Record) else planned_model(context, one)
+
+
+def curve_job(model: SiteModel, tissues: tuple[str, ...], parameters: Iterable[float]) -> SimulationJob:
+    """An indentation at flat ``parameters``, with derivatives, at the times of a curve."""
+    times = model.curve_times(CURVE_POINTS)
+    return SimulationJob(model, tissues, tuple(map(float, parameters)), tuple(map(float, times)))
 
 
 def experiment_cache(context: Context, folder: Path) -> SimulationCache:

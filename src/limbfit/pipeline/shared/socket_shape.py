@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,22 +41,27 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
         With the key and the remedy.
     """
     table, frame = study.socket, limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    with _blaming(study):
+    with blaming(study):
         if table.file is not None:
             return read_socket(
                 study.path(table.file), table.unit, table.space, outer=outer, frame=frame, bones=anatomy.bones
             )
         regions = regions_of(study, anatomy)
-        recipe = Recipe(
-            trim=trim_of(study, anatomy),
-            reduction_percent=table.reduction_percent,
-            areas=[_area(study, area, regions) for area in table.areas],
-            flare_mm=table.flare_mm,
-            distal=table.distal,
-            distal_clearance_mm=table.distal_clearance_mm,
-            edge_mm=table.face_edge_mm,
-        )
-        return rectified(outer, frame, recipe)
+        areas = [_area(study, area, regions) for area in table.areas]
+        return rectified(outer, frame, replace(recipe_of(study, anatomy), areas=areas))
+
+
+def recipe_of(study: Study, anatomy: Anatomy) -> Recipe:
+    """The study's rectification but for its areas."""
+    table = study.socket
+    return Recipe(
+        trim=trim_of(study, anatomy),
+        reduction_percent=table.reduction_percent,
+        flare_mm=table.flare_mm,
+        distal=table.distal,
+        distal_clearance_mm=table.distal_clearance_mm,
+        edge_mm=table.face_edge_mm,
+    )
 
 
 def trim_of(study: Study, anatomy: Anatomy) -> Trim:
@@ -80,7 +86,7 @@ def regions_of(study: Study, anatomy: Anatomy) -> dict[str, Region]:
     """Named regions of the skin: those of any limb, and the study's own, which win."""
     known = directions(anatomy, study.socket.side)
     regions = default_regions(anatomy, known)
-    with _blaming(study):
+    with blaming(study):
         for one in study.socket.regions:
             regions[one.name] = stated_region(anatomy, one.name, np.array(one.position), one.radius_mm)
     return regions
@@ -89,15 +95,27 @@ def regions_of(study: Study, anatomy: Anatomy) -> dict[str, Region]:
 def _area(study: Study, area: SocketAreaTable, regions: Mapping[str, Region]) -> Area:
     if area.position is not None:
         return Area(area.name, np.array(area.position), area.radius_mm, area.depth_mm)
-    region = regions.get(area.region or "")
-    if region is None:
+    name = area.region or ""
+    check_regions(study, [name], f"socket.areas.{area.name}.region", regions)
+    return Area(area.name, regions[name].position, area.radius_mm, area.depth_mm)
+
+
+def check_regions(study: Study, names: Sequence[str], place: str, known: Collection[str]) -> None:
+    """That regions which are named are among the ``known`` ones.
+
+    Raises
+    ------
+    StudyError
+        With those that there are.
+    """
+    wrong = next((name for name in names if name not in known), None)
+    if wrong is not None:
         raise StudyError(
-            f"no region is named {area.region!r}",
+            f"no region is named {wrong!r}",
             file=study.file,
-            place=f"socket.areas.{area.name}.region",
-            remedy="the limb has " + ", ".join(regions),
+            place=place,
+            remedy="there are " + ", ".join(known),
         )
-    return Area(area.name, region.position, area.radius_mm, area.depth_mm)
 
 
 def load_of(study: Study, load: SocketLoadTable, anatomy: Anatomy) -> tuple[Array, Array, Array]:
@@ -119,17 +137,17 @@ def load_of(study: Study, load: SocketLoadTable, anatomy: Anatomy) -> tuple[Arra
     if load.preset is None:
         return np.array(load.force_N), np.array(load.moment_Nmm), point
     standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
-    with _blaming(study):
+    with blaming(study):
         known = directions(anatomy, study.socket.side)
         return standard.force(weight, known), standard.moment(weight, known), point
 
 
 @contextmanager
-def _blaming(study: Study) -> Iterator[None]:
+def blaming(study: Study, place: str = "socket") -> Iterator[None]:
     """What is wrong with the shape is said of the study's table."""
     try:
         yield
     except SurfaceError as error:
-        place = "socket" if error.file is None else "socket.file"
+        place = place if error.file is None else "socket.file"
         what = error.what if error.file is None else f"{error.file}: {error.what}"
         raise StudyError(what, file=study.file, place=place, remedy=error.remedy) from None

@@ -55,7 +55,7 @@ def file_digest(path: Path) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON so that a reader sees the old file or the new one, never half of it."""
-    text = json.dumps(content, indent=1, allow_nan=False, default=_plain)
+    text = json.dumps(content, indent=1, allow_nan=False, default=plain)
     with atomic(path) as stream:
         stream.write(text.encode())
 
@@ -64,7 +64,7 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """NumPy scalars and arrays as what JSON knows."""
     if hasattr(value, "tolist"):
         return value.tolist()

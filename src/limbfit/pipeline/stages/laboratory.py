@@ -311,8 +311,8 @@ def settings(study: Study) -> CalibrationSettings:
 
 def groupings(study: Study) -> tuple[Grouping, ...]:
     """Which parameters move together in each stage, as far as the study lets them move."""
-    names, table = unknowns(study).names, study.calibration
-    made = [constrained(one, names, table.fixed, table.tied) for one in two_stages(names)]
+    names = unknowns(study).names
+    made = [constrained(one, names, study.fixed, study.calibration.tied) for one in two_stages(names)]
     return tuple(dict.fromkeys(made))
 
 

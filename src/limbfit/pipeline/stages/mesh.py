@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ...anatomy.meshing.meshreport import MeshReport
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...anatomy.surfaces.thickness import read_thickness
-from ...mesh import write_vtu
+from ...mesh import Mesh, write_vtu
 from ...study import Study
 from ..shared.context import Context
 from ..shared.store import COARSE, read_json, write_json
 from .files import THICKNESS
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -59,10 +63,15 @@ def make_mesh(job: MeshJob) -> dict[str, Any]:
     shared = replace(job.settings, near_radius_mm=0.0)
     anatomy, base = _base(job.surfaces, job.surfaces_key, shared)
     mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
-    write_vtu(mesh, job.file)
-    facts = {**asdict(report), "element": job.settings.element}
+    return keep_mesh(mesh, report, job.settings, job.file)
+
+
+def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path) -> dict[str, Any]:
+    """Write a mesh, and beside it the facts that are returned."""
+    write_vtu(mesh, file)
+    facts = {**asdict(report), "element": settings.element}
     facts["repairs"] = [repair.text for repair in report.repairs]
-    write_json(job.file.with_suffix(".json"), facts)
+    write_json(file.with_suffix(".json"), facts)
     return facts
 
 
@@ -70,9 +79,13 @@ def make_mesh(job: MeshJob) -> dict[str, Any]:
 def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     """What all sites of a study share, whatever their ``near_radius_mm``; a worker makes it once."""
     anatomy = load_anatomy(surfaces)
+    return anatomy, base_mesh(anatomy, settings, stored_depth(surfaces, anatomy, settings))
+
+
+def stored_depth(surfaces: Path, anatomy: Anatomy, settings: MeshSettings) -> Array | None:
+    """Thickness of the mapped layer at the skin's points, mm; none where every layer's is stated."""
     mapped = any(layer.thickness_mm is None for layer in settings.layers)
-    depth = read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
-    return anatomy, base_mesh(anatomy, settings, depth)
+    return read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
 
 
 def mesh_settings(study: Study) -> MeshSettings:
@@ -134,7 +147,7 @@ def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: s
         )
         for site in sites
     ]
-    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if is_meshed(job)}
+    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if is_meshed(job.file)}
     missing = [job for job in jobs if job.site not in facts]
     context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
     for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
@@ -145,5 +158,6 @@ def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: s
     return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
 
 
-def is_meshed(job: MeshJob) -> bool:
-    return job.file.is_file() and job.file.with_suffix(".json").is_file()
+def is_meshed(file: Path) -> bool:
+    """Whether a mesh was kept whole (see `keep_mesh`)."""
+    return file.is_file() and file.with_suffix(".json").is_file()

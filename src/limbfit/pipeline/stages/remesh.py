@@ -25,7 +25,7 @@ def meshed_models(
         mesh_job(context, model.site, model.position, model.axis, settings, folder / f"{model.site}.vtu")
         for model in models
     ]
-    missing = [job for job in dict.fromkeys(jobs) if not is_meshed(job)]
+    missing = [job for job in dict.fromkeys(jobs) if not is_meshed(job.file)]
     for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
     return [

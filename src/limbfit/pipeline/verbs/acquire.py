@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
+from itertools import product
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from ..._version import __version__
 from ...acquire import (
@@ -31,7 +33,7 @@ from ...acquire import (
 )
 from ...acquire.virtual import Fault, Limb, Serving, Surrogate, VirtualFitSocket, fit_surrogate, serve
 from ...errors import InputError, TraceError
-from ...study import Site, Study
+from ...study import AcquireTable, Indentation, Record, Site, Study
 from ..shared.store import Store, disk_errors, write_json
 from ..stages.traces import read_curves, write_curves
 
@@ -39,10 +41,13 @@ FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"
 
 
-def waiting_sites(study: Study) -> list[Site]:
-    """Sites whose record is yet to be made; one that states several in ``[[records]]`` is none of them."""
-    several = {record.site for record in study.records}
-    return [site for site in study.sites if site.name not in several and not study.is_recorded(site)]
+def waiting(study: Study) -> list[Indentation]:
+    """Sites and records that are yet to be made, site by site."""
+    return [one for one in study.indentations if not _is_made(study, one)]
+
+
+def _is_made(study: Study, one: Indentation) -> bool:
+    return one.trace is not None and study.path(one.trace).is_file()
 
 
 def acquire_site(
@@ -56,7 +61,7 @@ def acquire_site(
     replace_record: bool = False,
     listener: Listener | None = None,
 ) -> dict[str, Any]:
-    """Record one site on a device, judge the record, and put it where the study names it.
+    """Record a site, or one of its records, on a device, judge it, and put it where the study names it.
 
     Parameters
     ----------
@@ -64,16 +69,16 @@ def acquire_site(
     operator : where events of the operator come from (`limbfit.acquire.Keyboard`).  None: unattended - the
         limb counts as in place, and the key as held until the search is ``depth_mm`` deep.
     stops : unattended, where events that end the session come from (`limbfit.acquire.events.Abort`).
-    depth_mm : where the search ends; by default the site's ``depth_mm``, or the depth of its last record,
-        where unattended, else ``acquire.search_depth_mm``.
-    replace_record : also where the study has a record of this site; that one is kept beside the new one.
+    depth_mm : where the search ends; by default the record's own, where unattended the site's ``depth_mm`` or
+        the depth of its last record, else ``acquire.search_depth_mm``.
+    replace_record : also where the study has this record; that one is kept beside the new one.
     listener : is told of phases and samples; see `limbfit.acquire.Told`.
 
     Returns
     -------
     dict
-        ``site``, ``completed``, ``phase``, ``reason``, ``verdict``, ``samples``, ``lost``, ``refused``,
-        ``unreachable``, ``depth_mm`` and the files by kind.
+        ``name``, ``site``, ``completed``, ``phase``, ``reason``, ``verdict``, ``samples``, ``lost``,
+        ``refused``, ``unreachable``, ``depth_mm`` and the files by kind.
 
     Raises
     ------
@@ -82,24 +87,25 @@ def acquire_site(
     RunError
         Where the device does not answer, or the record cannot be written.
     """
-    site = study.site(name)
-    if len(study.records_at(site)) > 1 or (site.trace is None and study.records_at(site)):
-        raise InputError(
-            "a session makes the record of a site that has one",
-            file=study.file,
-            place=f"sites.{name}",
-            remedy="state it as sites.trace, record it, and state it in [[records]] then",
-        )
-    if site.trace is not None and study.path(site.trace).exists() and not replace_record:
+    one = study.indentation(name)
+    site = one.site if isinstance(one, Record) else one
+    if _is_made(study, one) and not replace_record:
         remedy = "give --again to record it once more; the old record is kept"
-        raise InputError(f"{site.trace} exists", file=study.file, place=f"sites.{name}.trace", remedy=remedy)
-    _check_inside(study, site)
-    settings = _settings(study, site, depth_mm, operator is None)
+        raise InputError(f"{one.trace} exists", file=study.file, place=_place(one), remedy=remedy)
+    if isinstance(one, Record) and one.forced:
+        raise InputError(
+            "the device drives by displacement, and this record is made under force",
+            file=study.file,
+            place=_place(one),
+            remedy='leave out control = "force", or record it elsewhere',
+        )
+    _check_inside(study, one)
+    settings = _settings(study, one, depth_mm, operator is None)
     device = LineDevice(connect(address))
     try:
         with disk_errors(study.folder):
-            folder = _new_folder(study, site)
-            recorder = Recorder(folder / RECORD, _head(site, settings, device, operator is None))
+            folder = _new_folder(study, one)
+            recorder = Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
     except BaseException:
         device.close()
         raise
@@ -111,6 +117,7 @@ def acquire_site(
     finally:
         recorder.close()
     found = {
+        "name": one.name,
         "site": site.name,
         "completed": ending.completed,
         "phase": str(ending.phase),
@@ -121,7 +128,7 @@ def acquire_site(
         "refused": asdict(device.refused),
         "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.completed else None,
     }
-    return found | _keep(study, site, folder, ending.completed)
+    return found | _keep(study, one, folder, ending.completed)
 
 
 def judge_recording(file: Path) -> dict[str, Any]:
@@ -149,11 +156,16 @@ def judge_recording(file: Path) -> dict[str, Any]:
     }
 
 
-def _check_inside(study: Study, site: Site) -> None:
+def _place(one: Indentation) -> str:
+    """Where the study names the record's file."""
+    return f"{one.key if isinstance(one, Record) else f'sites.{one.name}'}.trace"
+
+
+def _check_inside(study: Study, one: Indentation) -> None:
     """Nothing outside the study's folder is written."""
     root = study.folder.resolve()
-    targets = [study.folder / FOLDER / site.name]
-    targets += [study.path(site.trace)] if site.trace is not None else []
+    targets = [study.folder / FOLDER / one.name]
+    targets += [study.path(one.trace)] if one.trace is not None else []
     if (study.folder / FOLDER).exists() and not (study.folder / FOLDER).is_dir():
         raise InputError(
             "is a file, where records are kept", file=study.folder / FOLDER, remedy="move it away"
@@ -163,19 +175,32 @@ def _check_inside(study: Study, site: Site) -> None:
             raise InputError(
                 f"{target.relative_to(study.folder)} lies outside the study's folder",
                 file=study.file,
-                place=f"sites.{site.name}.trace",
+                place=_place(one),
                 remedy="nothing is recorded there; name a place inside",
             )
 
 
-def _settings(study: Study, site: Site, depth_mm: float | None, unattended: bool) -> Settings:
-    settings = Settings(**study.acquire.model_dump())
+def _settings(study: Study, one: Indentation, depth_mm: float | None, unattended: bool) -> Settings:
+    """Those of ``[acquire]``, with what the record states of its own."""
+    own = {"ramp_speed_mm_s": one.speed_mm_s, "hold_s": one.hold_s} if isinstance(one, Record) else {}
+    stated = {key: value for key, value in own.items() if value is not None}
+    try:
+        table = AcquireTable(**(study.acquire.model_dump() | stated))
+    except ValidationError as error:
+        what = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        raise InputError(what, file=study.file, place=_place(one).removesuffix(".trace")) from None
+    settings = Settings(**table.model_dump())
+    if depth_mm is None and isinstance(one, Record):
+        depth_mm = one.depth_mm
     if depth_mm is None and unattended:
-        depth_mm = site.depth_mm or _recorded_depth(study, site)
+        depth_mm = one.depth_mm or _recorded_depth(study, one)
         if depth_mm is None:
-            remedy = "give --depth, or sites.depth_mm"
+            remedy = "give --depth, or state its depth_mm"
             raise InputError(
-                "how deep to go is not known", file=study.file, place=f"sites.{site.name}", remedy=remedy
+                "how deep to go is not known",
+                file=study.file,
+                place=_place(one).removesuffix(".trace"),
+                remedy=remedy,
             )
     if depth_mm is None:
         return settings
@@ -183,31 +208,35 @@ def _settings(study: Study, site: Site, depth_mm: float | None, unattended: bool
         raise InputError(
             f"{depth_mm:g} mm is not between acquire.min_depth_mm ({settings.min_depth_mm:g}) and "
             f"acquire.depth_limit_mm ({settings.depth_limit_mm:g})",
-            place="--depth, or the site's depth",
+            place="--depth, or depth_mm",
         )
     return replace(settings, search_depth_mm=depth_mm)
 
 
-def _recorded_depth(study: Study, site: Site) -> float | None:
+def _recorded_depth(study: Study, one: Indentation) -> float | None:
     file = Store(study.results)["traces"] / "traces.json"
     if not file.is_file():
         return None
-    facts = Store(study.results).read("traces", "traces.json")["sites"].get(site.name)
+    facts = Store(study.results).read("traces", "traces.json")["sites"].get(one.name)
     return None if facts is None else float(facts["depth_mm"])
 
 
-def _new_folder(study: Study, site: Site) -> Path:
+def _new_folder(study: Study, one: Indentation) -> Path:
     stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
-    folder = study.folder / FOLDER / site.name / stamp
+    folder = study.folder / FOLDER / one.name / stamp
     folder.mkdir(parents=True)
     return folder
 
 
-def _head(site: Site, settings: Settings, device: LineDevice, unattended: bool) -> dict[str, Any]:
+def _head(
+    one: Indentation, site: Site, settings: Settings, device: LineDevice, unattended: bool
+) -> dict[str, Any]:
     identity = asdict(device.identity)
     del identity["nonce"]
     return {
         "site": site.name,
+        "record": one.name,
+        "indenter": one.indenter,
         "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
         "limbfit": __version__,
         "unattended": unattended,
@@ -226,7 +255,7 @@ def _both(first: Listener, second: Listener | None) -> Listener:
     return tell
 
 
-def _keep(study: Study, site: Site, folder: Path, completed: bool) -> dict[str, Any]:
+def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict[str, Any]:
     """Verdict and ramps beside the record; the first ramp that counts into the study."""
     files: dict[str, Any] = {"record": str(folder / RECORD), "trace": None}
     if not completed:
@@ -238,15 +267,15 @@ def _keep(study: Study, site: Site, folder: Path, completed: bool) -> dict[str, 
         for ramp in found:
             _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
         counted = [ramp for ramp in found if ramp.cycle > study.acquire.precondition]
-        if counted and site.trace is not None:
-            files["trace"] = str(_place_trace(study, site.trace, counted[0]))
+        if counted and one.trace is not None:
+            files["trace"] = str(_place_trace(study, one.trace, counted[0]))
         # Last: who waits for the verdict finds the trace in its place.
-        write_json(folder / VERDICT, verdict | {"trace": str(site.trace) if files["trace"] else None})
+        write_json(folder / VERDICT, verdict | {"trace": str(one.trace) if files["trace"] else None})
     return {"verdict": verdict, "files": files}
 
 
 def _place_trace(study: Study, trace: Path, ramp: Ramp) -> Path:
-    """The site's record where the study names it; a former one stays beside it, with the time in its name."""
+    """The record where the study names it; a former one stays beside it, with the time in its name."""
     file = study.path(trace)
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.exists():
@@ -292,13 +321,14 @@ def virtual_fitsocket(
 
 def stored_surrogates(study: Study) -> dict[str, Surrogate]:
     """Each site that has a stored simulation: of the prediction, else of `limbfit simulate`."""
-    found = {}
-    for site in study.indentations:
-        for folder, column in (("predict", "force_simulated_N"), ("simulate", "force_N")):
-            file = study.results / folder / f"{site.name}.csv"
-            if file.is_file() and (folder == "simulate" or column in read_curves(file)):
-                found[site.name] = _surrogate(file, column)
-                break
+    found: dict[str, Surrogate] = {}
+    columns = (("predict", "force_simulated_N"), ("simulate", "force_N"))
+    for one in study.indentations:
+        site = one.site.name if isinstance(one, Record) else one.name
+        for (folder, column), name in product(columns, dict.fromkeys((one.name, site))):
+            file = study.results / folder / f"{name}.csv"
+            if site not in found and file.is_file() and (folder == "simulate" or column in read_curves(file)):
+                found[site] = _surrogate(file, column)
     if not found:
         remedy = "run it first (limbfit run), or simulate sites (limbfit simulate)"
         raise InputError("the study has no stored simulation", file=study.results, remedy=remedy)

@@ -11,7 +11,7 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...indentation import read_indenter
 from ...study import Study
 from ..shared.context import Listener, Progress, quiet
-from ..shared.socket_shape import load_of, socket_of
+from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
 from ..shared.store import Store
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
@@ -123,6 +123,8 @@ def _socket_facts(study: Study, anatomy: Anatomy | None) -> list[str]:
     socket = socket_of(study, anatomy, anatomy.skin)
     for load in table.loads:
         load_of(study, load, anatomy)
+    named = [one.region for one in table.design.regions]
+    check_regions(study, named, "socket.design.regions", regions_of(study, anatomy))
     depth = socket.offset(anatomy.skin)
     return [
         *facts,

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
 from ...execution import make_executor
 from ...phantom.build import make_phantom
+from ...phantom.forces import site_force
 from ...study import load_study
 from ..shared.context import Listener, Progress, quiet
+from ..shared.kernels import kernels_compiling
 from ..shared.store import read_json
 from .run import run_study
 
@@ -25,14 +28,20 @@ def make_phantom_study(
     workers: int = 0,
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
-    with make_executor(workers) as executor:
+    with kernels_compiling() as compiled, make_executor(workers) as executor:
+
+        def mapping(function: Callable, jobs: Iterable) -> Iterable:
+            if function is site_force:
+                compiled()
+            return executor.map(function, jobs)
+
         return make_phantom(
             Path(folder),
             detail=detail,
             seed=seed,
             fat=fat,
             socket=socket,
-            mapping=executor.map,
+            mapping=mapping,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
         )
 

@@ -86,6 +86,8 @@ def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...],
         write_feb(problem, folder / f"{name}.feb", settings)
         return (folder / f"{name}.feb",), differences(problem, settings)
     if to == "febio-optimize":
+        if problem.fibres is not None:
+            raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
         settings = replace(settings, penalty=None)

@@ -1,7 +1,8 @@
-"""A socket on the limb: ``limbfit socket`` with the parameters that are known."""
+"""A socket on the limb, and its design: ``limbfit socket`` with the parameters that are known."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from ...errors import InputError
@@ -11,9 +12,10 @@ from ...study import Study
 from ..shared.context import Listener, quiet
 from ..shared.store import Store
 from .run import run_experiment
-from .simulate import known_parameters
+from .simulate import IDENTIFIED, known_parameters
 
 LITERATURE = "literature"
+SIMULATIONS = 6
 
 
 def fit_socket(
@@ -45,7 +47,67 @@ def fit_socket(
         Where the simulation does not come to its end.
     """
     used, origin = (parameters, "given") if parameters else _known(study, literature)
-    return run_experiment(study, "socket", listener=listener, parameters=used, parameters_from=origin)
+    covariance = None
+    if origin == IDENTIFIED:
+        calibration = Store(study.results).read("calibrate", "calibration.json")
+        covariance = calibration["uncertainty"]["covariance_log"]
+    return run_experiment(
+        study,
+        "socket",
+        listener=listener,
+        parameters=used,
+        parameters_from=origin,
+        covariance_log=covariance,
+    )
+
+
+def design_socket(
+    study: Study,
+    *,
+    optimise: Sequence[str] = (),
+    simulations: int = SIMULATIONS,
+    parameters: Parameters | None = None,
+    literature: bool = False,
+    listener: Listener = quiet,
+) -> dict[str, Any]:
+    """Design a socket from the study's target pressure, and compare it with a uniformly reduced one.
+
+    Nothing here is a medical device.
+
+    Parameters
+    ----------
+    optimise : regions whose largest pressures are to be lowered further.
+    simulations : at most so many for that, beside those of the two designs.
+    parameters, literature : as for `fit_socket`.
+
+    Returns
+    -------
+    dict
+        What ``results/socket_design/socket_design.json`` holds, and ``folder``, which also has the socket
+        with its wall (``socket.stl``).
+
+    Raises
+    ------
+    InputError
+        For regions or a shape that the limb cannot have, or identified parameters that are stale.
+    RunError
+        Where a simulation does not come to its end.
+    """
+    if simulations < 1:
+        raise InputError(f"{simulations} simulations are too few", remedy="allow one or more")
+    doubled = sorted({name for name in optimise if list(optimise).count(name) > 1})
+    if doubled:
+        raise InputError(f"region {doubled[0]!r} is named twice", remedy="name it once")
+    used, origin = (parameters, "given") if parameters else _known(study, literature)
+    return run_experiment(
+        study,
+        "socket_design",
+        listener=listener,
+        parameters=used,
+        parameters_from=origin,
+        optimise=list(optimise),
+        simulations=simulations if optimise else 0,
+    )
 
 
 def _known(study: Study, literature: bool) -> tuple[Parameters, str]:

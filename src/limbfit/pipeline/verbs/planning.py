@@ -1,4 +1,4 @@
-"""Planning an experiment on a limb: ``limbfit design`` with the parameters that are known."""
+"""Planning an experiment on a limb, sites or a whole session: ``limbfit design``."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from ...identify.checks.design import Criterion
 from ...indentation import Parameters
 from ...study import Study
 from ..shared.context import Listener, quiet
 from ..shared.store import Store
 from .run import run_experiment
-from .simulate import known_parameters
+from .simulate import IDENTIFIED, known_parameters
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
+_FASTER = 5.0  # the second speed that a protocol may have, over the first
 _CORRELATION = 0.95  # of the model's error between neighbouring points of comparison
 
 
@@ -57,9 +59,72 @@ def design_study(
     )
 
 
+def plan_protocol(
+    study: Study,
+    *,
+    minutes: float = 25.0,
+    setup_s: float = 60.0,
+    rest_s: float = 30.0,
+    speeds_mm_s: Sequence[float] = (),
+    holds_s: Sequence[float] = (0.0, 30.0),
+    depth_mm: float | None = None,
+    determine: Sequence[str] = (),
+    criterion: Criterion = "D",
+    draws: int = 3,
+    seed: int = 0,
+    parameters: Parameters | None = None,
+    listener: Listener = quiet,
+) -> dict[str, Any]:
+    """The records that determine the parameters best in a patient's time, at several draws of the tissues.
+
+    Parameters
+    ----------
+    minutes : of the whole session.
+    setup_s, rest_s : for each site with an indenter, and for the tissue to come back after each record.
+    speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, within its limit.
+    holds_s : at the deepest point, to choose from; 0: none.
+    depth_mm : of all records; by default as deep as each site was recorded or is planned.
+    determine : parameters such as ``muscle.c_kPa``; by default all.
+    criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances.
+    draws : tissues that the protocol is judged at, the first those of ``parameters``.
+    parameters : per tissue; by default the identified ones, or the study's start.
+
+    Returns
+    -------
+    dict
+        What ``results/protocol/protocol.json`` holds, and ``folder``, where ``records.toml`` is, too.
+
+    Raises
+    ------
+    InputError
+        For unknown parameters, a time too short for any record, or identified parameters that are stale.
+    """
+    used, origin = (parameters, "given") if parameters else known_parameters(study, Store(study.results))
+    slow = study.acquire.ramp_speed_mm_s
+    return run_experiment(
+        study,
+        "protocol",
+        listener=listener,
+        minutes=float(minutes),
+        setup_s=float(setup_s),
+        rest_s=float(rest_s),
+        speeds_mm_s=[float(v) for v in speeds_mm_s]
+        or [slow, min(_FASTER * slow, study.acquire.speed_limit_mm_s)],
+        holds_s=[float(hold) for hold in holds_s],
+        depth_mm=depth_mm,
+        determine=list(determine),
+        criterion=criterion,
+        draws=draws,
+        seed=seed,
+        parameters=used,
+        parameters_from=origin,
+        noise=_noise_of(study, origin),
+    )
+
+
 def _noise_of(study: Study, origin: str) -> dict[str, float]:
     """Sensor noise and the model's own error, from the calibration's residuals where there is one."""
-    if origin != "identified":
+    if origin != IDENTIFIED:
         return {"sensor_N": _SENSOR_N, "misfit": _MISFIT, "correlation": _CORRELATION}
     residuals = Store(study.results).read("calibrate", "calibration.json")["uncertainty"]["residuals"]
     noise = [row["compared_noise_sd_N"] for row in residuals["sites"].values()]

@@ -18,6 +18,7 @@ from ..experiments.catalogue import (
 from ..shared.causes import causes, parts_of
 from ..shared.context import Context, Listener, executor_of, quiet
 from ..shared.hand_labels import keep_hand_labels
+from ..shared.kernels import kernels_compiling
 from ..shared.keys import Keys, Stage
 from ..shared.provenance import input_digests, machine, settings_record, versions
 from ..shared.store import Store, lock, write_json
@@ -170,13 +171,16 @@ def run_study(
             context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
         known = Keys(study)
         chain = _chain(known)
-        for stage, key in chain.items():
-            if stage in anew or store.state(stage, key).state != "done":
-                _do(context, stage, known, chain)
-            else:
-                context.tell(stage, 1, 1, "is up to date")
-            if stage == until:
-                break
+        wanted = list(chain) if until is None else list(chain)[: list(chain).index(until) + 1]
+        missing = {name for name in wanted if name in anew or store.state(name, chain[name]).state != "done"}
+        with kernels_compiling("calibrate" in missing) as compiled:
+            for name in wanted:
+                if name == "calibrate":
+                    compiled()
+                if name in missing:
+                    _do(context, name, known, chain)
+                else:
+                    context.tell(name, 1, 1, "is up to date")
         summary = summarise(study)
     if until is not None:
         summary["until"] = until

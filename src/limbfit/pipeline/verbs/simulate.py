@@ -20,6 +20,7 @@ from ..shared.store import Store, write_json
 from ..stages.traces import write_curves
 from .run import keys, run_study
 
+IDENTIFIED = "identified"
 FEB_NAME, FORCES = "model.feb", "forces.txt"
 
 
@@ -181,4 +182,4 @@ def known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
             file=store["calibrate"] / "calibration.json",
             remedy="identify again (limbfit run), or give --parameters",
         )
-    return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], "identified"
+    return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], IDENTIFIED

@@ -142,7 +142,7 @@ def convergence_figure(store: Results) -> Figure | None:
     if not stages:
         return None
     count = 1 + len(store.law.keys)
-    drawing, axes = panels(count, count, 2.3)
+    drawing, axes = panels(count, 5, 2.3)
     with matplotlib.rc_context(STYLE):
         offset = 0
         for stage in stages:

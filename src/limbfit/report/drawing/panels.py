@@ -144,9 +144,9 @@ def legend(entries: Iterable[tuple[str, str]]) -> str:
     return f'<div class="legend">{items}</div>'
 
 
-def colour_bar(limits: tuple[float, float], title: str) -> str:
+def colour_bar(limits: tuple[float, float], title: str, colours: str = FIELD_MAP) -> str:
     stops = ", ".join(
-        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[FIELD_MAP](t)[:3])
+        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[colours](t)[:3])
         for t in np.linspace(0, 1, 9)
     )
     bar = f'<i class="colour-bar" style="background:linear-gradient(90deg, {stops})"></i>'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib
@@ -18,16 +19,16 @@ from .pictures import SIDES, Grid, four_sides, new_plotter, shoot, without_displ
 Array = NDArray[np.float64]
 FIELDS = (("pressure_kPa", "pressure (kPa)"), ("shear_kPa", "shear (kPa)"))
 OUTER = "face_set:skin"
+OFFSET, OFFSET_MAP = "offset_mm", "RdBu_r"
 
 
 @without_display_warning()
-def pressure_figures(store: Results, names: list[str]) -> tuple[Figure, ...]:
-    """Pressure and shear on four sides, donning and each load with one colour scale."""
-    files = [store.folder / "socket" / f"held-{i}.vtu" for i in range(len(names))]
-    surfaces = [_surface(file) for file in files if file.is_file()]
+def pressure_figures(store: Results, files: Mapping[str, Path], name: str = "socket") -> tuple[Figure, ...]:
+    """Pressure and shear on four sides, one colour scale for all the stored fields, by their titles."""
+    surfaces = {title: _surface(file) for title, file in files.items() if file.is_file()}
     if not surfaces:
         return ()
-    return tuple(_figure(store, names, surfaces, field, title) for field, title in FIELDS)
+    return tuple(_figure(store, surfaces, field, words, name) for field, words in FIELDS)
 
 
 def _surface(file: Path) -> Grid:
@@ -43,23 +44,51 @@ def _surface(file: Path) -> Grid:
     return surface
 
 
-def _figure(store: Results, names: list[str], surfaces: list[Grid], field: str, title: str) -> Figure:
-    top = max(float(np.max(surface.point_data[field])) for surface in surfaces)
+def _figure(store: Results, surfaces: Mapping[str, Grid], field: str, words: str, name: str) -> Figure:
+    top = max(float(np.max(surface.point_data[field])) for surface in surfaces.values())
     limits = (0.0, max(top, 1e-6))
-    views = four_sides(store, surfaces[0])
+    kind = field.removesuffix("_kPa")
+    markup = _strips(store, surfaces, field, limits, FIELD_MAP, f"The limb coloured by {words}")
+    caption = f"What the socket does to the limb when it has been held: {words}, one colour scale for all."
+    return Figure(f"{name}-{kind}", markup + colour_bar(limits, words), caption)
+
+
+def _strips(
+    store: Results,
+    surfaces: Mapping[str, Grid],
+    field: str,
+    limits: tuple[float, float],
+    colours: str,
+    alt: str,
+) -> str:
+    """A row of four sides for every surface, by its title."""
+    views = four_sides(store, next(iter(surfaces.values())))
     markup = ""
-    for name, surface in zip(names, surfaces, strict=True):
+    for title, surface in surfaces.items():
         plotter = new_plotter()
         plotter.add_mesh(
-            surface, scalars=field, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, lighting=False
+            surface, scalars=field, clim=limits, cmap=colours, show_scalar_bar=False, lighting=False
         )
         shots: list[Shot] = [(shoot(plotter, view), view, []) for view in views]
         plotter.close()
-        titles = [f"{name}, {side}" for side in SIDES]
-        markup += strip(shots, titles, f"The limb coloured by {title}, {name}, from four sides")
-    kind = field.removesuffix("_kPa")
-    caption = f"What the socket does to the limb when it has been held: {title}, one colour scale for all."
-    return Figure(f"socket-{kind}", markup + colour_bar(limits, title), caption)
+        markup += strip(shots, [f"{title}, {side}" for side in SIDES], f"{alt}, {title}, from four sides")
+    return markup
+
+
+@without_display_warning()
+def offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
+    """Faces of sockets by their titles, coloured by how far outside the unloaded limb they are."""
+    faces = {title: pv.read(file) for title, file in files.items() if file.is_file()}
+    if not faces:
+        return None
+    most = max(float(np.percentile(np.abs(face.point_data[OFFSET]), 99)) for face in faces.values())
+    limits = (-max(most, 0.1), max(most, 0.1))
+    words = "offset from the unloaded limb (mm)"
+    markup = _strips(store, faces, OFFSET, limits, OFFSET_MAP, f"Face of the socket coloured by {words}")
+    caption = (
+        "Faces of the sockets: offset from the unloaded limb under its liner, negative where pressed in."
+    )
+    return Figure("socket-design-offset", markup + colour_bar(limits, words, OFFSET_MAP), caption)
 
 
 def settling_figure(content: Json) -> Figure:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import matplotlib
 import numpy as np
 
@@ -29,7 +31,12 @@ def design_section(store: Results, content: Json) -> Section:
         "A-optimal the smallest sum of "
         f"variances. In short: {content['verdict']}."
     )
-    blocks: list[Block] = [words, _design_table(content), _figure(content), _candidate_table(content)]
+    blocks: list[Block] = [
+        words,
+        _design_table(content),
+        expected_figure("designs", content["designs"], "testing the sites of a design"),
+        _candidate_table(content),
+    ]
     if content["left_out"]:
         blocks.append(Bullets(tuple(f"Left out: {text}." for text in content["left_out"])))
     return Section("design", "Which sites to test", tuple(blocks))
@@ -44,13 +51,13 @@ def _design_table(content: Json) -> Table:
                 Cell(", ".join(f"{one['site']} ({fixed(one['depth_mm'])})" for one in row["sites"])),
                 numeric(fixed(100 * row["d_efficiency"], 0)),
                 numeric(fixed(100 * row["a_efficiency"], 0)),
-                *(numeric(_factor(row["factor_95"][name])) for name in names),
+                *(numeric(factor(row["factor_95"][name])) for name in names),
             ),
             marked=row["design"] == "the study's own",
         )
         for row in content["designs"]
     )
-    head = ("Design", "Sites (depth in mm)", "D (%)", "A (%)", *(_label(name) for name in names))
+    head = ("Design", "Sites (depth in mm)", "D (%)", "A (%)", *(label(name) for name in names))
     caption = (
         "Designs: efficiencies against the best, and for each parameter the factor f of the 95 % interval to "
         "be expected (value / f to value × f)."
@@ -58,26 +65,29 @@ def _design_table(content: Json) -> Table:
     return Table("designs", caption, head, rows)
 
 
-def _factor(value: float) -> str:
+def factor(value: float) -> str:
+    """Of a 95 % interval, in words where nothing is known."""
     return "open" if value > _WIDEST else f"×/÷ {number(value)}"
 
 
-def _label(name: str) -> str:
+def label(name: str) -> str:
+    """A parameter's tissue and symbol."""
     tissue, _, parameter = name.rpartition(".")
     return f"{tissue} {symbol(parameter)}"
 
 
-def _figure(content: Json) -> Figure:
-    names = list(content["designs"][0]["factor_95"])
+def expected_figure(name: str, designs: Sequence[Json], of: str) -> Figure:
+    """Expected factors of the intervals by parameter; ``of``: what one is left with, in words."""
+    names = list(designs[0]["factor_95"])
     drawing, (ax,) = panels(1, 1, 0.8 + 0.3 * len(names))
     with matplotlib.rc_context(STYLE):
-        count = len(content["designs"])
-        for k, row in enumerate(content["designs"]):
+        count = len(designs)
+        for k, row in enumerate(designs):
             color, marker = _STYLES[k % len(_STYLES)]
             factors = np.minimum([row["factor_95"][name] for name in names], _WIDEST)
             at = np.arange(len(names)) + 0.16 * (k - (count - 1) / 2)
             ax.plot(factors, at, marker, color=color, ms=5, label=row["design"])
-        ax.set_yticks(range(len(names)), [_label(name) for name in names])
+        ax.set_yticks(range(len(names)), [label(name) for name in names])
         ax.invert_yaxis()
         ax.set_xscale("log")
         ax.axvline(2, color=MUTED, lw=0.8, ls="--")
@@ -87,11 +97,11 @@ def _figure(content: Json) -> Figure:
         ax.grid(visible=False, axis="y")
         legend_above(drawing, ax, columns=2)
     caption = (
-        "The factor by which each parameter would remain uncertain after testing the sites of a design. "
+        f"The factor by which each parameter would remain uncertain after {of}. "
         f"Right of the dashed line: more than twofold; {_WIDEST:g} and more are drawn at {_WIDEST:g}."
     )
     alt = "Expected factors of the 95 % intervals by parameter and design; the numbers are in the table"
-    return Figure("designs-figure", svg(drawing, "designs-figure", alt), caption)
+    return Figure(f"{name}-figure", svg(drawing, f"{name}-figure", alt), caption)
 
 
 def _candidate_table(content: Json) -> Table:

@@ -9,9 +9,11 @@ from ..page import Note, Section
 from ..store import Json, Results
 from .cube import cube_section
 from .design import design_section
+from .protocol import protocol_section
 from .regions import regions_section
 from .sensitivity import SENSITIVITIES
 from .socket import socket_section
+from .socket_design import socket_design_section
 from .uncertainty import uncertainty_section
 from .validation import validation_section
 
@@ -24,7 +26,9 @@ _OWN: dict[str, Maker] = {
     **SENSITIVITIES,
     "crossvalidate": validation_section,
     "design": design_section,
+    "protocol": protocol_section,
     "socket": socket_section,
+    "socket_design": socket_design_section,
 }
 SECTIONS = Registry("report section", _OWN)
 
@@ -39,7 +43,7 @@ def experiment_sections(store: Results) -> tuple[Section, ...]:
 
 
 def _outdated(name: str) -> Note:
-    verb = name.replace("sensitivity-", "sensitivity --only ")
+    verb = name.replace("sensitivity-", "sensitivity --only ").replace("socket_design", "socket design")
     return Note(
         f"The stored results of “limbfit {verb}” are left out: they were made from other inputs, settings or "
         "code. Run it again to see them here."

@@ -33,7 +33,9 @@ def socket_section(store: Results, content: Json) -> Section:
         ),
         Prose(_shape(content)),
         Prose(_loads(loads)),
-        *pressure_figures(store, names),
+        *pressure_figures(
+            store, {name: store.folder / "socket" / f"held-{i}.vtu" for i, name in enumerate(names)}
+        ),
         settling_figure(content),
         _regions(names, held),
         Prose(PUBLISHED),

@@ -6,7 +6,8 @@ import { labelled, NAVIGATION } from "/static/views/parts.js";
 import { Player } from "/static/views/player.js";
 
 const GREEK = { gamma: "γ", tau: "τ" };
-const parted = (key) => { const [, name, unit] = /^(.*?)(?:_(kPa|s))?$/.exec(key); return [GREEK[name] ?? name, unit ?? "–"]; };
+const below = (digits) => [...digits].map((digit) => "₀₁₂₃₄₅₆₇₈₉"[digit]).join("");
+const parted = (key) => { const [, name, digits, unit] = /^(.*?)(\d*)(?:_(kPa|s))?$/.exec(key); return [(GREEK[name] ?? name) + below(digits), unit ?? "–"]; };
 const AXES = { time_s: { title: "Time", unit: "s" }, displacement_mm: { title: "Displacement", unit: "mm" } };
 const WATCH_MS = 1500;
 

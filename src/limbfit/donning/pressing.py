@@ -1,0 +1,83 @@
+"""A limb under a stated field of pressure: the deformed surface is the shape of a socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..anatomy.surfaces.triangles import Surface
+from ..errors import ProblemError
+from ..fe import History, Pressure, Problem, Result, Step, StepControl, solve
+from ..fe.materials import Material
+from ..mesh import Mesh
+from .model import ELEMENT, OUTER, most_threads
+
+Array = NDArray[np.float64]
+
+LEVELS = 32  # of pressure, up to the largest: what a face has is rounded to them
+COMING_ON, HELD = 6, 4  # steps
+RELAXING = 2.0  # power of the step's number that the time of the hold goes with
+
+
+def pressed_problem(
+    mesh: Mesh, materials: Mapping[str, Material], pressure_kPa: Array, on_s: float, hold_s: float
+) -> Problem:
+    """A limb whose outer surface bears a pressure that follows it; bones and proximal cut are held.
+
+    Parameters
+    ----------
+    mesh : LPS mm, with the face set ``skin`` and node sets ``fixed_*``.
+    materials : by region.
+    pressure_kPa : (f,) of the faces of that set, 0 or more; rounded to a part in ``LEVELS`` of the largest.
+    on_s, hold_s : how long the pressure comes on and then stays.
+
+    Raises
+    ------
+    ProblemError
+        Where no face bears any.
+    """
+    top = float(pressure_kPa.max())
+    if not top > 0.0:
+        raise ProblemError("no pressure is stated anywhere on the limb", remedy="state one below the brim")
+    faces, levels = mesh.face_sets[OUTER], np.round(LEVELS * pressure_kPa / top)
+    times = [0.0, on_s, on_s + hold_s] if hold_s > 0.0 else [0.0, on_s]
+    pressures = []
+    for level in np.unique(levels[levels > 0.0]):
+        value = 1e-3 * top * level / LEVELS
+        pressures.append(Pressure(faces[levels == level], times, [0.0, *(value for _ in times[1:])]))
+    return Problem(
+        mesh=mesh,
+        materials=materials,
+        fixed=mesh.held,
+        contact_faces=np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64),
+        indenter=None,
+        history=History(np.array([0.0, times[-1]]), np.zeros(2)),
+        pressures=tuple(pressures),
+        element=ELEMENT,
+    )
+
+
+def press(problem: Problem, on_step: Callable[[Step], None] | None = None) -> Result:
+    """Simulate a problem of `pressed_problem`; the last state is kept."""
+    times = np.asarray(problem.pressures[0].times)
+    on = times[1] * np.arange(1, COMING_ON + 1) / COMING_ON
+    held = times[1] + (times[-1] - times[1]) * (np.arange(1, HELD + 1) / HELD) ** RELAXING
+    steps = np.concatenate([on, held]) if times[-1] > times[1] else on
+    control = StepControl(times=tuple(map(float, steps)), threads=most_threads())
+    return solve(problem, control, on_step=on_step, store="all")
+
+
+def outer_surface(mesh: Mesh, displacement: Array | None = None) -> Surface:
+    """The limb's outer surface, open at the proximal cut, LPS mm, moved by a displacement (n, 3) of nodes.
+
+    The faces of quadratic cells are each four triangles.
+    """
+    faces = mesh.face_sets[OUTER]
+    if faces.shape[1] == 6:
+        corners = [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]
+        faces = np.vstack([faces[:, list(corner)] for corner in corners])
+    nodes, local = np.unique(faces, return_inverse=True)
+    points = mesh.points if displacement is None else mesh.points + displacement
+    return Surface(points[nodes], local.reshape(-1, 3))

@@ -1,0 +1,143 @@
+"""Depths of regions of a socket that lower pressures there: few simulations, each proposed by what is known.
+
+Each region's largest pressure is taken to change with every depth by a constant factor per mm.  The factors
+begin as a guess for a region's own depth and none for the others, and follow what was simulated by Broyden's
+update (C. G. Broyden, Math. Comput. 19:577, 1965).  A proposal solves the linear program that they make,
+within a trust region around the best design so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+Array = NDArray[np.float64]
+
+OWN_PER_MM = 0.15  # guess: by how much a region's own depth changes the logarithm of its pressure
+LEAST_KPA = 1.0  # pressures below this count as this
+DEEPEST_MM, RELIEF_MM = 4.0, -8.0  # bounds of the depths
+TRUST_MM, WIDEST_MM, NARROWEST_MM = 2.0, 4.0, 0.25
+MEAN_WEIGHT = 0.1  # of the mean beside the worst, so that regions that are not the worst gain too
+LIMIT_WEIGHT = 5.0  # of what is beyond the limits
+WORTH = 0.01  # a foreseen gain that is less is not simulated for
+GOOD, POOR = 0.5, 0.1  # share of the foreseen gain from, or below, which the trust region changes
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A simulated design: depths (k,) mm, the largest pressures (r,) kPa of all regions, and its merit.
+
+    ``pressures`` is None where it could not be made or simulated.
+    """
+
+    depths: Array
+    pressures: Array | None
+    merit: float
+
+
+@dataclass(eq=False)
+class Relief:
+    """The search, asked for depths and told what they gave.
+
+    Parameters
+    ----------
+    named : (k,) which of the regions have a depth, and are to be lowered.
+    reference : (r,) kPa, of the control: named regions are lowered relative to it.
+    limits : (r,) kPa that the others should not exceed.
+    start : (r,) kPa, of the design with no depth anywhere.
+    """
+
+    named: Sequence[int]
+    reference: Array
+    limits: Array
+    start: Array
+    trials: list[Trial] = field(init=False)
+    trust_mm: float = field(init=False, default=TRUST_MM)
+
+    def __post_init__(self) -> None:
+        depths = np.zeros(len(self.named))
+        self.trials = [Trial(depths, self.start, self.merit(self.start))]
+        self._slopes = np.zeros((len(self.start), len(self.named)))
+        self._slopes[list(self.named), np.arange(len(self.named))] = OWN_PER_MM
+
+    @property
+    def best(self) -> Trial:
+        return min(self.trials, key=lambda trial: trial.merit)
+
+    def merit(self, pressures: Array) -> float:
+        """The goal: the worst and the mean of the named over the control, and the excess, as logarithms."""
+        return self._merit(_log(pressures))
+
+    def _merit(self, y: Array) -> float:
+        named = list(self.named)
+        gain = y[named] - _log(self.reference)[named]
+        others = np.setdiff1d(np.arange(len(y)), named)
+        excess = np.maximum(y[others] - np.log(self.limits[others]), 0.0).max(initial=0.0)
+        return float(gain.max() + MEAN_WEIGHT * gain.mean() + LIMIT_WEIGHT * excess)
+
+    def propose(self) -> Array | None:
+        """Depths (k,) mm to be simulated next; None where no gain that is worth it is foreseen."""
+        if self.trust_mm < NARROWEST_MM:
+            return None
+        depths = self._minimum()
+        foreseen = self._merit(self._foreseen(depths))
+        return None if foreseen > self.best.merit - WORTH else depths
+
+    def tell(self, depths: Array, pressures: Array | None) -> Trial:
+        """What the proposed depths gave: pressures (r,) kPa, or None where they could not be simulated."""
+        if pressures is None:
+            trial = Trial(depths, None, np.inf)
+            self.trust_mm /= 2.0
+        else:
+            trial = Trial(depths, pressures, self.merit(pressures))
+            foreseen = self.best.merit - self._merit(self._foreseen(depths))
+            share = (self.best.merit - trial.merit) / foreseen
+            if share > GOOD:
+                self.trust_mm = min(2.0 * self.trust_mm, WIDEST_MM)
+            elif share < POOR:
+                self.trust_mm /= 2.0
+            self._learn(depths, pressures)
+        self.trials.append(trial)
+        return trial
+
+    def _foreseen(self, depths: Array) -> Array:
+        """Logarithms (r,) of the pressures at depths (k,)."""
+        best = self.best
+        assert best.pressures is not None
+        return np.asarray(_log(best.pressures) + self._slopes @ (depths - best.depths))
+
+    def _learn(self, depths: Array, pressures: Array) -> None:
+        step = depths - self.best.depths
+        wrong = _log(pressures) - self._foreseen(depths)
+        self._slopes += np.outer(wrong, step) / (step @ step)
+
+    def _minimum(self) -> Array:
+        """The linear program's depths: unknowns are the depths, the worst gain and the excess."""
+        named, k = list(self.named), len(self.named)
+        best = self.best
+        assert best.pressures is not None
+        rest = _log(best.pressures) - self._slopes @ best.depths
+        others = np.setdiff1d(np.arange(len(rest)), named)
+        gains = np.column_stack([self._slopes[named], -np.ones(k), np.zeros(k)])
+        beyond = np.column_stack([self._slopes[others], np.zeros(len(others)), -np.ones(len(others))])
+        cost = np.concatenate([MEAN_WEIGHT * self._slopes[named].mean(axis=0), [1.0, LIMIT_WEIGHT]])
+        low = np.maximum(best.depths - self.trust_mm, RELIEF_MM)
+        high = np.minimum(best.depths + self.trust_mm, DEEPEST_MM)
+        found = linprog(
+            cost,
+            A_ub=np.vstack([gains, beyond]),
+            b_ub=np.concatenate(
+                [_log(self.reference)[named] - rest[named], np.log(self.limits[others]) - rest[others]]
+            ),
+            bounds=[*zip(low, high, strict=True), (None, None), (0.0, None)],
+        )
+        assert found.success, found.message  # the excess is free to grow
+        return np.asarray(found.x[:k])
+
+
+def _log(pressures: Array) -> Array:
+    return np.log(np.maximum(pressures, LEAST_KPA))

@@ -1,0 +1,141 @@
+"""Which records fit into a patient's time, and what they would determine: Bayesian choice of a protocol.
+
+Each record that could be made has a Fisher information on the logarithms of the parameters, at several draws
+of them, since what a record tells depends on the tissue. A protocol is judged by the covariance of the
+parameters that are wanted, the others being unknown too: by the mean over the draws of the logarithm of its
+determinant (D) or of its trace (A) (Chaloner and Verdinelli, Statistical Science 1995, 10:273).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import CalibrationError
+from .design import Criterion
+
+Array = NDArray[np.float64]
+
+_LARGEST_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), however little is known
+
+
+@dataclass(frozen=True)
+class Option:
+    """A record that could be made: ``information`` (d, p, p) on log(parameters) at each draw.
+
+    ``place`` is what is prepared for it, a site with an indenter; records at one place share that time.
+    """
+
+    place: tuple[str, str]
+    seconds: float
+    information: Array
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Time of a session: ``seconds`` in all, ``setup_s`` for each place."""
+
+    seconds: float
+    setup_s: float
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be determined: ``which`` (k,) of the parameters, given the ``prior`` (p, p) information."""
+
+    prior: Array
+    which: tuple[int, ...]
+    criterion: Criterion = "D"
+
+    def covariances(self, options: Sequence[Option], chosen: Sequence[int], draws: int) -> Array:
+        """Of log(parameters) (d, p, p) at each of the draws."""
+        total = np.repeat(self.prior[None], draws, axis=0)
+        for i in chosen:
+            total = total + options[i].information
+        return np.asarray(np.linalg.inv(total))
+
+    def cost(self, covariances: Array) -> float:
+        """What the best protocol has least of."""
+        part = covariances[:, self.which][:, :, self.which]
+        if self.criterion == "A":
+            return float(np.trace(part, axis1=1, axis2=2).mean())
+        return float(np.linalg.slogdet(part)[1].mean())
+
+
+def factors_95(covariances: Array) -> Array:
+    """(d, p) the factor f of the expected 95 % interval [value / f, value x f] at each draw."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    return np.asarray(np.exp(1.96 * np.sqrt(np.minimum(variances, _LARGEST_VARIANCE))))
+
+
+def seconds_of(options: Sequence[Option], chosen: Sequence[int], budget: Budget) -> float:
+    """How long a protocol takes."""
+    places = {options[i].place for i in chosen}
+    return sum(options[i].seconds for i in chosen) + budget.setup_s * len(places)
+
+
+def plan(options: Sequence[Option], budget: Budget, wanted: Wanted) -> tuple[int, ...]:
+    """The records to make: added by gain in their time, then exchanged as long as that helps.
+
+    Raises
+    ------
+    CalibrationError
+        Where no record fits into the time.
+    """
+    if not options or all(seconds_of(options, [i], budget) > budget.seconds for i in range(len(options))):
+        raise CalibrationError("no record fits into the time")
+    draws = len(options[0].information)
+
+    def cost(chosen: Sequence[int]) -> float:
+        return wanted.cost(wanted.covariances(options, chosen, draws))
+
+    starts = [_filled([], options, budget, cost, by_time=by_time) for by_time in (True, False)]
+    best = min((_exchanged(start, options, budget, cost) for start in starts), key=cost)
+    return tuple(sorted(best))
+
+
+Cost = Callable[[Sequence[int]], float]
+
+
+def _filled(
+    chosen: Sequence[int], options: Sequence[Option], budget: Budget, cost: Cost, *, by_time: bool
+) -> list[int]:
+    """The choice with what tells most, for its time or at all, added until nothing more fits."""
+    found = list(chosen)
+    while True:
+        now, spent, best, gain = cost(found), seconds_of(options, found, budget), -1, 0.0
+        for i in range(len(options)):
+            seconds = seconds_of(options, [*found, i], budget)
+            if i in found or seconds > budget.seconds:
+                continue
+            told = (now - cost([*found, i])) / (seconds - spent if by_time else 1.0)
+            if told > gain:
+                best, gain = i, told
+        if best < 0:
+            return found
+        found.append(best)
+
+
+def _exchanged(start: Sequence[int], options: Sequence[Option], budget: Budget, cost: Cost) -> list[int]:
+    """The choice with one record left out and the time filled anew, as long as that is better."""
+    found, least = list(start), cost(start)
+    while True:
+        trials = []
+        for out in found:
+            rest = [i for i in found if i != out]
+            without = options[out]
+            others = [option if option is not without else _nothing(option) for option in options]
+            trials += [_filled(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
+        best = min(trials, key=cost, default=found)
+        now = cost(best)
+        if not now < least - 1e-9 * abs(least):
+            return found
+        found, least = best, now
+
+
+def _nothing(option: Option) -> Option:
+    """A record that takes longer than any session: it is not chosen again."""
+    return Option(option.place, float("inf"), option.information)

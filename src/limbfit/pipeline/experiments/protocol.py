@@ -1,0 +1,335 @@
+"""The experiment ``protocol``: which records a session of stated length should make, and what they tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from numpy.typing import NDArray
+from scipy.stats import norm, qmc
+
+from ...anatomy.sites.under import tissue_under
+from ...anatomy.surfaces.surfaces import load_anatomy
+from ...errors import InputError, RunError
+from ...identify.checks.design import NoiseModel, candidate
+from ...identify.checks.design import prior_information as bounds_information
+from ...identify.checks.protocol import Budget, Option, Wanted, factors_95, plan, seconds_of
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...indentation import Parameters, SiteModel
+from ...study import Site
+from ..shared.context import Context
+from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
+from ..shared.store import write_json
+from ..shared.tabular import write_table
+from ..stages.laboratory import unknowns
+from .design import DEEPEST_SHARE
+
+Array = NDArray[np.float64]
+
+DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
+DESIGNED, PLAIN = "designed", "one ramp at each site"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A record that could be made: the indenter pressed in at one rate, held, and taken back at that rate."""
+
+    site: str
+    indenter: str | None
+    depth_mm: float
+    speed_mm_s: float
+    hold_s: float
+    model: SiteModel
+
+    @property
+    def tool(self) -> str:
+        return self.indenter or "indenter"
+
+    @property
+    def seconds(self) -> float:
+        """From the first touch to the last."""
+        return 2.0 * self.depth_mm / self.speed_mm_s + self.hold_s
+
+    @property
+    def told(self) -> str:
+        held = f", held for {self.hold_s:g} s" if self.hold_s else ""
+        return f"site {self.site}, {self.tool}, {self.depth_mm:.1f} mm at {self.speed_mm_s:g} mm/s{held}"
+
+
+def run_protocol(
+    context: Context,
+    folder: Path,
+    *,
+    minutes: float,
+    setup_s: float,
+    rest_s: float,
+    speeds_mm_s: Sequence[float],
+    holds_s: Sequence[float],
+    depth_mm: float | None,
+    determine: Sequence[str],
+    criterion: str,
+    draws: int,
+    seed: int,
+    parameters: Parameters,
+    parameters_from: str,
+    noise: dict[str, float],
+) -> dict[str, Any]:
+    """Simulate every possible record at every draw, with derivatives, and choose within the time."""
+    study = context.study
+    known = unknowns(study)
+    strange = [name for name in determine if name not in known.names]
+    if strange:
+        raise InputError(
+            f"no parameter is named {strange[0]!r}",
+            place="--determine",
+            remedy=f"use {', '.join(known.names)}",
+        )
+    centre = study.vector(parameters)
+    tissues = drawn(known, centre, draws, seed)
+    planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm)
+    found, options, peaks = _options(context, folder, planned, tissues, NoiseModel(**noise), rest_s, left_out)
+    if not found:
+        raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
+    budget = Budget(60.0 * minutes, setup_s)
+    which = tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
+    wanted = Wanted(bounds_information(known), which, "A" if criterion == "A" else "D")
+    plans = _plans(found, options, budget, wanted)
+    if DESIGNED not in plans:
+        least = min(seconds_of(options, [i], budget) for i in range(len(options)))
+        raise InputError(
+            f"no record fits into {minutes:g} min: the shortest takes {least / 60:.1f} min, set-up included",
+            place="--minutes",
+            remedy="allow more time",
+        )
+    rows = [
+        _row(name, chosen, options, budget, wanted, known.names, len(tissues))
+        for name, chosen in plans.items()
+    ]
+    content = {
+        "minutes": minutes,
+        "setup_s": setup_s,
+        "rest_s": rest_s,
+        "criterion": wanted.criterion,
+        "determine": [known.names[i] for i in which],
+        "draws": tissues.tolist(),
+        "records": [_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
+        "protocols": rows,
+        "verdict": _verdict(rows[0], [known.names[i] for i in which]),
+        "candidates": [_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
+        "left_out": left_out,
+        "parameters": parameters,
+        "parameters_from": parameters_from,
+        "noise": noise,
+    }
+    write_json(folder / "protocol.json", content)
+    _write_tables(folder, content)
+    _write_records(folder / "records.toml", content["records"])
+    return {}
+
+
+def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
+    """Tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
+
+    A parameter with a prior scatters by its factor, another by half of what its bounds leave. A Latin
+    hypercube spreads few draws well.
+    """
+    spread = 0.5 * np.log(known.upper / known.lower) / np.sqrt(12.0)
+    for prior in known.priors:
+        spread[known.names.index(prior.name)] = np.log(prior.factor)
+    others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
+    scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
+    return np.vstack([centre, np.exp(np.clip(scattered, np.log(known.lower), np.log(known.upper)))])
+
+
+def _planned(
+    context: Context, speeds_mm_s: Sequence[float], holds_s: Sequence[float], depth_mm: float | None
+) -> tuple[list[Planned], list[str]]:
+    """Every site with every indenter, speed and hold, as deep as it was recorded, planned or asked for."""
+    study, found, left_out = context.study, [], []
+    anatomy = load_anatomy(context.store["surfaces"])
+    deepest: dict[str, float] = {}
+    for one in study.indentations:
+        own = model_of(context, one)
+        deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
+    for site in study.sites:
+        wanted = depth_mm or deepest[site.name]
+        for name in study.all_indenters:
+            model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, wanted), searched=True)
+            thickness = tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
+            depth = min(wanted, DEEPEST_SHARE * thickness)
+            if depth < wanted:
+                half = f"half of the tissue's {thickness:.1f} mm"
+                left_out.append(f"site {site.name}: no deeper than {depth:.1f} mm, {half}")
+            for speed in speeds_mm_s:
+                for hold in holds_s:
+                    planned = _press(model, depth, speed, hold)
+                    found.append(Planned(site.name, name, depth, speed, hold, planned))
+    return found, list(dict.fromkeys(left_out))
+
+
+def _with_tool(site: Site, name: str | None) -> Site:
+    return site.model_copy(update={"indenter": name})
+
+
+def _press(model: SiteModel, depth: float, speed: float, hold: float) -> SiteModel:
+    """In to ``depth`` mm at ``speed`` mm/s, held for ``hold`` s, and out."""
+    ramp = depth / speed
+    knots = [(0.0, 0.0), (ramp, depth)] + ([(ramp + hold, depth)] if hold else [])
+    knots.append((knots[-1][0] + ramp, 0.0))
+    times, depths = zip(*knots)
+    return replace(model, knots_s=times, knots_mm=depths)
+
+
+def _options(
+    context: Context,
+    folder: Path,
+    planned: Sequence[Planned],
+    tissues: Array,
+    noise: NoiseModel,
+    rest_s: float,
+    left_out: list[str],
+) -> tuple[list[Planned], list[Option], list[float]]:
+    """What each record would tell at each draw: nothing where its simulation does not come to its end.
+
+    Records that press harder than the device may at the first draw are left out.
+    """
+    study, cache = context.study, experiment_cache(context, folder)
+    limit = study.acquire.force_limit_N
+    jobs = [curve_job(one.model, study.tissues, tissue) for one in planned for tissue in tissues]
+    infos: list[list[Array]] = [[] for _ in planned]
+    peaks, failed = np.zeros(len(planned)), [0] * len(planned)
+    for i, (job, simulation) in enumerate(zip(jobs, cache.run(jobs, context.executor))):
+        k, draw = divmod(i, len(tissues))
+        context.tell("protocol", i + 1, len(jobs), planned[k].told)
+        assert simulation.jacobian is not None
+        if draw == 0:
+            peaks[k] = simulation.force_N.max()
+        if simulation.completed:
+            response = SiteResponse(simulation.force_N, simulation.jacobian)
+            at = np.array(job.parameters)
+            told = candidate(planned[k].site, planned[k].depth_mm, response, at, noise)
+            infos[k].append(told.information)
+        else:
+            failed[k] += 1
+            infos[k].append(np.zeros((tissues.shape[1],) * 2))
+    kept = []
+    for k, one in enumerate(planned):
+        if peaks[k] > limit:
+            left_out.append(f"{one.told}: {peaks[k]:.1f} N, over acquire.force_limit_N ({limit:g} N)")
+        elif failed[k] == len(tissues):
+            left_out.append(f"{one.told}: not simulated to the end")
+        else:
+            kept.append(k)
+            if failed[k]:
+                where = f"at {failed[k]} of {len(tissues)} draws"
+                left_out.append(f"{one.told}: not simulated to the end {where}, and counts for nothing there")
+    options = [
+        Option((planned[k].site, planned[k].tool), planned[k].seconds + rest_s, np.array(infos[k]))
+        for k in kept
+    ]
+    return [planned[k] for k in kept], options, [float(peaks[k]) for k in kept]
+
+
+def _plans(
+    found: Sequence[Planned], options: Sequence[Option], budget: Budget, wanted: Wanted
+) -> dict[str, tuple[int, ...]]:
+    """The designed protocol, one slow ramp at every site, and the best without each ingredient."""
+    slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
+    plain = [one.speed_mm_s == slow and not one.hold_s and one.indenter == tool for one in found]
+    kinds: Mapping[str, Sequence[bool]] = {
+        DESIGNED: [True] * len(found),
+        "without holds": [not one.hold_s for one in found],
+        "at one speed": [one.speed_mm_s == slow for one in found],
+        "with one indenter": [one.indenter == tool for one in found],
+    }
+    plans: dict[str, tuple[int, ...]] = {}
+    for name, allowed in kinds.items():
+        chosen = [i for i, ok in enumerate(allowed) if ok]
+        fits = any(seconds_of(options, [i], budget) <= budget.seconds for i in chosen)
+        if fits and (name == DESIGNED or len(chosen) < len(found)):
+            best = plan([options[i] for i in chosen], budget, wanted)
+            plans[name] = tuple(chosen[i] for i in best)
+    if any(plain):
+        plans[PLAIN] = tuple(i for i, ok in enumerate(plain) if ok)
+    return plans
+
+
+def _row(
+    name: str,
+    chosen: Sequence[int],
+    options: Sequence[Option],
+    budget: Budget,
+    wanted: Wanted,
+    names: Sequence[str],
+    draws: int,
+) -> dict[str, Any]:
+    """A protocol, and what to expect of it: the middle of the draws and the worst."""
+    covariances = wanted.covariances(options, chosen, draws)
+    factors = factors_95(covariances)
+    middle, worst = np.median(factors, axis=0), factors.max(axis=0)
+    return {
+        "design": name,
+        "records": len(chosen),
+        "minutes": seconds_of(options, chosen, budget) / 60.0,
+        "factor_95": dict(zip(names, middle.tolist(), strict=True)),
+        "worst_95": dict(zip(names, worst.tolist(), strict=True)),
+        "determined": int(np.sum(middle[list(wanted.which)] <= DETERMINED)),
+        "cost": wanted.cost(covariances),
+    }
+
+
+def _record(one: Planned, option: Option, peak: float) -> dict[str, Any]:
+    return {
+        "site": one.site,
+        "indenter": one.tool,
+        "depth_mm": one.depth_mm,
+        "speed_mm_s": one.speed_mm_s,
+        "hold_s": one.hold_s,
+        "seconds": option.seconds,
+        "peak_force_N": peak,
+    }
+
+
+def _verdict(best: Mapping[str, Any], wanted: Sequence[str]) -> str:
+    """In words: how much of what is wanted the protocol determines."""
+    open_ones = [name for name in wanted if best["factor_95"][name] > DETERMINED]
+    head = (
+        f"{best['records']} records in {best['minutes']:.0f} min determine {best['determined']} of "
+        f"{len(wanted)} parameters within 25 %"
+    )
+    return f"{head}; not {', '.join(open_ones)}" if open_ones else head
+
+
+def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
+    keys = ("site", "indenter", "depth_mm", "speed_mm_s", "hold_s", "seconds", "peak_force_N")
+    for name in ("records", "candidates"):
+        write_table(folder / f"{name}.csv", keys, [[row[key] for key in keys] for row in content[name]])
+    names = list(content["protocols"][0]["factor_95"])
+    heads = ["protocol", "records", "minutes", "determined", *(f"factor_95_{name}" for name in names)]
+    rows = [
+        [row["design"], row["records"], row["minutes"], row["determined"], *row["factor_95"].values()]
+        for row in content["protocols"]
+    ]
+    write_table(folder / "protocols.csv", heads, rows)
+
+
+def _write_records(file: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """The tables ``[[records]]`` of a study that makes them."""
+    tables, number = tomlkit.aot(), dict.fromkeys((row["site"] for row in records), 0)
+    for row in records:
+        number[row["site"]] += 1
+        table = tomlkit.table()
+        name = f"{number[row['site']]}"
+        table.update({"site": row["site"], "name": name, "trace": f"records/{row['site']}-{name}.csv"})
+        if row["indenter"] != "indenter":
+            table["indenter"] = row["indenter"]
+        table.update({key: round(row[key], 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
+        tables.append(table)
+    document = tomlkit.document()
+    document["records"] = tables
+    file.write_text(tomlkit.dumps(document), encoding="utf-8")

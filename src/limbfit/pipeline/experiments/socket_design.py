@@ -1,0 +1,361 @@
+"""The experiment ``socket_design``: from pressures to a socket's shape, beside a uniformly reduced control.
+
+The limb under the target pressure has the shape of the socket.  Control and design are put on and loaded
+alike; where regions are named, the depths over them are moved to lower the largest pressures there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...anatomy.frame import Frame, limb_frame
+from ...anatomy.surfaces.surfaces import write_surface
+from ...anatomy.surfaces.triangles import Surface
+from ...donning import outer_surface, press, pressed_problem
+from ...donning.model import OUTER
+from ...donning.relief import Relief, Trial
+from ...errors import RunError, SurfaceError
+from ...fe import Step
+from ...fe.materials import Material
+from ...indentation import Parameters, fibre_field
+from ...mesh import Mesh, write_vtu
+from ...socket import Recipe, Socket, rectified
+from ...socket.offsets import offsets
+from ...socket.rays import profile
+from ...socket.rectify import reduced_to
+from ...socket.targets import Target, zone
+from ...socket.wall import thickness, wall
+from ..shared.context import Context
+from ..shared.kept import Kept, Made
+from ..shared.socket_shape import blaming, check_regions, recipe_of
+from ..shared.sources import code_digest
+from ..shared.store import digest, file_digest, write_json
+from ..shared.tabular import write_table
+from .socket_limb import SocketLimb
+
+Array = NDArray[np.float64]
+
+NAME, PLACE = "socket_design", "socket.design"
+CONTROL, DESIGN, OPTIMISED = "control", "design", "optimised"
+
+
+def run_socket_design(
+    context: Context,
+    folder: Path,
+    *,
+    parameters: Parameters,
+    parameters_from: str,
+    optimise: Sequence[str],
+    simulations: int,
+) -> dict[str, Any]:
+    """Design a socket for the target pressure of the study, and put it and its control on the limb.
+
+    Parameters
+    ----------
+    optimise : regions whose largest pressures are to be lowered.
+    simulations : at most so many for that, beside those of control and design.
+    """
+    with blaming(context.study, PLACE):
+        bench = _Bench.of(context, folder, parameters, simulations if optimise else 0)
+        covered = bench.limb.faces(bench.mesh, bench.plain)
+        stated = [one.region for one in context.study.socket.design.regions]
+        check_regions(context.study, stated, f"{PLACE}.regions", covered)
+        check_regions(context.study, optimise, "--optimise", covered)
+        target = bench.target()
+        recipe = bench.designed(target)
+        design = bench.made(DESIGN, recipe)
+        control_face, reduction = reduced_to(
+            design.face.volume_mm3, bench.limb.outer.skin, bench.frame, bench.recipe
+        )
+        control = _Made(CONTROL, control_face, facts={"reduction_percent": reduction})
+        done = {one.name: bench.put_on(one) for one in (control, design)}
+        found: dict[str, Any] = {}
+        if optimise:
+            best, found = _optimised(bench, recipe, done, optimise, simulations)
+            done[OPTIMISED] = best
+    last = list(done.values())[-1]
+    walled = bench.wall(last.face)
+    write_surface(folder / "socket.stl", walled)
+    content = {
+        "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa}
+        | {"regions": dict(target.regions)},
+        "designs": [bench.told(one) for one in done.values()],
+        "optimisation": found or None,
+        "wall": _wall_facts(bench, walled, last),
+        "parameters": parameters,
+        "parameters_from": parameters_from,
+        "liner": bench.limb.liner,
+        "balance_percent": max(one.facts["simulation"]["balance_percent"] for one in done.values()),
+        "mesh": bench.mesh_facts,
+    }
+    write_json(folder / f"{NAME}.json", content)
+    for one in done.values():
+        bench.write(folder, one)
+    _write_tables(folder, content)
+    return {}
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """A design: its face, and what is known of it: depths, its simulation, fields at the mesh's nodes."""
+
+    name: str
+    face: Socket
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    fields: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class _Bench:
+    """The limb on which designs are tried, and what is kept of them."""
+
+    context: Context
+    limb: SocketLimb
+    mesh: Mesh
+    mesh_facts: dict[str, Any]
+    laws: Mapping[str, Material]
+    recipe: Recipe
+    plain: Socket
+    kept: Kept
+    given: str
+    total: int
+    count: int = 0
+
+    @classmethod
+    def of(cls, context: Context, folder: Path, parameters: Parameters, more: int) -> _Bench:
+        study, limb = context.study, SocketLimb.of(context, NAME)
+        recipe = recipe_of(study, limb.anatomy)
+        frame = limb_frame(limb.anatomy.cut_point, limb.anatomy.cut_normal)
+        plain = rectified(limb.outer.skin, frame, replace(recipe, reduction_percent=0.0))
+        mesh, facts = limb.mesh(context, NAME, folder, plain)
+        table = study.socket.model_dump(mode="json", exclude={"design"})
+        given = digest(
+            *(table, study.material.model_dump(mode="json"), parameters),
+            *(file_digest(folder / "limb.vtu"), code_digest(SocketLimb.of), code_digest(press)),
+        )
+        kept = Kept(folder, also=[context.store[NAME]])
+        laws = limb.materials(parameters)
+        return cls(context, limb, mesh, facts, laws, recipe, plain, kept, given, 3 + more)
+
+    @property
+    def frame(self) -> Frame:
+        return limb_frame(self.limb.anatomy.cut_point, self.limb.anatomy.cut_normal)
+
+    def tell(self, share: float, words: str) -> None:
+        self.context.tell(NAME, self.count + share, self.total, words)
+
+    def target(self) -> Target:
+        table = self.limb.study.socket.design
+        stated = {one.region: one.pressure_kPa for one in table.regions if one.pressure_kPa is not None}
+        return Target(table.pressure, table.pressure_kPa, stated)
+
+    def designed(self, target: Target) -> Recipe:
+        """How the limb's shape becomes that under the target pressure."""
+        table, faces = self.limb.study.socket, self.mesh.face_sets[OUTER]
+        middles = self.mesh.points[faces[:, :3]].mean(axis=1)
+        pressure = target.at(middles, self.limb.anatomy, self.limb.regions, self.plain)
+        problem = pressed_problem(self.mesh, self.laws, pressure, table.donning_s, table.hold_s)
+        problem = replace(problem, fibres=fibre_field(self.limb.fibres, self.mesh))
+        end = problem.history.times[-1]
+
+        def on_step(step: Step) -> None:
+            self.tell(step.time / end, f"target pressure: {step.time:.2f} of {end:g} s")
+
+        def make() -> Made:
+            result = press(problem, on_step)
+            if not result.completed:
+                raise RunError(
+                    f"the limb could not be put under the target pressure: {result.reason}; lower "
+                    f"{PLACE}.pressure_kPa, or choose another socket.edge_mm"
+                )
+            return {"statistics": result.statistics}, {"displacement": result.states[-1].u}
+
+        _, fields = self.kept.get(digest("pressed", self.given, pressure.tolist()), make)
+        self.count += 1
+        limb = profile(self.limb.outer.skin, self.frame)
+        before, after = outer_surface(self.mesh), outer_surface(self.mesh, fields["displacement"])
+        return replace(self.recipe, offsets=offsets(limb, before, after, self.frame))
+
+    def made(self, name: str, recipe: Recipe, depths: Mapping[str, float] | None = None) -> _Made:
+        """The face of a recipe with depths (mm) over regions; it can be given its wall."""
+        zones = [
+            zone(region, self.limb.anatomy, self.limb.regions, depth)
+            for region, depth in (depths or {}).items()
+        ]
+        face = rectified(self.limb.outer.skin, self.frame, replace(recipe, areas=zones))
+        self.wall(face)
+        return _Made(name, face, {"depths_mm": dict(depths or {})})
+
+    def wall(self, face: Socket) -> Surface:
+        table = self.limb.study.socket.design
+        return wall(
+            face,
+            self.limb.anatomy.cut_normal,
+            table.wall_mm,
+            adapter_diameter_mm=table.adapter_diameter_mm,
+            adapter_mm=table.adapter_mm,
+        )
+
+    def put_on(self, one: _Made) -> _Made:
+        """With what happens when it is put on and loaded."""
+        face = one.face
+
+        def told(time: float, end: float, words: str) -> None:
+            self.tell(time / end, f"{one.name}: {words}")
+
+        def make() -> Made:
+            found = self.limb.don(self.mesh, self.laws, face, told)
+            fields = {
+                f"{name}.{part}": getattr(held, part)
+                for name, held in found.held.items()
+                for part in ("pressure", "shear", "displacement")
+            }
+            return self.limb.facts(found, face), fields
+
+        key = digest(self.given, face.points.tolist(), face.clear.tolist())
+        facts, fields = self.kept.get(key, make)
+        self.count += 1
+        self.tell(0.0, f"{one.name}: {_peak(facts):.0f} kPa at most")
+        return replace(one, facts={**one.facts, "simulation": facts}, fields=fields)
+
+    def told(self, one: _Made) -> dict[str, Any]:
+        """What is stored of a design."""
+        offset = -one.face.offset(self.limb.outer.skin)
+        shape = {"volume_cm3": one.face.volume_mm3 / 1000.0, "offset_mm": [offset.min(), offset.max()]}
+        return {"name": one.name, **shape, "peaks_kPa": _peaks(one.facts["simulation"]), **one.facts}
+
+    def write(self, folder: Path, one: _Made) -> None:
+        """The face with its offset from the unloaded limb, and the fields after donning and each load."""
+        face = one.face.surface.to_pyvista()
+        face.point_data["offset_mm"] = -one.face.offset(self.limb.outer.skin)
+        face.save(folder / f"{one.name}-face.vtp")
+        names = dict.fromkeys(key.rpartition(".")[0] for key in one.fields)
+        for i, name in enumerate(names):
+            data = {"pressure_kPa": one.fields[f"{name}.pressure"], "shear_kPa": one.fields[f"{name}.shear"]}
+            data["displacement_mm"] = one.fields[f"{name}.displacement"]
+            write_vtu(self.mesh, folder / f"{one.name}-{i}.vtu", point_data=data)
+
+
+def _optimised(
+    bench: _Bench, recipe: Recipe, done: Mapping[str, _Made], optimise: Sequence[str], count: int
+) -> tuple[_Made, dict[str, Any]]:
+    """The best of the designs that depths over the named regions give, and how it was found."""
+    control, start = (_peaks(done[name].facts["simulation"]) for name in (CONTROL, DESIGN))
+    regions = [name for name in start if name in control]
+    limits = _limits(bench, control, regions)
+    order = [regions.index(name) for name in optimise]
+
+    def vector(peaks: Mapping[str, float]) -> Array:
+        return np.array([peaks.get(name, 0.0) for name in regions])
+
+    search = Relief(order, vector(control), vector(limits), vector(start))
+    best, rows = done[DESIGN], [_row(search.trials[0], optimise, start)]
+    for number in range(1, count + 1):
+        depths = search.propose()
+        if depths is None:
+            break
+        made = _tried(bench, recipe, dict(zip(optimise, map(float, depths), strict=True)), number)
+        peaks = _peaks(made.facts["simulation"]) if isinstance(made, _Made) else None
+        trial = search.tell(depths, None if peaks is None else vector(peaks))
+        rows.append(_row(trial, optimise, peaks, "" if isinstance(made, _Made) else made))
+        if isinstance(made, _Made) and trial is search.best:
+            best = made
+    peaks = _peaks(best.facts["simulation"])
+    gains = [
+        {
+            "region": name,
+            "control_kPa": control[name],
+            "design_kPa": start[name],
+            "optimised_kPa": peaks[name],
+            "change_percent": 100.0 * (peaks[name] / control[name] - 1.0),
+        }
+        for name in optimise
+    ]
+    beyond = [name for name in regions if name not in optimise and peaks[name] > limits[name]]
+    found = {"regions": list(optimise), "gains": gains, "limits_kPa": limits, "beyond_limits": beyond}
+    return replace(best, name=OPTIMISED), found | {"simulations": count, "trials": rows}
+
+
+def _tried(bench: _Bench, recipe: Recipe, depths: Mapping[str, float], number: int) -> _Made | str:
+    """A design put on the limb; words where it cannot be."""
+    try:
+        return bench.put_on(bench.made(f"{OPTIMISED}, {number}", recipe, depths))
+    except (SurfaceError, RunError) as error:
+        bench.count += 1
+        bench.tell(0.0, f"{OPTIMISED}, {number}: {error}")
+        return str(error)
+
+
+def _limits(bench: _Bench, control: Mapping[str, float], regions: Sequence[str]) -> dict[str, float]:
+    """As stated; else no region is to bear more than the control's most loaded one."""
+    stated = {one.region: one.limit_kPa for one in bench.limb.study.socket.design.regions if one.limit_kPa}
+    return {name: stated.get(name, max(control.values())) for name in regions}
+
+
+def _row(
+    trial: Trial, optimise: Sequence[str], peaks: Mapping[str, float] | None, reason: str = ""
+) -> dict[str, Any]:
+    return {
+        "depths_mm": dict(zip(optimise, trial.depths, strict=True)),
+        "peaks_kPa": None if peaks is None else {name: peaks[name] for name in optimise},
+        "merit": trial.merit if np.isfinite(trial.merit) else None,
+        "reason": reason,
+    }
+
+
+def _peaks(simulation: Mapping[str, Any]) -> dict[str, float]:
+    """The largest pressure of each region over all loads, kPa; after donning where there are none."""
+    peaks: dict[str, float] = {}
+    for held in simulation["loads"] or [simulation["donning"]]:
+        for row in held["regions"]:
+            peaks[row["region"]] = max(row["peak_kPa"], peaks.get(row["region"], 0.0))
+    return peaks
+
+
+def _peak(simulation: Mapping[str, Any]) -> float:
+    return float(max(held["peak_kPa"] for held in simulation["loads"] or [simulation["donning"]]))
+
+
+def _wall_facts(bench: _Bench, body: Surface, one: _Made) -> dict[str, Any]:
+    measured = thickness(body, one.face)
+    return {
+        "of": one.name,
+        "stated_mm": bench.limb.study.socket.design.wall_mm,
+        "least_mm": measured.min(),
+        "median_mm": np.median(measured),
+        "volume_cm3": body.volume / 1000.0,
+    }
+
+
+def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
+    columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
+    rows = [
+        [design["name"], name, region["region"], *(region[key] for key in columns)]
+        for design in content["designs"]
+        for name, held in (
+            ("donning", design["simulation"]["donning"]),
+            *((one["name"], one) for one in design["simulation"]["loads"]),
+        )
+        for region in held["regions"]
+    ]
+    write_table(folder / "regions.csv", ["design", "load", "region", *columns], rows)
+    found = content["optimisation"]
+    if found is None:
+        return
+    names = found["regions"]
+    heads = [*(f"{name}_{unit}" for unit in ("depth_mm", "peak_kPa") for name in names), "reason"]
+    lines = [
+        [
+            *(trial["depths_mm"][name] for name in names),
+            *((trial["peaks_kPa"] or {}).get(name) for name in names),
+            trial["reason"],
+        ]
+        for trial in found["trials"]
+    ]
+    write_table(folder / "trials.csv", heads, lines)

@@ -1,0 +1,252 @@
+"""The limb of a study as sockets are put on it: meshed whole under its liner, with loads and regions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from ...anatomy.meshing.layers import LayerSpec
+from ...anatomy.meshing.liner import under_liner
+from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...donning import SETTLING, Donned, Fit, Held, Load, Patch, Row, don, socket_problem
+from ...donning.model import OUTER
+from ...errors import RunError
+from ...fe.materials import Material
+from ...indentation import Parameters, fibre_field, materials
+from ...mesh import Mesh, read_vtu
+from ...socket import Socket
+from ...socket.landmarks import directions, knee_centre
+from ...socket.regions import Region
+from ...study import Study, Vector
+from ..shared.context import Context
+from ..shared.simulations import fibres_of
+from ..shared.socket_shape import load_of, regions_of
+from ..shared.store import read_json
+from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Covariance = Sequence[Sequence[float]] | None
+
+LINER = "liner"
+BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
+FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those below, and how elements grow
+Z95 = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class SocketLimb:
+    """What sockets are put on.
+
+    Attributes
+    ----------
+    anatomy : skin and bones; ``outer`` has what the socket touches for its skin.
+    depth : of the fat below that, where it is mapped.
+    regions : of the skin, by name.
+    fibres : their direction in each tissue that has some.
+    """
+
+    study: Study
+    anatomy: Anatomy
+    outer: Anatomy
+    depth: Array | None
+    regions: Mapping[str, Region]
+    fibres: tuple[tuple[str, Vector], ...]
+
+    @classmethod
+    def of(cls, context: Context, name: str) -> SocketLimb:
+        """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
+        study, surfaces = context.study, context.store["surfaces"]
+        anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
+        outer, depth = anatomy, stored_depth(surfaces, anatomy, mesh_settings(study))
+        if thickness:
+            context.tell(name, 0, 0, f"a liner of {thickness:g} mm around the limb")
+            outer, depth = under_liner(anatomy, thickness, depth)
+        return cls(study, anatomy, outer, depth, regions_of(study, anatomy), fibres_of(context))
+
+    def materials(self, parameters: Parameters) -> dict[str, Material]:
+        """Of the tissues and the liner."""
+        kappa, liner = self.study.material.kappa_ratio, self.study.socket.liner
+        laws = materials(parameters, kappa, self.study.material.law, dict(self.fibres))
+        return laws | materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
+
+    def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, dict[str, Any]]:
+        """The whole limb's mesh and its facts; that of an interrupted run is kept."""
+        file = folder / "limb.vtu"
+        if not is_meshed(file):
+            context.tell(name, 0, 0, "a mesh of the whole limb")
+            fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
+            mesh, report = mesh_limb(self.outer, self._settings, max(fine, 0.0), self.depth)
+            keep_mesh(mesh, report, self._settings, file)
+        return read_vtu(file), read_json(file.with_suffix(".json"))
+
+    @property
+    def _settings(self) -> MeshSettings:
+        table, settings = self.study.socket, mesh_settings(self.study)
+        layers = settings.layers
+        if table.liner.thickness_mm:
+            layers = (LayerSpec(LINER, table.liner.thickness_mm), *layers)
+        return replace(
+            settings,
+            element="tet10",
+            layers=layers,
+            edge_near_mm=table.edge_mm,
+            edge_far_mm=max(FAR * table.edge_mm, settings.edge_far_mm),
+            growth=GROWTH,
+            flatness=FLATNESS,
+        )
+
+    def fit(self, socket: Socket) -> Fit:
+        """How a socket comes on this limb, and its loads."""
+        table, known = self.study.socket, directions(self.anatomy, self.study.socket.side)
+        knee = knee_centre(self.anatomy)
+        loads = []
+        for load in table.loads:
+            force, moment, point = load_of(self.study, load, self.anatomy)
+            loads.append(Load(load.name, force, moment, point, load.duration_s, load.hold_s))
+        depth = float(np.ptp(socket.points @ known.proximal))
+        return Fit(
+            pivot=self.anatomy.cut_point if knee is None else knee,
+            proximal=known.proximal,
+            anterior=known.anterior,
+            friction=table.friction,
+            donning_s=table.donning_s,
+            hold_s=table.hold_s,
+            travel_mm=None if table.donning == "growth" else table.travel_mm or depth,
+            loads=tuple(loads),
+        )
+
+    def faces(self, mesh: Mesh, socket: Socket) -> dict[str, Mask]:
+        """Which faces (f,) under a socket belong to each region: those whose nearest skin does."""
+        skin, middles = self.anatomy.skin, mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
+        below = igl.point_mesh_squared_distance(middles, skin.points, skin.faces)[1]
+        nearest = igl.point_mesh_squared_distance(middles, socket.points, socket.faces)[1]
+        covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
+        masks = {name: region.faces[below] & covered for name, region in self.regions.items()}
+        return {name: mask for name, mask in masks.items() if mask.any()}
+
+    def don(
+        self,
+        mesh: Mesh,
+        laws: Mapping[str, Material],
+        socket: Socket,
+        told: Callable[[float, float, str], None],
+        sensitivities: bool = False,
+    ) -> Donned:
+        """Put a socket on and load it.
+
+        Parameters
+        ----------
+        told : is given the time, the end of all, both s, and words.
+
+        Raises
+        ------
+        RunError
+            Where the simulation does not come to its end.
+        """
+        fit = self.fit(socket)
+        end = fit.ends[-1][2]
+
+        def on_row(row: Row) -> None:
+            force = float(np.linalg.norm(row.force))
+            words = f"{row.time:.2f} of {end:g} s: {force:.0f} N, {row.whole.peak_kPa:.0f} kPa at most"
+            told(row.time, end, words)
+
+        problem = replace(socket_problem(mesh, laws, socket, fit), fibres=fibre_field(self.fibres, mesh))
+        found = don(problem, fit, self.faces(mesh, socket), sensitivities=sensitivities, on_row=on_row)
+        if not found.result.completed:
+            raise RunError(
+                f"the socket could not be simulated to the end: {found.result.reason}; lower "
+                "socket.reduction_percent or the areas' depths, or choose another socket.edge_mm"
+            )
+        return found
+
+    def facts(self, found: Donned, socket: Socket, covariance_log: Covariance = None) -> dict[str, Any]:
+        """What is stored of a simulation, with intervals where a covariance (p, p) is given."""
+        fit = self.fit(socket)
+        names = [f"{region}.{name}" for region, name in found.result.parameter_names]
+        deviation = None
+        if covariance_log is not None:
+            deviation = _deviation(self.study, names, np.array(covariance_log))
+        held = {name: _held(one, deviation) for name, one in found.held.items()}
+        donned, base = held.pop("donning"), found.held["donning"].row
+        loads = []
+        for load in fit.loads:
+            here = found.held[load.name].row
+            settled = {"settling_mm": float(here.move[2] - base.move[2])}
+            stated = {"name": load.name, "force_N": load.force, "moment_Nmm": load.moment}
+            loads.append({**stated, **settled, **held[load.name]})
+        statistics = found.result.statistics
+        return {
+            "seconds": statistics["seconds"]["total"],
+            "penetration_mm": max((row.penetration_mm for row in found.rows), default=0.0),
+            "balance_percent": 100.0 * max((row.imbalance for row in found.rows), default=0.0),
+            "friction": fit.friction,
+            "donning": donned,
+            "loads": loads,
+            "steps": [_step(row, fit) for row in found.rows],
+            # How far it sinks in is told by itself: the wall's stiffness is stated, and no study's.
+            "warnings": [doubt.text for doubt in found.result.doubts if doubt.kind != "sunk"],
+            "statistics": {
+                key: statistics[key] for key in ("steps", "cuts", "newton_iterations", "unknowns")
+            },
+        }
+
+    @property
+    def liner(self) -> dict[str, Any]:
+        """What is stored of the liner."""
+        table = self.study.socket.liner
+        return {"thickness_mm": table.thickness_mm, "material": table.material} | table.parameters
+
+
+def _deviation(study: Study, names: Sequence[str], covariance: Array) -> Callable[[Array], float]:
+    """Standard deviation of a value from its slopes (p,) by the parameters ``names`` of the solver."""
+    own = [f"{tissue}.{parameter.name}" for tissue in study.tissues for parameter in study.law.parameters]
+    known = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
+    order = [names.index(name) for name in own if name in names]
+    among = covariance[np.ix_(known, known)]
+    return lambda slopes: float(np.sqrt(slopes[order] @ among @ slopes[order]))
+
+
+def _held(one: Held, deviation: Callable[[Array], float] | None) -> dict[str, Any]:
+    def interval(name: str, value: float) -> list[float] | None:
+        if deviation is None:
+            return None
+        sd = deviation(one.slopes[name])
+        return [max(value - Z95 * sd, 0.0), value + Z95 * sd]
+
+    def told(name: str, patch: Patch) -> dict[str, Any]:
+        return {"region": name, **asdict(patch), "interval_kPa": interval(name, patch.mean_kPa)}
+
+    row = one.row
+    spread = None if deviation is None else Z95 * deviation(one.slopes[SETTLING])
+    return {
+        "time_s": row.time,
+        "contact_area_mm2": row.contact_area_mm2,
+        "peak_kPa": row.whole.peak_kPa,
+        "mean_kPa": row.whole.mean_kPa,
+        "shear_peak_kPa": row.whole.shear_peak_kPa,
+        "settling_interval_mm": None if spread is None else [-spread, spread],
+        "regions": [told(name, patch) for name, patch in row.regions.items()],
+    }
+
+
+def _step(row: Row, fit: Fit) -> dict[str, Any]:
+    return {
+        "time_s": row.time,
+        "force_N": fit.frame.T @ row.force,
+        "moment_Nmm": fit.frame.T @ row.moment,
+        "move_mm": row.move,
+        "turn_deg": row.turn,
+        "contact_area_mm2": row.contact_area_mm2,
+        "peak_kPa": row.whole.peak_kPa,
+        "mean_kPa": row.whole.mean_kPa,
+        "imbalance_percent": 100.0 * row.imbalance,
+    }

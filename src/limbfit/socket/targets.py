@@ -1,0 +1,126 @@
+"""The pressure that a socket is meant to have on the limb: presets, tissue depth, and values of regions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ..anatomy.surfaces.surfaces import Anatomy
+from ..errors import SurfaceError
+from .areas import Zone
+from .regions import Region
+from .shape import Socket
+
+Array = NDArray[np.float64]
+
+PROMINENCES = ("tibial crest", "fibular head", "distal tibia", "distal fibula")
+REACH_MM = 18.0  # beyond a region: over what its pressure, or depth, goes over into what is beside it
+BRIM_MM = 20.0  # below the brim: over what the pressure comes on
+DEEP_MM = 20.0  # of tissue over bone: deeper tissue bears as much
+
+TISSUE_DEPTH = "tissue depth"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Shares of the stated pressure: of the limb, and of regions that have another one."""
+
+    limb: float
+    regions: Mapping[str, float] = field(default_factory=dict)
+
+
+# Round figures for what concepts of sockets intend, to begin with; none is measured.
+PRESETS: Mapping[str, Preset] = {
+    "hydrostatic": Preset(1.0),
+    "total surface bearing": Preset(1.0, dict.fromkeys(PROMINENCES, 0.5)),
+    "patellar tendon bearing": Preset(
+        0.6,
+        {"patellar tendon": 2.0, "medial proximal": 1.5, "posterior proximal": 1.5}
+        | dict.fromkeys(PROMINENCES, 0.25),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A pressure field over the limb.
+
+    Attributes
+    ----------
+    kind : ``tissue depth`` or a name of `PRESETS`.
+    pressure_kPa : what shares are meant of.
+    regions : pressures of regions, kPa, over those of the kind.
+    """
+
+    kind: str
+    pressure_kPa: float
+    regions: Mapping[str, float] = field(default_factory=dict)
+
+    def at(self, points: Array, anatomy: Anatomy, regions: Mapping[str, Region], socket: Socket) -> Array:
+        """Pressure (n,) kPa at points (n, 3) of the limb's outer surface, LPS mm; 0 beyond the brim.
+
+        Parameters
+        ----------
+        regions : of the limb; those of a preset that it does not have count as the rest.
+        socket : any face around the limb, for where the brim runs.
+
+        Raises
+        ------
+        SurfaceError
+            For a region that the limb does not have, and tissue depth of a limb without bones.
+        """
+        skin = anatomy.skin
+        below = igl.point_mesh_squared_distance(points, skin.points, skin.faces)[2]  # a liner
+        if self.kind == TISSUE_DEPTH:
+            found = self.pressure_kPa * _deep(below, anatomy)
+            values: dict[str, float] = {}
+        else:
+            preset = PRESETS[self.kind]
+            found = np.full(len(points), self.pressure_kPa * preset.limb)
+            values = {name: share * self.pressure_kPa for name, share in preset.regions.items()}
+            values = {name: value for name, value in values.items() if name in regions}
+        rest = {name: value for name, value in values.items() if name not in self.regions}
+        for name, value in (*rest.items(), *self.regions.items()):  # where they overlap, what is stated wins
+            share = zone(name, anatomy, regions, 0.0).share(below)
+            found = (1.0 - share) * found + share * value
+        return found * _under(points, socket)
+
+
+def zone(name: str, anatomy: Anatomy, regions: Mapping[str, Region], depth_mm: float) -> Zone:
+    """A region of the limb as what is pressed into a face by a depth, or relieved.
+
+    Raises
+    ------
+    SurfaceError
+        Where the limb has no such region.
+    """
+    if name not in regions:
+        raise SurfaceError(f"no region is named {name!r}", remedy="the limb has " + ", ".join(regions))
+    points = anatomy.skin.triangles[regions[name].faces].mean(axis=1)
+    return Zone(name, points, REACH_MM, depth_mm)
+
+
+def _deep(points: Array, anatomy: Anatomy) -> Array:
+    """Depth (n,) of points of the skin over the nearest bone, as a share of ``DEEP_MM``, at most 1."""
+    if not anatomy.bones:
+        raise SurfaceError(
+            "the depth of tissue is not known: the limb has no bones",
+            remedy=f"choose another socket.design.pressure: {', '.join(PRESETS)}",
+        )
+    squared = [
+        igl.point_mesh_squared_distance(points, bone.points, bone.faces)[0] for bone in anatomy.bones.values()
+    ]
+    return np.asarray(np.clip(np.sqrt(np.min(squared, axis=0)) / DEEP_MM, 0.0, 1.0))
+
+
+def _under(points: Array, socket: Socket) -> Array:
+    """Share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
+    nearest = igl.point_mesh_squared_distance(points, socket.points, socket.faces)[1]
+    covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
+    t = np.clip(KDTree(socket.points[socket.brim]).query(points)[0] / BRIM_MM, 0.0, 1.0)
+    return np.where(covered, t**2 * (3.0 - 2.0 * t), 0.0)

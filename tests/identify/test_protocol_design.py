@@ -1,0 +1,77 @@
+"""The records of a session: within its time, against brute force, and over several tissues."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from limbfit.errors import CalibrationError
+from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan, seconds_of
+
+P = 3
+PRIOR = 0.1 * np.eye(P)
+
+
+def options(number: int, draws: int = 2, seed: int = 0) -> list[Option]:
+    """Records at two places, each of its own length."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for i in range(number):
+        J = rng.standard_normal((draws, 4, P))
+        information = np.transpose(J, (0, 2, 1)) @ J
+        found.append(Option((f"s{i % 2}", "tip"), float(rng.integers(20, 90)), information))
+    return found
+
+
+@pytest.mark.parametrize("criterion", ["D", "A"])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_is_nearly_that_of_brute_force_and_keeps_its_time(criterion, seed):
+    some, budget = options(9, seed=seed), Budget(260.0, 40.0)
+    wanted = Wanted(PRIOR, (0, 1, 2), criterion)
+
+    def cost(chosen):
+        return wanted.cost(wanted.covariances(some, chosen, 2))
+
+    every = [c for k in range(1, 10) for c in combinations(range(9), k)]
+    fits = [c for c in every if seconds_of(some, c, budget) <= budget.seconds]
+    best, found = min(map(cost, fits)), plan(some, budget, wanted)
+    assert seconds_of(some, found, budget) <= budget.seconds
+    assert cost(found) <= best + (0.05 if criterion == "D" else 0.02 * best)
+
+
+def test_a_place_is_prepared_once():
+    two = [Option(("a", "tip"), 30.0, np.eye(P)[None]) for _ in range(2)]
+    apart = [two[0], Option(("a", "ball"), 30.0, np.eye(P)[None])]
+    budget = Budget(1000.0, 60.0)
+    assert seconds_of(two, [0, 1], budget) == 120.0
+    assert seconds_of(apart, [0, 1], budget) == 180.0
+
+
+def test_what_is_wanted_decides():
+    """One record tells of the first parameter, one of the second; time is for one."""
+    tells = [Option(("a", "tip"), 50.0, 100.0 * np.diag(np.eye(P)[k])[None]) for k in (0, 1)]
+    budget = Budget(60.0, 0.0)
+    assert plan(tells, budget, Wanted(PRIOR, (0,))) == (0,)
+    assert plan(tells, budget, Wanted(PRIOR, (1,))) == (1,)
+
+
+def test_a_record_must_tell_at_every_tissue():
+    """Much at one tissue and nothing at the other is less, on average, than some at both."""
+    uneven = np.stack([1e4 * np.eye(P), np.zeros((P, P))])
+    even = np.stack([1e3 * np.eye(P)] * 2)
+    both = [Option(("a", "tip"), 50.0, uneven), Option(("a", "tip"), 50.0, even)]
+    assert plan(both, Budget(60.0, 0.0), Wanted(PRIOR, (0, 1, 2))) == (1,)
+    assert plan(both, Budget(60.0, 0.0), Wanted(PRIOR, (0, 1, 2), "A")) == (1,)
+
+
+def test_the_expected_factor_is_of_the_covariance():
+    covariance = np.diag([0.01, 0.04, 1e9])[None]
+    assert factors_95(covariance)[0, :2] == pytest.approx(np.exp([0.196, 0.392]))
+    assert np.isfinite(factors_95(covariance)).all()
+
+
+def test_too_little_time_is_told():
+    with pytest.raises(CalibrationError, match="no record fits"):
+        plan(options(4), Budget(10.0, 40.0), Wanted(PRIOR, (0,)))

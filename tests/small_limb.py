@@ -1,0 +1,40 @@
+"""A small limb with one bone as a study of surfaces, for tests of sockets."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "anatomy"))
+from bodies import limb
+
+from limbfit.anatomy.surfaces.surfaces import write_surface
+
+LIMB = """
+[study]
+name = "small limb"
+[surfaces]
+skin = "skin.stl"
+bones = { tibia = "tibia.stl" }
+[geometry]
+proximal_cut = { point = [12.0, -80.0, 300.0], normal = [0.0, 0.0, 1.0] }
+[[sites]]
+name = "1"
+position = [46.0, -80.0, 290.0]
+depth_mm = 3.0
+[socket]
+trim_mm = 26.0
+edge_mm = 14.0
+distal_clearance_mm = 3.0
+"""
+
+__all__ = ["limb", "small_limb"]
+
+
+def small_limb(folder: Path, text: str) -> Path:
+    """Write the limb into a folder, and a study whose table ``[socket]`` goes on with ``text``."""
+    anatomy = limb()
+    write_surface(folder / "skin.stl", anatomy.skin)
+    write_surface(folder / "tibia.stl", anatomy.bones["tibia"])
+    (folder / "study.toml").write_text(LIMB + text)
+    return folder
