@@ -65,19 +65,23 @@ class ModelView {
     const turn = ++this.reading;
     try {
       const scene = await this.context.api.get("model/scene");
-      if (turn !== this.reading) return;
-      await this.take(scene);
+      if (turn !== this.reading) return; // a newer one was asked for or taken
+      await this.take(scene, JSON.stringify(scene) === JSON.stringify(this.scene));
     } catch (error) {
       this.context.warn(error.message);
     }
   }
 
-  /** Show a scene; surfaces and meshes are read where they are others than those that are shown. */
-  async take(scene) {
+  /**
+   * Show a scene; surfaces and meshes are read where they are others than those that are shown. An unchanged scene
+   * leaves the form of the sites alone: who is typing or clicking there would lose the click.
+   */
+  async take(scene, unchanged = false) {
+    ++this.reading; // an older answer that is still under way is void
     const first = this.scene === null || !Object.keys(this.scene.surfaces).length;
     this.scene = scene;
     if (!scene.sites.some((site) => site.name === this.chosen)) this.chosen = scene.sites[0]?.name ?? null;
-    this.editor.show();
+    if (!unchanged) this.editor.show();
     this.marks();
     if (this.drawing) {
       await this.readSurfaces();
