@@ -17,7 +17,7 @@ from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
 from ..pipeline.stages.inputs import plain_image
 from ..study import Study
-from .corrected import LABELS, labels_of, save_labels, shown_labels
+from .editing import LABELS, labels_of, save_labels, shown_labels
 from .processes import running
 from .study_routes import Folder
 

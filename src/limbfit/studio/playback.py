@@ -126,7 +126,7 @@ def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
     """The mesh that the fields of a site stand on: arrays of `Volume`; facts: names of regions, fields."""
     file = _file(folder, source, site, 0)
     mesh = read_vtu(file)
-    arrays = _arrays(file)
+    arrays = arrays_of(file)
     fields = [
         {"name": name, "title": field.title, "unit": field.unit}
         for name, field in FIELDS.items()
@@ -148,7 +148,7 @@ def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name:
     """
     field = FIELDS.get(name)
     file = _file(folder, source, site, moment)
-    arrays = _arrays(file)
+    arrays = arrays_of(file)
     if field is None or field.array not in arrays:
         raise InputError("no such field is stored", remedy="fields are " + ", ".join(FIELDS))
     nodes = np.unique(arrays["cells"][:, :4])
@@ -164,7 +164,7 @@ def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name:
     )
 
 
-def _arrays(file: Path) -> dict[str, NDArray[Any]]:
+def arrays_of(file: Path) -> dict[str, NDArray[Any]]:
     """The point and cell arrays of a VTU file, and its ``cells`` (m, k)."""
     grid = read_grid(file)
     found = {}

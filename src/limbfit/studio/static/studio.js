@@ -20,6 +20,7 @@ const VIEWS = [
   ["traces", "Traces"],
   ["identification", "Identification"],
   ["results", "Results"],
+  ["socket", "Socket"],
 ];
 const TOPICS = ["study", "stages", "labels", "log", "acquired"];
 const EVERY_MS = 1000;

@@ -278,6 +278,17 @@ export class Viewer {
     return hit ? { point: hit.point.toArray(), normal: hit.face.normal.toArray() } : null;
   }
 
+  /** Where a ray through a pointer first meets the mesh, uncut and undeformed: [x, y, z], or null. */
+  meshAt(event) {
+    if (!this.body) return null;
+    const box = this.canvas.getBoundingClientRect();
+    const at = new THREE.Vector2(
+      (2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+    const ray = new THREE.Raycaster();
+    ray.setFromCamera(at, this.view.camera);
+    return ray.intersectObject(this.body)[0]?.point.toArray() ?? null;
+  }
+
   /** Where on the page a point of space is drawn: [x, y] in pixels of the window. */
   pixelOf(point) {
     const box = this.canvas.getBoundingClientRect();

@@ -1,0 +1,61 @@
+"""The view Socket in a real browser, over stored runs made from formulas."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from stored_fields import block
+
+from browsing import serious_findings, until
+from limbfit.mesh import write_vtu
+
+
+def held(name: str, share: float) -> dict:
+    row = {"region": "left middle", "mean_kPa": share, "peak_kPa": 10 * share, "shear_kPa": 0.5}
+    return {"name": name, "settling_mm": 7.5, "regions": [row | {"interval_kPa": [0.5 * share, 2 * share]}]}
+
+
+def write_run(results, folder: str, begin: str, factor: float) -> dict:
+    """Pressure grows from right to left, 1 kPa per mm from 1 kPa on; ``factor`` times that under load."""
+    mesh = block()
+    (results / folder).mkdir(parents=True, exist_ok=True)
+    for i, share in enumerate((1.0, factor)):
+        pressure = share * (1.0 + mesh.points[:, 0] - mesh.points[:, 0].min())
+        data = {"pressure_kPa": pressure, "shear_kPa": 0.1 * pressure}
+        write_vtu(mesh, results / folder / f"{begin}-{i}.vtu", point_data=data)
+    return {"donning": held("donning", 1.0), "loads": [held("stance", factor)]}
+
+
+@pytest.mark.slow
+def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, open_page):
+    page = open_page(serve(study) + "#/socket")
+    page.get_by_text("No socket run is stored: limbfit socket STUDY makes one").wait_for()
+    results = study / "results"
+    content = write_run(results, "socket", "held", 5.0)
+    (results / "socket" / "socket.json").write_text(json.dumps(content))
+    design = {"name": "design", "simulation": write_run(results, "socket_design", "design", 2.0)}
+    (results / "socket_design" / "socket_design.json").write_text(json.dumps({"designs": [design]}))
+    for folder in ("socket", "socket_design"):
+        (results / folder / "stage.json").write_text("{}")
+    words, slider = page.locator(".view.socket .player-words"), page.get_by_label("step", exact=True)
+    until(lambda: words.inner_text().startswith("donning; contact pressure at most 10.0 kPa"))
+    bar = page.locator(".view.socket .lf-bar")
+    scale, canvas = bar.inner_text(), page.locator(".view.socket .lf-canvas")
+    donned = canvas.screenshot()
+    slider.fill("1")
+    until(lambda: words.inner_text() == "stance; contact pressure at most 50.0 kPa; settles by 7.5 mm")
+    page.get_by_role("cell", name="2.5 to 10.0").wait_for()
+    assert bar.inner_text() == scale  # one for all steps
+    until(lambda: canvas.screenshot() != donned)
+    box = canvas.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    told = until(lambda: page.locator(".socket-pointed").inner_text())
+    assert told.split("; ")[0] in {
+        f"contact pressure {kPa} kPa" for kPa in ("20.0", "35.0")
+    }  # nodes beside the middle
+    assert "left" in told.split("; ")[1]
+    assert serious_findings(page) == []
+    page.get_by_role("combobox", name="run").select_option("design")
+    slider.fill("1")
+    until(lambda: words.inner_text().startswith("stance; contact pressure at most 20.0 kPa"))
