@@ -107,7 +107,7 @@ class SocketView {
     const at = Number(this.slider.value), step = this.chosen?.steps[at], values = this.frames[at];
     if (!values) return;
     const settled = typeof step.settling_mm === "number" ? `; settles by ${step.settling_mm.toFixed(1)} mm` : "";
-    this.words.textContent = `${step.name}; ${FIELDS[this.field.value]} at most ${shortNumber(largest(values))} kPa${settled}`;
+    this.words.textContent = `${step.name}; ${FIELDS[this.field.value]} at most ${shortNumber(largest(values))} kPa at a node${settled}`;
     this.slider.setAttribute("aria-valuetext", step.name);
     this.viewer?.setMoment({ on: "nodes", values }, null);
     const number = (value) => value.toFixed(1);
