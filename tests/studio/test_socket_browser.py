@@ -44,7 +44,9 @@ def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, op
     scale, canvas = bar.inner_text(), page.locator(".view.socket .lf-canvas")
     donned = canvas.screenshot()
     slider.fill("1")
-    until(lambda: words.inner_text() == "stance; contact pressure at most 50.0 kPa at a node; settles by 7.5 mm")
+    until(
+        lambda: words.inner_text() == "stance; contact pressure at most 50.0 kPa at a node; settles by 7.5 mm"
+    )
     page.get_by_role("cell", name="2.5 to 10.0").wait_for()
     assert bar.inner_text() == scale  # one for all steps
     until(lambda: canvas.screenshot() != donned)
