@@ -184,7 +184,7 @@ class _Outer:
         best: _Standing | None = None
         allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSE)
         for number in range(self.fidelity.rounds):
-            loose = number == 0 or not is_last
+            loose = not is_last or self.model.correction is None
             inner = self._inner(stage, _LOOSE if loose else 1.0)
             reached = self._correct(stage)
             settled = reached.settles(allowed)
