@@ -13,6 +13,7 @@ from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Fit, Load, don, socket_problem, socket_steps
+from limbfit.errors import RunError
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
 from limbfit.pipeline.shared.socket_shape import socket_of
@@ -83,6 +84,23 @@ def test_it_is_not_done_twice_and_the_report_shows_it(found, folder):
     assert "The limb in its socket" in page
     assert "not a medical device" in page
     assert page.count("stance, anterior view") == 2  # pressure and shear
+
+
+PULL = """friction = 0.0
+hold_s = 0.0
+[[socket.loads]]
+name = "pull"
+force_N = [0.0, 0.0, -60.0]
+duration_s = 1.0
+hold_s = 0.0
+"""
+
+
+@pytest.mark.slow
+def test_a_load_that_nothing_carries_is_named(tmp_path):
+    """A socket without friction, pulled off the limb."""
+    with pytest.raises(RunError, match="the load 'pull' could not be carried beyond .* N, .*socket.friction"):
+        fit_socket(load_study(small_limb(tmp_path, PULL)))
 
 
 @pytest.mark.slow

@@ -162,10 +162,7 @@ class SocketLimb:
         problem = replace(socket_problem(mesh, laws, socket, fit), fibres=fibre_field(self.fibres, mesh))
         found = don(problem, fit, self.faces(mesh, socket), sensitivities=sensitivities, on_row=on_row)
         if not found.result.completed:
-            raise RunError(
-                f"the socket could not be simulated to the end: {found.result.reason}; lower "
-                "socket.reduction_percent or the areas' depths, or choose another socket.edge_mm"
-            )
+            raise RunError(_stopped(found, fit))
         return found
 
     def facts(self, found: Donned, socket: Socket, covariance_log: Covariance = None) -> dict[str, Any]:
@@ -204,6 +201,24 @@ class SocketLimb:
         """What is stored of the liner."""
         table = self.study.socket.liner
         return {"thickness_mm": table.thickness_mm, "material": table.material} | table.parameters
+
+
+def _stopped(found: Donned, fit: Fit) -> str:
+    """Why a simulation did not come to its end, and what may be done: donning by shape, loads by their path."""
+    last = found.rows[-1] if found.rows else None
+    time = 0.0 if last is None else last.time
+    during = next((name for name, _, off in fit.ends if time < off - 1e-9), fit.ends[-1][0])
+    if during == "donning" or last is None:
+        return (
+            f"the socket could not be put on: {found.result.reason}; lower socket.reduction_percent or the "
+            "areas' depths, or choose another socket.edge_mm"
+        )
+    return (
+        f"the load {during!r} could not be carried beyond {np.linalg.norm(last.force):.0f} N, with the socket "
+        f"{np.linalg.norm(last.move):.0f} mm from where it was put on: {found.result.reason}; see whether the "
+        "force presses the socket onto the limb (socket.loads.force_N, LPS), and whether anything holds it: "
+        "socket.friction, an end that bears (socket.distal)"
+    )
 
 
 def _deviation(study: Study, names: Sequence[str], covariance: Array) -> Callable[[Array], float]:
