@@ -99,7 +99,7 @@ hold_s = 0.0
 @pytest.mark.slow
 def test_a_load_that_nothing_carries_is_named(tmp_path):
     """A socket without friction, pulled off the limb."""
-    with pytest.raises(RunError, match="the load 'pull' could not be carried beyond .* N, .*socket.friction"):
+    with pytest.raises(RunError, match=r"the load 'pull' could not be carried .*socket\.friction"):
         fit_socket(load_study(small_limb(tmp_path, PULL)))
 
 

@@ -183,7 +183,7 @@ class _Outer:
         settled, is_last = False, stage == len(self.stages) - 1
         best: _Standing | None = None
         allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSE)
-        for number in range(self.fidelity.rounds):
+        for _ in range(self.fidelity.rounds):
             loose = not is_last or self.model.correction is None
             inner = self._inner(stage, _LOOSE if loose else 1.0)
             reached = self._correct(stage)

@@ -204,7 +204,7 @@ class SocketLimb:
 
 
 def _stopped(found: Donned, fit: Fit) -> str:
-    """Why a simulation did not come to its end, and what may be done: donning by shape, loads by their path."""
+    """Why a simulation did not come to its end, and what may be done about it."""
     last = found.rows[-1] if found.rows else None
     time = 0.0 if last is None else last.time
     during = next((name for name, _, off in fit.ends if time < off - 1e-9), fit.ends[-1][0])
@@ -213,9 +213,10 @@ def _stopped(found: Donned, fit: Fit) -> str:
             f"the socket could not be put on: {found.result.reason}; lower socket.reduction_percent or the "
             "areas' depths, or choose another socket.edge_mm"
         )
+    reached, moved = np.linalg.norm(last.force), np.linalg.norm(last.move)
     return (
-        f"the load {during!r} could not be carried beyond {np.linalg.norm(last.force):.0f} N, with the socket "
-        f"{np.linalg.norm(last.move):.0f} mm from where it was put on: {found.result.reason}; see whether the "
+        f"the load {during!r} could not be carried beyond {reached:.0f} N, with the socket {moved:.0f} mm from "
+        f"where it was put on: {found.result.reason}; see whether the "
         "force presses the socket onto the limb (socket.loads.force_N, LPS), and whether anything holds it: "
         "socket.friction, an end that bears (socket.distal)"
     )
