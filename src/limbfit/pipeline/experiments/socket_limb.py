@@ -215,8 +215,8 @@ def _stopped(found: Donned, fit: Fit) -> str:
         )
     reached, moved = np.linalg.norm(last.force), np.linalg.norm(last.move)
     return (
-        f"the load {during!r} could not be carried beyond {reached:.0f} N, with the socket {moved:.0f} mm from "
-        f"where it was put on: {found.result.reason}; see whether the "
+        f"the load {during!r} could not be carried beyond {reached:.0f} N, with the socket {moved:.0f} mm "
+        f"from where it was put on: {found.result.reason}; see whether the "
         "force presses the socket onto the limb (socket.loads.force_N, LPS), and whether anything holds it: "
         "socket.friction, an end that bears (socket.distal)"
     )
