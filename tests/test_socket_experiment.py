@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista as pv
 
 from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
@@ -70,6 +71,25 @@ def test_what_holds_the_donned_socket_goes_over_into_the_load(found):
     assert here < after < here + 0.3 * (150.0 - here)
 
 
+def test_the_strain_inside_is_told_and_stored(found, folder):
+    """Of every tissue under the liner, with its place; more under the load; cells in the file."""
+    (load,) = found["loads"]
+    for one in (found["donning"], load):
+        assert [row["tissue"] for row in one["inside"]] == ["skin", "muscle"]
+        for row in one["inside"]:
+            assert 0.0 < row["shear_rare"] <= row["shear"]
+            assert 0.0 < row["compression_rare"] <= row["compression"] < 0.5
+            volumes = [row["volume_mm3"], *row["sheared_mm3"].values()]
+            assert volumes == sorted(volumes, reverse=True)
+            assert row["near"] in {region["region"] for region in one["regions"]}
+    before, after = (max(row["shear"] for row in one["inside"]) for one in (found["donning"], load))
+    assert after > before
+    stored = pv.read(folder / "results" / "socket" / "held-1.vtu")
+    names = list(stored.field_data["region_names"])
+    skin = np.asarray(stored.cell_data["region"]) == names.index("skin")
+    assert stored.cell_data["shear_strain"][skin].max() == pytest.approx(load["inside"][0]["shear"])
+
+
 def test_tissue_relaxes_while_the_socket_is_held(found):
     held = [row for row in found["steps"] if 2.0 - 1e-9 <= row["time_s"] <= 3.0 + 1e-9]
     assert (np.diff([row["mean_kPa"] for row in held]) < 0.0).all()
@@ -84,6 +104,7 @@ def test_it_is_not_done_twice_and_the_report_shows_it(found, folder):
     assert "The limb in its socket" in page
     assert "not a medical device" in page
     assert page.count("stance, anterior view") == 2  # pressure and shear
+    assert "cuts along and across it through the largest shear" in page
 
 
 PULL = """friction = 0.0

@@ -3,12 +3,15 @@
 Or the other way round: under a stated pressure, whose shape is a socket's.
 """
 
+from .inside import RARE, SHEAR_LEVELS, Strains, TissueStrain
 from .model import Fit, Load, socket_problem, socket_steps
 from .outcome import SETTLING, WHOLE, Donned, Held, Patch, Row, don
 from .pressing import outer_surface, press, pressed_problem
 
 __all__ = [
+    "RARE",
     "SETTLING",
+    "SHEAR_LEVELS",
     "WHOLE",
     "Donned",
     "Fit",
@@ -16,6 +19,8 @@ __all__ = [
     "Load",
     "Patch",
     "Row",
+    "Strains",
+    "TissueStrain",
     "don",
     "outer_surface",
     "press",

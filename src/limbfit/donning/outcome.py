@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..fe import Problem, Result, State, Step, StepControl, System, Tractions, solve, tractions
 from ..fe.kernel.laws import Laws
+from .inside import Strains
 from .model import Fit, socket_steps
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ class Held:
     ----------
     row : what the socket does then.
     pressure, shear, displacement : (n,) kPa, (n, 3) kPa and (n, 3) mm at the mesh's nodes.
+    strains : of the cells.
     slopes : of the whole's and each region's mean pressure, kPa, and of ``settling``, mm, the derivatives
         (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
     """
@@ -82,6 +84,7 @@ class Held:
     pressure: Array
     shear: Array
     displacement: Array
+    strains: Strains
     slopes: Mapping[str, Array]
 
 
@@ -126,7 +129,8 @@ def don(
             if np.isclose(step.time, off):
                 pressure, shear = found.at_nodes(len(problem.mesh.points))
                 slopes = _slopes(problem, system, laws, step.state, patches) if sensitivities else {}
-                held[name] = Held(rows[-1], pressure, shear, step.state.u, slopes)
+                strains = Strains.of(system, laws, step.state)
+                held[name] = Held(rows[-1], pressure, shear, step.state.u, strains, slopes)
         if on_row is not None:
             on_row(rows[-1])
 

@@ -68,10 +68,10 @@ def _shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
 
 
 def _write_fields(folder: Path, mesh: Mesh, found: Donned) -> None:
-    """One VTU for donning and each load: pressure, shear and displacement at the nodes."""
+    """One VTU for donning and each load: pressure, shear, displacement at the nodes, strains of the cells."""
     for i, one in enumerate(found.held.values()):
         fields = {"pressure_kPa": one.pressure, "shear_kPa": one.shear, "displacement_mm": one.displacement}
-        write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields)
+        write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
 
 
 def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:

@@ -172,7 +172,12 @@ class SocketLimb:
         deviation = None
         if covariance_log is not None:
             deviation = _deviation(self.study, names, np.array(covariance_log))
-        held = {name: _held(one, deviation) for name, one in found.held.items()}
+        mesh = found.result.problem.mesh
+        faces = self.faces(mesh, socket)
+        held = {
+            name: _held(one, deviation) | {"inside": _inside(mesh, one, faces)}
+            for name, one in found.held.items()
+        }
         donned, base = held.pop("donning"), found.held["donning"].row
         loads = []
         for load in fit.loads:
@@ -252,6 +257,21 @@ def _held(one: Held, deviation: Callable[[Array], float] | None) -> dict[str, An
         "settling_interval_mm": None if spread is None else [-spread, spread],
         "regions": [told(name, patch) for name, patch in row.regions.items()],
     }
+
+
+def _inside(mesh: Mesh, one: Held, faces: Mapping[str, Mask]) -> list[dict[str, Any]]:
+    """Strain of each tissue under the liner, and where most: the place at rest, the region nearest to it."""
+    middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
+    rows = []
+    for number, tissue in enumerate(mesh.region_names):
+        if tissue == LINER:
+            continue
+        found = asdict(one.strains.within(mesh.regions == number))
+        place = mesh.points[mesh.cells[found.pop("cell"), :4]].mean(axis=0)
+        far = np.linalg.norm(middles - place, axis=1)
+        near = min(faces, key=lambda name: float(far[faces[name]].min()), default=None)
+        rows.append({"tissue": tissue, **found, "place_mm": place, "near": near})
+    return rows
 
 
 def _step(row: Row, fit: Fit) -> dict[str, Any]:

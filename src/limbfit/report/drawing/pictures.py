@@ -199,7 +199,7 @@ def field_figure(store: Results, sites: Sequence[str], stage: str, name: str) ->
     cuts = [far_side(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
     limits = _limits(cuts, views, field[0])
     shots: list[Shot] = [
-        (_shoot_field(cut, view, field[0], limits), view, []) for view, cut in zip(views, cuts, strict=True)
+        (shoot_field(cut, view, field[0], limits), view, []) for view, cut in zip(views, cuts, strict=True)
     ]
     names = [row["site"] for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
@@ -209,7 +209,7 @@ def field_figure(store: Results, sites: Sequence[str], stage: str, name: str) ->
     )
 
 
-def _shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
+def shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
     """A deformed cut, coloured by a field without shading, so that colours can be read off the bar."""
     plotter = new_plotter()
     surface = cut.warp_by_vector("displacement_mm").extract_surface(algorithm="dataset_surface")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -13,12 +13,25 @@ from numpy.typing import NDArray
 from ..page import Figure
 from ..store import Json, Results
 from .ink import MUTED, SIMULATED, STYLE, THIRD, legend_above, panels, svg
-from .panels import FIELD_MAP, Shot, colour_bar, strip
-from .pictures import SIDES, Grid, four_sides, new_plotter, shoot, without_display_warning
+from .panels import FIELD_MAP, Mark, Shot, View, colour_bar, strip
+from .pictures import (
+    SIDES,
+    Grid,
+    far_side,
+    four_sides,
+    limb_frame,
+    linear,
+    new_plotter,
+    shoot,
+    shoot_field,
+    unit,
+    without_display_warning,
+)
 
 Array = NDArray[np.float64]
 FIELDS = (("pressure_kPa", "pressure (kPa)"), ("shear_kPa", "shear (kPa)"))
 OUTER = "face_set:skin"
+SHEAR, MARKED = "shear_strain", "#d62728"
 OFFSET, OFFSET_MAP = "offset_mm", "RdBu_r"
 
 
@@ -89,6 +102,55 @@ def offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
         "Faces of the sockets: offset from the unloaded limb under its liner, negative where pressed in."
     )
     return Figure("socket-design-offset", markup + colour_bar(limits, words, OFFSET_MAP), caption)
+
+
+@without_display_warning()
+def inside_figure(store: Results, title: str, inside: Sequence[Json], file: Path) -> tuple[Figure, ...]:
+    """Cuts along and across the limb through the place of the largest shear, coloured by it."""
+    if not file.is_file():
+        return ()
+    grid, worst = linear(file), max(inside, key=lambda found: found["shear"])
+    place = np.asarray(worst["place_mm"], dtype=float)
+    shear, words = np.asarray(grid.cell_data[SHEAR]), "shear strain"
+    limits = (0.0, max(float(np.percentile(shear, 99.5)), 1e-6))
+    shots: list[Shot] = []
+    for view in _cuts(store, grid, place):
+        pixels = shoot_field(far_side(grid, view, smooth=True), view, SHEAR, limits)
+        moved = place + _moved(grid, place)
+        shots.append((pixels, view, [Mark("largest", moved, MARKED)]))
+    near = f", near {worst['near']}" if worst["near"] else ""
+    caption = (
+        f"Inside the limb, {title}: cuts along and across it through the largest shear "
+        f"({worst['tissue']}{near}), deformed; colour: largest shear strain of each element."
+    )
+    markup = strip(shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}")
+    return (Figure("socket-inside", markup + colour_bar(limits, words), caption),)
+
+
+def _cuts(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
+    """The whole limb, cut along it through its middle and a place, and across it there."""
+    _, back, up = limb_frame(store)
+    points = np.asarray(grid.points)
+    middle = points.mean(axis=0)
+    outwards = (place - middle) - (place - middle) @ up * up
+    normal = unit(np.cross(outwards if np.linalg.norm(outwards) > 1.0 else back, up))
+    half = float(np.ptp(points @ up)) / 2 * 1.05
+    across = np.cross(normal, up)
+    reach = float(np.abs((points - middle) @ across).max()) + 10
+    height = (points @ up).max() / 2 + (points @ up).min() / 2
+    along_focal = middle + (height - middle @ up) * up + ((place - middle) @ normal) * normal
+    wide = float(np.abs((points - middle) - np.outer((points - middle) @ up, up)).max()) + 8
+    across_focal = middle + ((place - middle) @ up) * up
+    return (
+        View(along_focal, normal, up, half, (round(900 * reach / half), 900)),
+        View(across_focal, -up, -back, wide, (900, 900)),
+    )
+
+
+def _moved(grid: Grid, place: Array) -> Array:
+    """Displacement (3,) mm of the node nearest to a place at rest."""
+    nearest = np.argmin(np.linalg.norm(np.asarray(grid.points) - place, axis=1))
+    return np.asarray(grid.point_data["displacement_mm"])[nearest]
 
 
 def settling_figure(content: Json) -> Figure:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..drawing.socket_pictures import pressure_figures, settling_figure
+from ..drawing.socket_pictures import inside_figure, pressure_figures, settling_figure
 from ..formats import NOTHING, fixed, friction, heading, numeric
 from ..page import Block, Note, Prose, Row, Section, Table
 from ..store import Json, Results
@@ -24,6 +24,7 @@ PUBLISHED = (
 def socket_section(store: Results, content: Json) -> Section:
     """What the experiment ``socket`` found."""
     loads = content["loads"]
+    folder = store.folder / "socket"
     names = ["donning", *(load["name"] for load in loads)]
     held = [content["donning"], *loads]
     blocks: list[Block] = [
@@ -33,12 +34,12 @@ def socket_section(store: Results, content: Json) -> Section:
         ),
         Prose(_shape(content)),
         Prose(_loads(loads)),
-        *pressure_figures(
-            store, {name: store.folder / "socket" / f"held-{i}.vtu" for i, name in enumerate(names)}
-        ),
+        *pressure_figures(store, {name: folder / f"held-{i}.vtu" for i, name in enumerate(names)}),
         settling_figure(content),
         _regions(names, held),
         Prose(PUBLISHED),
+        *inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
+        _inside(names, held),
         Prose(
             f"Sum of contact forces and moments against the stated load: within "
             f"{content['balance_percent']:.2g} % at every step. Pressures are those of contact, on the "
@@ -101,3 +102,32 @@ def _regions(names: list[str], held: list[Mapping[str, Any]]) -> Table:
         "identified parameters' covariance, to first order; liner and friction count as known."
     )
     return Table("socket-regions", caption, head, tuple(rows))
+
+
+def _inside(names: list[str], held: list[Mapping[str, Any]]) -> Table:
+    levels = list(held[0]["inside"][0]["sheared_mm3"])
+    head = (
+        "Tissue",
+        "Shear: largest",
+        "exceeded in 1 %",
+        "Compression: largest",
+        "exceeded in 1 %",
+        *(f"Sheared over {level} (cm3)" for level in levels),
+        "Largest shear near",
+    )
+    rows = []
+    for name, one in zip(names, held, strict=True):
+        rows.append(Row((heading(name), *(numeric("") for _ in head[1:])), marked=True))
+        for found in one["inside"]:
+            strains = ("shear", "shear_rare", "compression", "compression_rare")
+            cells = [fixed(found[key], 2) for key in strains]
+            cells += [fixed(found["sheared_mm3"][level] / 1000.0, 2) for level in levels]
+            row = (heading(found["tissue"]), *map(numeric, cells), numeric(found["near"] or NOTHING))
+            rows.append(Row(row))
+    caption = (
+        "Strain inside the limb, when donning and each load have been held. Shear: half the difference of "
+        "the largest and the least principal Green-Lagrange strain, compression: the least with its sign "
+        "turned, both of a whole element, and what 1 % of the tissue's volume exceeds. The largest grow as "
+        "elements get smaller. No limit of harm is implied."
+    )
+    return Table("socket-inside", caption, head, tuple(rows))
