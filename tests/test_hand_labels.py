@@ -116,6 +116,7 @@ def test_contours_of_the_results_make_the_same_labels(folder):
     assert (study.results / "segment" / "quality.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_seeds_choose_and_name_the_bones(folder):
     first = segmented(study_of(folder))
     k, j, i = np.argwhere(first.mask("fibula")).mean(axis=0)

@@ -92,6 +92,7 @@ def test_the_prior_of_c_is_made_of_what_is_stored() -> None:
     assert all(prior["m"] == exponent() for prior in STORED["prior"].values())
 
 
+@pytest.mark.slow
 @needs_data
 def test_two_layers_of_held_out_persons_are_predicted() -> None:
     found = coverage(TWO.legs(DATA), SQUARE, TWO.known)
@@ -108,6 +109,7 @@ def test_three_layers_of_held_out_persons_are_predicted() -> None:
     assert max((*found.layers, found.whole)) <= 0.95
 
 
+@pytest.mark.slow
 @needs_data
 def test_too_sure_a_population_does_not_cover(monkeypatch: pytest.MonkeyPatch) -> None:
     """With people who do not differ and readings that are exact the same intervals hold far too little."""

@@ -44,6 +44,7 @@ def test_every_notebook_is_run_here() -> None:
         assert f'run("{page.stem}")' in here
 
 
+@pytest.mark.slow
 def test_a_block_relaxes_and_the_square_is_the_stiffest_indenter(run, capsys) -> None:
     left = run("indent-a-block")
     assert left["after_hold"] < 0.8 * left["at_peak"]
