@@ -90,8 +90,8 @@ class Simulation:
 _KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest usual ones, some 5 GB in all
 # The tissue that sets a site's contact penalty, whatever law the site's own have.
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}
-# To the deepest point; from the indenter's edge.  With 4 steps and 20 mm more the penalty of the demo's six sites
-# is the same within 0.3 %, for twice the time.
+# To the deepest point; from the indenter's edge.  With 4 steps and 20 mm more the penalty of the demo's six
+# sites is the same within 0.3 %, for twice the time.
 _REFERENCE_STEPS, _REFERENCE_MM = 3, 35.0
 # Of the penetration that is allowed: three of 24 tissues drawn over the bounds then go beyond it.
 _MARGIN = 0.5
