@@ -173,7 +173,7 @@ class GeometryTable(TomlTable):
             raise ValueError("give either skin_layer_mm or layers")
         if not self.layers and "core" in self.model_fields_set:
             raise ValueError("core belongs to layers; give layers too")
-        names = [one.name for one in (*self.model_layers, *self.regions)] + [self.core]
+        names = [*(one.name for one in self.model_layers), *(one.name for one in self.regions), self.core]
         if len(set(names)) < len(names):
             raise ValueError(f"layers, core and regions need different names, not {', '.join(names)}")
         if sum(layer.thickness == "map" for layer in self.layers) > 1:

@@ -106,9 +106,9 @@ class Study(TomlTable):
 
     @property
     def tissues(self) -> tuple[str, ...]:
-        """Names of the materials and of the mesh's regions: layers, outermost first, core, what is in it."""
+        """Names of the materials and of the mesh's regions: layers, outermost first, regions, the core."""
         layers, regions = self.geometry.model_layers, self.geometry.regions
-        return (*(one.name for one in layers), self.geometry.core, *(one.name for one in regions))
+        return (*(one.name for one in layers), *(one.name for one in regions), self.geometry.core)
 
     @property
     def law(self) -> TissueLaw:

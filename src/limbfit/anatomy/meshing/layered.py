@@ -14,7 +14,7 @@ from .columns import Columns, columns, even_steps
 from .engines import VolumeMesh
 from .layers import Level, LimbFields
 from .projection import projected
-from .regions import interfaces, region_level, same_faces
+from .regions import interfaces, mesh_numbers, region_level, same_faces
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,7 +31,7 @@ def core_mesh(points: Array, tets: Ints) -> Mesh:
 def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) -> tuple[Mesh, Columns]:
     """The tet4 mesh of core and extruded layers with its sets, and the columns of the layers' nodes.
 
-    ``regions`` names the layers, outermost first, the core, and the regions inside it.
+    ``regions`` names the layers, outermost first, the regions inside the core, and the core.
     """
     count = len(core.points)
     faces = boundary_faces(core_mesh(core.points, core.tets))
@@ -46,11 +46,12 @@ def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) 
     shares = (depths[-1] - np.vstack([depths[::-1], np.zeros(len(base))])) / depths[-1]
     tets, layer = stack.tets(interface)
     innermost = len(fields.depths) - 1
+    numbers = mesh_numbers(core.regions, len(fields.depths), len(fields.regions))
     mesh = Mesh(
         points=np.vstack([core.points, stack.placed(low, high, shares)]),
         cells=np.vstack([tets, core.tets]),
         cell_type="tet4",
-        regions=np.concatenate([innermost - layer, innermost + 1 + core.regions]),
+        regions=np.concatenate([innermost - layer, numbers]),
         region_names=regions,
     )
     return _with_sets(mesh, core, stack), stack

@@ -36,6 +36,7 @@ from .regions import (
     check_regions,
     cut_at_regions,
     interfaces,
+    mesh_numbers,
     refined_at_regions,
     region_level,
     region_volumes,
@@ -79,11 +80,6 @@ class MeshSettings:
     curved: bool = True
     flatness: float = 1.0
     engine: str = "mmg"
-
-    @property
-    def regions(self) -> tuple[str, ...]:
-        """The mesh's regions: the layers, outermost first, and the core; without those inside the core."""
-        return (*(layer.name for layer in self.layers), self.core)
 
     @property
     def base_spacing_mm(self) -> float:
@@ -168,7 +164,7 @@ def mesh_site(
 
     Returns
     -------
-    mesh : regions named as the layers, the core and the anatomy's regions; node sets ``fixed_bone`` (on
+    mesh : regions named as the layers, the anatomy's regions and the core; node sets ``fixed_bone`` (on
         bones) and ``fixed_proximal`` (on the cut plane); face set ``skin`` (outward, without the cut plane).
     report : quality and what was trimmed.
 
@@ -204,7 +200,8 @@ def _meshed(base: BaseMesh, size: Array, settings: MeshSettings) -> tuple[Mesh, 
     fields = base.fields
     task = _task(base.grid, size, settings)
     core = _snapped(_adapted(task, fields, settings), fields)
-    mesh, stack = with_layers(core, fields, (*settings.regions, *fields.regions))
+    names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
+    mesh, stack = with_layers(core, fields, names)
     mesh = polished(mesh, fields, stack)
     mesh, repairs = repaired(mesh, fields, stack)
     if settings.element == "tet10" and not inverted(mesh).any():
@@ -280,8 +277,9 @@ def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
     triangles = boundary_faces(core_mesh(grid.points, grid.tets))
     common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
     surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
-    names = tuple(map(str, range(grid.regions.max() + 1)))
-    inner = interfaces(Mesh(grid.points, grid.tets, "tet4", grid.regions, names), 0)
+    count = int(grid.regions.max())
+    numbers = mesh_numbers(grid.regions, 0, count)
+    inner = interfaces(Mesh(grid.points, grid.tets, "tet4", numbers, tuple(map(str, range(count + 1)))), 0)
     refs = [np.full(len(faces), REGION << number) for number, faces in enumerate(inner)]
     return VolumeTask(
         grid.points,

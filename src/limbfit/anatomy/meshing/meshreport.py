@@ -107,7 +107,7 @@ def _regions(mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]) -
     found = {}
     for number, faces in enumerate(interfaces(mesh, len(fields.depths))):
         error = np.abs(region_level(fields, number)(mesh.points[faces[:, :3]].mean(axis=1))[0])
-        name = mesh.region_names[len(fields.depths) + 1 + number]
+        name = mesh.region_names[len(fields.depths) + number]
         found[name] = {
             "enclosed_mm3": regions_mm3[name],
             "mean_mm": float(error.mean()) if len(error) else 0.0,

@@ -21,13 +21,14 @@ from ...errors import SurfaceError
 from ...mesh import Mesh, boundary_faces
 from ..surfaces.triangles import Surface
 from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refined
-from .layers import TRIM_SAMPLES, Level, LimbFields, box_distance, box_samples, signed_distance
+from .layers import Level, LimbFields, box_distance, box_samples, signed_distance
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there
 GENTLEST = 0.2  # slope of a region's level, below which it does not tell a distance
+SAMPLES = 20_000  # all over a region's box
 CELLS_ACROSS = 3.0  # of the grid over a region's thickness, before it is cut
 THINNEST_EDGES = 0.5  # of the edge near the site: a thinner region is refused
 
@@ -82,7 +83,7 @@ def _samples(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Arra
     if high[2] <= low[2]:
         return np.zeros((0, 3)), 0.0
     whole = float(np.prod(high - low))
-    samples = box_samples(low, high, (whole / TRIM_SAMPLES) ** (1 / 3))
+    samples = box_samples(low, high, (whole / SAMPLES) ** (1 / 3))
     return samples, whole / len(samples)
 
 
@@ -155,14 +156,18 @@ def region_volumes(fields: LimbFields) -> dict[str, float]:
     return found
 
 
-def interfaces(mesh: Mesh, core: int) -> list[Ints]:
-    """Outward faces (k, 3 or 6) of each region after a mesh's ``core`` to the core or to later regions."""
-    return [_interface(mesh, core, number) for number in range(core + 1, len(mesh.region_names))]
+def mesh_numbers(regions: Ints, layers: int, count: int) -> Ints:
+    """Numbers (m,) in a mesh, whose core comes last, of the ``regions`` (m,) of a grid, whose core is 0."""
+    return np.where(regions == 0, layers + count, layers + regions - 1)
 
 
-def _interface(mesh: Mesh, core: int, number: int) -> Ints:
-    other = (mesh.regions == core) | (mesh.regions > number)
-    sides = [_faces_of(mesh, chosen) for chosen in (mesh.regions == number, other)]
+def interfaces(mesh: Mesh, layers: int) -> list[Ints]:
+    """Outward faces (k, 3 or 6) of each region after a mesh's layers to what comes after it, to the core."""
+    return [_interface(mesh, number) for number in range(layers, len(mesh.region_names) - 1)]
+
+
+def _interface(mesh: Mesh, number: int) -> Ints:
+    sides = [_faces_of(mesh, chosen) for chosen in (mesh.regions == number, mesh.regions > number)]
     return sides[0][same_faces(sides[0][:, :3], sides[1][:, :3], len(mesh.points))]
 
 
