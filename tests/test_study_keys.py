@@ -208,7 +208,7 @@ READ: dict[str, str] = {
 # How else the tables above name them.
 OTHER_NAMES = {
     "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
-    "geometry.regions.label": "geometry.regions.0.surface",  # so too
+    "geometry.regions.label": "geometry.regions.surface",  # instead of it
     "indenter.file": "indenter",
     "indenters.file": "indenters.ball",
     "calibration.prior.median": "calibration.prior.skin.c_kPa.median",
