@@ -56,6 +56,7 @@ regions = [{ name = "scar", surface = "scar.stl" }]
 edge_near_mm = 4.0
 edge_far_mm = 16.0
 near_radius_mm = 10.0
+growth = 0.9
 [indenter]
 width_mm = 14.0
 edge_radius_mm = 2.0
@@ -63,7 +64,7 @@ edge_radius_mm = 2.0
 load_steps = 5
 unload_steps = 4
 [material]
-start = { m = 4.0 }
+start = { m = 4.0, gamma = 3.0, tau_s = 0.4 }
 [material.tissues.skin]
 start = { c_kPa = 9.0, m = 6.0, gamma = 2.0, tau_s = 0.5 }
 [material.tissues.scar]
@@ -71,8 +72,7 @@ start = { c_kPa = 10.0 }
 upper = { c_kPa = 500.0 }
 [calibration]
 search_radius_mm = 0
-fixed = ["skin.c_kPa", "skin.m", "skin.gamma", "skin.tau_s", "muscle.m", "scar.m"]
-tied = [["scar.gamma", "muscle.gamma"], ["scar.tau_s", "muscle.tau_s"]]
+fixed = ["skin.c_kPa", "skin.m", "skin.gamma", "skin.tau_s"]
 """
 SITE = """
 [[sites]]
@@ -177,9 +177,10 @@ def test_regions_that_cannot_be_are_refused(tmp_path, region: str, more: str, wo
 
 
 @pytest.mark.slow
-def test_its_stiffness_is_identified_with_all_else_of_it_tied(tmp_path) -> None:
-    """Forces from finer meshes than the study's; the scar's stiffness is within its interval and 10 %."""
-    write_study(tmp_path)
+def test_its_stiffness_is_identified_beside_the_muscle_s(tmp_path) -> None:
+    """All else known, forces from finer meshes than the study's, noise of 0.03 to 0.05 N on 2 N."""
+    known = [f"{tissue}.{name}" for tissue in ("scar", "muscle") for name in ("m", "gamma", "tau_s")]
+    write_study(tmp_path, STUDY.replace('"skin.tau_s"]', f'"skin.tau_s", {str(known)[1:-1]}]'))
     random = np.random.default_rng(3)
     fine = MeshSettings(edge_near_mm=3.5, edge_far_mm=16.0, near_radius_mm=10.0, growth=0.9)
     for name in PLACES:
@@ -192,8 +193,7 @@ def test_its_stiffness_is_identified_with_all_else_of_it_tied(tmp_path) -> None:
     run_study(study, until="calibrate")
     found = Store(study.results).read("calibrate", "calibration.json")
     last = found["stages"][-1]["parameters"]
-    assert last["scar"]["gamma"] == last["muscle"]["gamma"]
     low, high = found["uncertainty"]["intervals_95"]["scar"]["c_kPa"]
-    assert low < 25.0 < high
+    assert low < 25.0 < high < 3.0 * low
     assert last["scar"]["c_kPa"] == pytest.approx(25.0, rel=0.1)
     assert last["muscle"]["c_kPa"] == pytest.approx(4.0, rel=0.1)

@@ -28,6 +28,7 @@ Ints = NDArray[np.int64]
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there
 GENTLEST = 0.2  # slope of a region's level, below which it does not tell a distance
+WALL_REACHES = 2.0  # from a region before, where it may be a wall: it may itself be continued by one
 SAMPLES = 20_000  # all over a region's box
 CELLS_ACROSS = 3.0  # of the grid over a region's thickness, before it is cut
 THINNEST_EDGES = 0.5  # of the edge near the site: a thinner region is refused
@@ -58,14 +59,16 @@ def region_level(fields: LimbFields, number: int) -> Field:
 def _wall(fields: LimbFields, number: int, points: Array) -> Level:
     """Distance (n,) of points from the nearest wall of a region, and the unit direction away from it."""
     distance, normal = fields.layer(points)
-    walls = [fields.void(points)] if fields.bones else []
-    for before in range(number):
-        value, slope = region_level(fields, before)(points)
+    everywhere = np.arange(len(points))
+    walls = [(everywhere, *fields.void(points))] if fields.bones else []
+    for before, surface in enumerate(list(fields.regions.values())[:number]):
+        close = everywhere[_is_near(surface, WALL_REACHES * fields.bone_clearance_mm, points)]
+        value, slope = region_level(fields, before)(points[close])
         steep = np.maximum(np.linalg.norm(slope, axis=1), GENTLEST)
-        walls.append((value / steep, slope / steep[:, None]))
-    for value, slope in walls:
-        nearer = value < distance
-        distance, normal = np.where(nearer, value, distance), np.where(nearer[:, None], slope, normal)
+        walls.append((close, value / steep, slope / steep[:, None]))
+    for place, value, slope in walls:
+        nearer = value < distance[place]
+        distance[place[nearer]], normal[place[nearer]] = value[nearer], slope[nearer]
     return distance, normal
 
 
