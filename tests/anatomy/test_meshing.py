@@ -83,6 +83,7 @@ def test_a_flat_element_is_told_where_it_matters(meshed: tuple) -> None:
         flat = mesh.with_points(points)
         return mesh_warnings(flat, quality(flat), 0.0, (position, 20.0))
 
+    near, far = int(distance.argmin()), int(distance.argmax())
     assert mesh_warnings(mesh, quality(mesh), 0.01, (position, 20.0)) == ()
     assert [text.startswith("smallest dihedral angle within 20 mm") for text in told(near, 0.06)] == [True]
     assert told(far, 0.001)[0].startswith("smallest dihedral angle 0.")

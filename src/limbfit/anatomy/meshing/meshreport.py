@@ -19,7 +19,7 @@ from .untangling import Repair
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Smallest angle near the indenter, and anywhere: far from it layers are thin beside the edges, and hardly strain.
+# Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.
 GOOD_DIHEDRAL_DEG, SOUND_DIHEDRAL_DEG = 8.0, 3.0
 GOOD_VOLUME = 0.02  # long edges far from the indenter cut across a round limb by up to a hundredth
 
