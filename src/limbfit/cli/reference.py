@@ -13,9 +13,9 @@ from .groups import GROUPS
 
 HEAD = """# Commands
 
-Made by `python -m limbfit.cli.reference`; `limbfit COMMAND --help` says the same. The exit code is 0 when done, 1 when
-something failed, 2 for bad usage or bad input, 130 when interrupted. `limbfit --install-completion` completes
-commands and options in the shell. The same in many commands:
+Made by `python -m limbfit.cli.reference`; `limbfit COMMAND --help` says the same. The exit code is 0 when done,
+1 when something failed, 2 for bad usage or bad input, 130 when interrupted. `limbfit --install-completion`
+completes commands and options in the shell. The same in many commands:
 """
 _MANY = 5  # commands that share an option or argument: it is explained once
 
@@ -48,10 +48,10 @@ def _section(name: str, command: Any, shared: set[str]) -> list[str]:
     for verb, one in _verbs(name, command):
         parameters = _parameters(one)
         arguments = [p for p in parameters if p.param_type_name == "argument"]
-        given = " ".join([verb, *(p.name.upper() if p.required else f"[{p.name.upper()}]" for p in arguments)])
+        words = (p.name.upper() if p.required else f"[{p.name.upper()}]" for p in arguments)
         own = [item for item in map(_item, parameters) if item not in shared]
         also = [p for p in parameters if _item(p) in shared and p not in arguments]
-        lines += [f"### {given}\n", _text(one.help), *own, *([""] if own else [])]
+        lines += [f"### {' '.join([verb, *words])}\n", _text(one.help), *own, *([""] if own else [])]
         lines += [f"Also {', '.join(map(_names, also))}.\n"] if also else []
     return lines
 
