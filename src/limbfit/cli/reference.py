@@ -14,8 +14,8 @@ from .groups import GROUPS
 HEAD = """# Commands
 
 Made by `python -m limbfit.cli.reference`; `limbfit COMMAND --help` says the same. The exit code is 0 when
-done, 1 when something failed, 2 for bad usage or bad input, 130 when interrupted. `limbfit --install-completion`
-completes commands and options in the shell. The same in many commands:
+done, 1 when something failed, 2 for bad usage or bad input, 130 when interrupted.
+`limbfit --install-completion` completes commands and options in the shell. The same in many commands:
 """
 _MANY = 5  # commands that share an option or argument: it is explained once
 
