@@ -16,7 +16,7 @@ from .groups import WithDefault
 from .runs import where
 
 app = typer.Typer(
-    help="Put a socket on the limb and load it (fit, also without that word), or design one.",
+    help="Put a socket on the limb and load it (fit, the default), or design one.",
     cls=WithDefault,
     rich_markup_mode=None,
 )
@@ -25,7 +25,7 @@ OfTissues = Annotated[
     typer.Option(help="the law's parameters of each tissue; default: identified, or those of people"),
 ]
 OfPeople = Annotated[
-    bool, typer.Option("--literature", help="tissues of people, although some were identified")
+    bool, typer.Option("--literature", help="tissues of people, even where some were identified")
 ]
 
 
@@ -78,7 +78,7 @@ def design(
         typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
     ] = "",
     simulations: Annotated[
-        int, typer.Option(help="with --optimise: at most so many beside those of the two designs", min=1)
+        int, typer.Option(help="with --optimise: how many at most, beside those of the two designs", min=1)
     ] = 6,
     parameters: OfTissues = None,
     literature: OfPeople = False,

@@ -65,7 +65,7 @@ def design(
     protocol: Annotated[
         bool, typer.Option("--protocol", help="choose the records of a whole session instead")
     ] = False,
-    minutes: Annotated[float, typer.Option(help="with --protocol: of the session, min", min=1)] = 25.0,
+    minutes: Annotated[float, typer.Option(help="with --protocol: length of the session, min", min=1)] = 25.0,
     speeds: Annotated[
         str | None,
         typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
@@ -75,7 +75,9 @@ def design(
         str | None, typer.Option(help="with --protocol: parameters such as muscle.c_kPa; default: all")
     ] = None,
     criterion: Annotated[Literal["D", "A"], typer.Option(help="with --protocol: D or A")] = "D",
-    draws: Annotated[int, typer.Option(help="with --protocol: tissues to judge by", min=1, max=64)] = 3,
+    draws: Annotated[
+        int, typer.Option(help="with --protocol: how many tissues to judge by", min=1, max=64)
+    ] = 3,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.

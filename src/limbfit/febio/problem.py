@@ -112,7 +112,7 @@ def _pressures(model: FebModel, tissue: Tissue) -> tuple[Pressure, ...]:
     for load in model.pressures:
         faces = tissue.number[model.geometry.surfaces[load.surface]]
         if (faces < 0).any():
-            what = f"the surface {load.surface!r} of a pressure lies not on tissue"
+            what = f"the surface {load.surface!r} of a pressure does not lie on tissue"
             raise ProblemError(what, place=f"line {load.line}")
         curve = model.curves[load.curve]
         times = knots([curve], step_times(model.phases, model.curves), 0.0, end)

@@ -135,7 +135,7 @@ def _last(log: Path, is_running: bool) -> dict[str, Any]:
     progress = [row for row in events if row["event"] in ("progress", "fit")]
     end = _ENDS.get(events[-1]["event"]) if events else None
     if end is None:
-        end = "running" if is_running else "ended without a word: it was killed, or memory ran out"
+        end = "running" if is_running else "ended without a message: it was killed, or memory ran out"
     keys = ("stage", "done", "total", "text")
     return {
         "what": events[0].get("what") if events else None,

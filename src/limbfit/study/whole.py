@@ -358,7 +358,7 @@ class Study(TomlTable):
     @model_validator(mode="after")
     def _one_door(self) -> Study:
         if (self.image is None) == (self.surfaces is None):
-            raise ValueError("give either [image] or [surfaces]: geometry enters by one door")
+            raise ValueError("give either [image] or [surfaces], not both")
         if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
             raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
         if self.surfaces is not None or (self.image is not None and self.image.markers is None):

@@ -58,7 +58,7 @@ class LawTable:
         """
         if not self.has_terms:
             raise ProblemError(
-                "the tissue's law is no sum of Ogden terms, and other programs know none else",
+                "the tissue's law is not a sum of Ogden terms, and other programs know no other",
                 remedy="use one of Ogden terms there",
             )
         return self.numbers.reshape(-1, 2)

@@ -125,7 +125,7 @@ def read_feb(path: str | Path) -> FebModel:
     try:
         version = root.attributes.get("version", "")
         if root.tag != "febio_spec" or version.partition(".")[0] not in ("3", "4"):
-            raise root.refuse("is no input of FEBio 3 or 4", "save it anew with FEBio Studio 2")
+            raise root.refuse("is not an input of FEBio 3 or 4", "save it again with FEBio Studio 2")
         return _model(root)
     except ProblemError as error:
         raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None

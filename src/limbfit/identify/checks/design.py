@@ -46,7 +46,7 @@ class NoiseModel:
         if not (self.sensor_N >= 0 and self.misfit >= 0 and 0 <= self.correlation < 1):
             raise CalibrationError("a noise model has standard deviations >= 0 and a correlation below 1")
         if self.sensor_N == 0 and self.misfit == 0:
-            raise CalibrationError("a design needs some noise: without any, one site tells everything")
+            raise CalibrationError("a design needs some noise: without any, one site determines everything")
 
     def row(self, force_N: Array) -> Array:
         """First row (n,) of the covariance (Toeplitz) of a record."""

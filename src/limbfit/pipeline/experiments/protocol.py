@@ -227,7 +227,7 @@ def _options(
             kept.append(k)
             if failed[k]:
                 where = f"at {failed[k]} of {len(tissues)} draws"
-                left_out.append(f"{one.told}: not simulated to the end {where}, and counts for nothing there")
+                left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
     options = [
         Option((planned[k].site, planned[k].tool), planned[k].seconds + rest_s, np.array(infos[k]))
         for k in kept

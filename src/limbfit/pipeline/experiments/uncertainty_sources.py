@@ -217,8 +217,8 @@ def mesh_share(study: Study) -> tuple[str, float]:
     order = MESH_ORDERS[study.mesh.element]
     how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
     if study.mesh.coarse is not None:
-        return f"what the fine mesh lacks, in every interval already: {how}", error_of_own_mesh(study.mesh)
-    what = f"what the mesh lacks, from edges {FINER:g} times as long: {how}"
+        return f"error of the fine mesh, in every interval already: {how}", error_of_own_mesh(study.mesh)
+    what = f"error of the mesh, from edges {FINER:g} times as long: {how}"
     return what, error_of_coarser(order, 1 / FINER)
 
 

@@ -82,7 +82,7 @@ def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
     driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
     if not driven or (names and len(driven) < len(chosen)):
         raise InputError(
-            'forces are compared, and a record with control = "force" has none of its own',
+            'this compares forces, and a record with control = "force" has none to compare',
             file=study.file,
             remedy="name records under a stated displacement",
         )

@@ -37,7 +37,9 @@ COARSER = 1.3  # times the edges: another mesh that tells the error of the study
 # In logarithms of parameters: another simulation's states save work as first guesses as far as NEAR, and half
 # of it within CLOSE; one that is farther than that is the next one's start.
 NEAR, CLOSE, MOST_STARTS = 1.5, 0.35, 8
-ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too sure"
+ONLY_LINEARISED = (
+    "too few simulations completed near the answer: its intervals are linearised, and too narrow"
+)
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 

@@ -197,7 +197,7 @@ def _settings(study: Study, one: Indentation, depth_mm: float | None, unattended
         if depth_mm is None:
             remedy = "give --depth, or state its depth_mm"
             raise InputError(
-                "how deep to go is not known",
+                "the depth is not known",
                 file=study.file,
                 place=_place(one).removesuffix(".trace"),
                 remedy=remedy,

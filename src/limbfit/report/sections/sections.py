@@ -187,7 +187,7 @@ def _residuals(store: Results) -> str:
         f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
         f"{fixed(100 * found['correlation'], 0)} % of a record. "
         + (
-            f"To these comes the error of the meshes, from others, in percent of the largest force: {meshes}."
+            f"The error of the meshes is added, in percent of the largest force: {meshes}."
             if meshes
             else "The error of the meshes is not in them: no other mesh was simulated."
         )
