@@ -47,7 +47,7 @@ def run_design(
         records = study.records_at(site)
         if len(records) > 1 or any(record.forced for record in records):
             raise InputError(
-                "a design chooses one indentation per site, under a stated displacement; this site has others",
+                "a design chooses one indentation per site, under a stated displacement; a site has others",
                 file=study.file,
                 place=f"sites.{site.name}",
                 remedy="leave one of that kind in a study for the design",
