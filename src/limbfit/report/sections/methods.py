@@ -339,11 +339,7 @@ def _mesh_error(sites: Json) -> str:
     """The meshes' part of the residuals' covariance, in words; nothing where it was not measured."""
     shares = [100 * one["mesh_share"] for one in sites.values() if one.get("mesh_share") is not None]
     ends = f"{fixed(min(shares), 1)} to {fixed(max(shares), 1)}" if shares else ""
-    return (
-        f", and for the error of the meshes: {ends} % of the largest force, from other meshes"
-        if shares
-        else ""
-    )
+    return f", and for the error of the meshes: {ends} % of the largest force" if shares else ""
 
 
 def _uncertainty(store: Results) -> str:
