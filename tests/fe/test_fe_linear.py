@@ -10,11 +10,17 @@ import scipy.sparse as sp
 from blocks import drive, punch
 
 from limbfit.bench.blocks import punched_block
-from limbfit.fe import StepControl, Support, System
+from limbfit.fe import StepControl, Support, System, solve
 from limbfit.fe.history import Memory
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.solution.factor import Factor
-from limbfit.fe.solution.linear import SOLVERS, NotPositiveDefiniteError, linear_solver, symmetric_product
+from limbfit.fe.solution.linear import (
+    SOLVERS,
+    WITHOUT_PARDISO,
+    NotPositiveDefiniteError,
+    linear_solver,
+    symmetric_product,
+)
 from limbfit.fe.solution.multigrid import Multigrid
 from limbfit.fe.solution.simulation import Simulation
 
@@ -153,3 +159,18 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     assert not short.converged
     assert factor.solve_anew(data, b, None, 1e-6, short.x).converged
     assert factor.lasting
+
+
+def test_where_factors_are_dear_multigrid_takes_their_place(monkeypatch):
+    """Derivatives too; forces are those of a factor within the tolerance."""
+    problem, control = punch("tet10", 2, 1), StepControl(load_steps=6, unload_steps=2)
+    usual = solve(problem, control, sensitivities=True)
+    monkeypatch.setenv(WITHOUT_PARDISO, "1")
+    monkeypatch.delitem(SOLVERS, "cholmod")
+    found = solve(problem, control, sensitivities=True)
+    assert found.completed
+    assert found.statistics["linear_solver"] == "multigrid"
+    assert found.statistics["factorisations"] == 0
+    np.testing.assert_allclose(found.force, usual.force, atol=1e-4 * usual.peak_force)
+    largest = np.abs(usual.force_sensitivity).max(axis=0)
+    assert (np.abs(found.force_sensitivity - usual.force_sensitivity).max(axis=0) <= 1e-3 * largest).all()

@@ -9,7 +9,9 @@ import numpy as np
 from ...mesh import Mesh, boundary_faces, to_tet10
 from ..contact.indenter import Indenter
 from ..kernel.assembly import is_compiled
+from ..kernel.laws import Laws
 from ..materials import OgdenQLV
+from ..observables import element_fields
 from ..problem import History, Problem
 from .control import StepControl
 from .sensitivity import explicit_derivatives
@@ -27,7 +29,7 @@ def are_compiled() -> bool:
 
 
 def compile_kernels(element: str = "tet10p0") -> None:
-    """Compile what an indentation with a square punch and its derivatives needs, and store it.
+    """Compile what an indentation with a square punch, its derivatives and its fields need, and store it.
 
     That takes half a minute.  Kernels hold for every element and law: one small block meets them all.
     """
@@ -47,4 +49,6 @@ def compile_kernels(element: str = "tet10p0") -> None:
         history=History(np.array([0.0, 1.0]), np.array([0.0, _DEPTH_MM])),
         element=element,
     )
-    solve(problem, steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
+    found = solve(problem, steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
+    if found.deepest is not None:
+        element_fields(found.system, Laws.build([tissue, tissue]), found.deepest)

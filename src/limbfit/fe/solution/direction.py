@@ -150,9 +150,7 @@ def _foresee(
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
     """Solution (n, r) of the tangent at an equilibrium for ``b (n, r)``, from the guess ``x``."""
-    if not factor.ready:
-        renew(at, factor)
-    springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
+    springs = _ready_at(at, factor)
     found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:
         blocks = None if at.touch is None else at.touch.blocks
@@ -164,10 +162,17 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
 
 def preconditioner(at: Evaluation, factor: Factor) -> Callable[[Array], Array]:
     """The factor's solution of vectors (n, r), with the contact springs of an evaluation."""
+    springs = _ready_at(at, factor)
+    return lambda r: factor.precondition(r, springs)
+
+
+def _ready_at(at: Evaluation, factor: Factor) -> SpringChange | None:
+    """The springs by which an evaluation differs from what is factorised; what does not last is made anew."""
     if not factor.ready or not factor.lasting:
         renew(at, factor)
-    springs = None if at.touch is None else _change(factor, at, at.touch, at.touch.closed)
-    return lambda r: factor.precondition(r, springs)
+    if at.touch is None or not factor.lasting:
+        return None
+    return _change(factor, at, at.touch, at.touch.closed)
 
 
 def _begin(system: System, at: Evaluation, factor: Factor) -> None:

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from ..system import System
 from .convexity import body_stiffness, shear_stiffness
-from .linear import LinearSolver, NotPositiveDefiniteError, linear_solver, symmetric_product
+from .linear import (
+    LinearSolver,
+    NotPositiveDefiniteError,
+    factors_are_dear,
+    linear_solver,
+    symmetric_product,
+)
 from .multigrid import Multigrid
 from .springs import SpringChange, SpringColumns
 
@@ -46,8 +52,8 @@ class Factor:
     """The linear algebra of one simulation: a factor of some earlier tangent and what to do with it.
 
     ``counts`` and ``seconds`` tell what was done.  ``name`` auto is `Multigrid` for quadratic tetrahedra,
-    unless they are few or the factor is to be ``lasting``.  ``moduli (r,)``: shear modulus of each
-    region, MPa.
+    unless they are few or the factor is to be ``lasting``, and factors are not dear here.
+    ``moduli (r,)``: shear modulus of each region, MPa.
     """
 
     def __init__(
@@ -55,8 +61,9 @@ class Factor:
     ) -> None:
         self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
         moving = system.bodies is not None and system.bodies.free > 0
-        suits = not moving and system.cells.shape[1] == 10 and system.unknowns >= FEWEST_MULTIGRID
-        if name == "auto" and suits and not lasting:
+        suits = not moving and system.cells.shape[1] == 10
+        pays = (system.unknowns >= FEWEST_MULTIGRID and not lasting) or factors_are_dear()
+        if name == "auto" and suits and pays:
             self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]
         self._shear: Array | None = None

@@ -11,6 +11,7 @@ import ctypes
 import functools
 import importlib
 import importlib.metadata
+import os
 import weakref
 from itertools import pairwise
 from typing import Any, Protocol
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 
+# An environment variable: with any value, PARDISO counts as not installed.
+WITHOUT_PARDISO = "LIMBFIT_WITHOUT_PARDISO"
 # Dense operations of a factorisation run about this many times faster than those of a solution, which waits
 # for memory (measured with PARDISO on matrices of 10,000 to 200,000 unknowns).
 OPERATIONS_PER_ENTRY = 45.0
@@ -39,13 +42,14 @@ class NotPositiveDefiniteError(ArithmeticError):
 class LinearSolver(Protocol):
     """Analyse once, factorise often, solve oftener.
 
-    ``lasting``: whether a factorisation is worth keeping for other matrices; ``worth``: its cost over that of
-    one solution and one product with the matrix, estimated from the factor's operations and entries (not
-    timed: a run must be repeatable).
+    ``lasting``: whether a factorisation is worth keeping for other matrices; ``dear``: whether multigrid wins
+    at any size; ``worth``: its cost over that of one solution and one product with the matrix, estimated from
+    the factor's operations and entries (not timed: a run must be repeatable).
     """
 
     name: str
     lasting: bool
+    dear: bool
     worth: float
 
     def factorise(self, data: Array) -> None:
@@ -62,7 +66,7 @@ class Pardiso:
     """
 
     name = "pardiso"
-    lasting = True
+    lasting, dear = True, False
 
     def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
         self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)
@@ -76,6 +80,8 @@ class Pardiso:
         # no defaults, METIS, count entries and operations, single precision, zero-based rows
         for position, value in {0: 1, 1: 2, 9: 13, 17: -1, 18: -1, 20: 1, 27: int(single), 34: 1}.items():
             self._parameters[position] = value
+        if os.environ.get(WITHOUT_PARDISO):
+            raise ImportError(f"PARDISO is left out: {WITHOUT_PARDISO} is set")
         self._mkl = _mkl()
         # The factor lives outside Python's memory.
         self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
@@ -161,7 +167,7 @@ class Cholmod:
     """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
 
     name = "cholmod"
-    lasting = True
+    lasting, dear = True, False
     worth = 20.0
 
     def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
@@ -187,7 +193,7 @@ class SuperLU:
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
-    lasting = True
+    lasting, dear = True, True
     worth = 40.0
 
     def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
@@ -225,6 +231,12 @@ def linear_solver(
             if candidate == name:
                 raise
     raise ImportError("no sparse solver works here")
+
+
+def factors_are_dear() -> bool:
+    """Whether the only factorisations of this machine are much slower than multigrid."""
+    one = np.zeros(1, dtype=np.int32)
+    return linear_solver(np.arange(2, dtype=np.int32), one).dear
 
 
 def symmetric_product(indptr: Index, indices: Index, data: Array, x: Array, threads: int = 1) -> Array:

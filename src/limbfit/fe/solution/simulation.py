@@ -25,6 +25,7 @@ from .coupling import Coupling, couple, renewed, solve_coupled
 from .direction import renew
 from .factor import Factor
 from .guesses import Warm, extrapolation
+from .linear import factors_are_dear
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
 from .pace import Pace
 from .schedule import foresee
@@ -43,8 +44,11 @@ VAIN_RENEWALS, CLOSER = 6, 0.9
 # Force over the mean shear modulus and the square of a body's width against which a residual is judged before
 # anything is touched.
 NOTHING = 1e-6
-# Contact pressure over the mean shear modulus that is no equilibrium's, but that of a guess.
-STEEP_PRESSURE = 15.0
+# Depth of a step over that of the last one, as far as a first guess counts on it.
+MOST_DEEPER = 3.0
+# Contact pressure over the mean shear modulus from which a rounded edge is flat in the tangents far from
+# equilibrium: over the radius it is a negative stiffness, there beside that of the tissue.
+STEEP_PRESSURE = 1.0
 
 
 class Simulation:
@@ -65,7 +69,7 @@ class Simulation:
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self.factor = Factor(self.system, self.laws.moduli, control.linear_solver, control.threads)
         # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
-        apart = sensitivities and not self.factor.lasting
+        apart = sensitivities and not self.factor.lasting and not factors_are_dear()
         self.slopes = self.factor
         if apart:
             self.slopes = Factor(self.system, self.laws.moduli, threads=control.threads, lasting=True)
@@ -219,10 +223,15 @@ class Simulation:
 
     def _predict(self, t: float) -> Array:
         warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
-        if warm is not None:  # what it missed by in the step before, it will miss by in this one
-            return warm if last is None else warm + (self.states[-1].rows - last)
+        if warm is not None:  # what it missed by in the step before, it will miss by in this one, by depth
+            return warm if last is None else warm + self._deeper(t) * (self.states[-1].rows - last)
         weights = self._foreseen(t)
         return np.asarray(sum(w * state.rows for w, state in zip(weights, self.states)))
+
+    def _deeper(self, t: float) -> float:
+        """The depth at time ``t`` over that of the last state; one where it says nothing."""
+        now, then = self.problem.history.displacement_at(t), self.states[-1].displacement
+        return min(now / then, MOST_DEEPER) if now > 0.0 and then > 0.0 else 1.0
 
     def _foreseen(self, t: float) -> Array:
         """Weights of the last states in a guess of the one at time ``t``; those before a further body turned

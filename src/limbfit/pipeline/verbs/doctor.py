@@ -21,7 +21,7 @@ from ..._version import __version__
 from ...errors import InputError, LimbfitError
 from ...execution import THREAD_VARIABLES, ProcessExecutor, usable_cores
 from ...fe import OgdenQLV
-from ...fe.solution.linear import SOLVERS, linear_solver
+from ...fe.solution.linear import SOLVERS, factors_are_dear, linear_solver
 from ...febio.program import find_febio
 from ...laws import KPA
 from ..experiments.cube import RAMP_S, compress
@@ -113,11 +113,11 @@ def _solvers() -> Iterator[Finding]:
     if not working:
         yield Finding("sparse solvers", "failed", "none works", "pip install pypardiso, or limbfit[cholmod]")
         return
-    slow = working[0] == list(SOLVERS)[-1]
+    slow = factors_are_dear()
     yield Finding(
         "sparse solvers",
         "warning" if slow else "ok",
-        f"{working[0]} is used; working: {', '.join(working)}",
+        f"{'multigrid' if slow else working[0]} is used; working: {', '.join(working)}",
         "a faster one: pip install pypardiso (x86-64), or limbfit[cholmod]" if slow else "",
     )
 
