@@ -76,6 +76,10 @@ def design(
     ] = None,
     criterion: Annotated[Literal["D", "A"], typer.Option(help="with --protocol: D or A")] = "D",
     draws: Annotated[int, typer.Option(help="with --protocol: tissues to judge by", min=1, max=64)] = 3,
+    ultrasound: Annotated[
+        float | None,
+        typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.
@@ -99,6 +103,7 @@ def design(
                 determine=determine.split(",") if determine else (),
                 criterion=criterion,
                 draws=draws,
+                ultrasound_sd_mm=ultrasound,
                 parameters=used,
                 listener=listener,
             )

@@ -207,6 +207,7 @@ class Study(TomlTable):
             **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
             **{f"{record.key}.trace": record.trace for record in self.recorded},
+            **{f"{record.key}.ultrasound": record.ultrasound for record in self.recorded},
         }
         if self.image is not None:
             named |= {"image.path": self.image.path, "image.markers": self.image.marked}

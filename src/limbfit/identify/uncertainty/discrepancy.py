@@ -52,8 +52,12 @@ class ResidualModel:
 
     @property
     def misfit_elsewhere(self) -> float:
-        """Misfit to expect at a site that was not fitted, over its largest force: root mean square."""
-        return float(np.sqrt(np.mean(self.misfit**2)))
+        """Misfit to expect at a site that was not fitted, over its largest force: root mean square.
+
+        Of records of forces, where there are any: depths may be small, and as much the larger is their share.
+        """
+        of_force = np.array([noise.unit == "N" for noise in self.noise])
+        return float(np.sqrt(np.mean(self.misfit[of_force if of_force.any() else ~of_force] ** 2)))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like values; forces in N (depths of a record under force in mm), misfits over the largest."""

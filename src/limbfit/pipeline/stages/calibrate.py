@@ -60,7 +60,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         "warnings": laboratory.warnings,
         "contact": contact_record(laboratory.latest, laboratory.penalties, answers, found.responses),
         "doubts": doubts_record(
-            laboratory.doubts, laboratory.latest, laboratory.evaluations * len(laboratory.records), found
+            laboratory.doubts, laboratory.latest, laboratory.evaluations * laboratory.simulated, found
         ),
     }
     write_json(folder / "calibration.json", content)
