@@ -84,10 +84,10 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
 
 def _gauge(region: str, pairs: list[tuple[_Crossing, _Crossing]]) -> Gauge:
     nodes = np.concatenate([one.nodes for pair in pairs for one in pair])
-    weights = np.concatenate([part for top, bottom in pairs for part in (top.weights, -bottom.weights)])
+    weights: Array = np.concatenate([part for top, bottom in pairs for part in (top.weights, -bottom.weights)])
     kept, place = np.unique(nodes, return_inverse=True)
     thickness = sum(bottom.along_mm - top.along_mm for top, bottom in pairs)
-    return Gauge(region, float(thickness), kept, np.bincount(place, weights))
+    return Gauge(region, float(thickness), kept, np.bincount(place, weights).astype(np.float64))
 
 
 def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
