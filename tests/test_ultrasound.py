@@ -9,13 +9,22 @@ import numpy as np
 import pytest
 
 import layered
-from layered import layered_block
+from layered import layered_block, store_blocks
 from limbfit.bench.blocks import block_site
 from limbfit.bench.blocks import layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
-from limbfit.indentation import SimulationJob, simulate, to_vector
-from limbfit.mesh import gauges_along
-from limbfit.study import SolverTable
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
+from limbfit.mesh import gauges_along, write_vtu
+from limbfit.phantom.record import Ramp, record, write_ultrasound
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
+from limbfit.pipeline.shared.store import write_json
+from limbfit.pipeline.stages.laboratory import Laboratory, linearised
+from limbfit.pipeline.stages.predict import run_predict
+from limbfit.report.sections.layers import layer_figure
+from limbfit.report.store import load_store
+from limbfit.study import SolverTable, Study, load_study
 from limbfit.traces import Layers, read_layers, thinnings
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -116,3 +125,98 @@ def test_readings_must_begin_before_and_last_into_contact() -> None:
         thinnings(layers, 1.0, 9.0, 0.1)
     with pytest.raises(TraceError, match="only 1 readings in contact"):
         thinnings(layers, 2.98, 9.0, 0.1)
+
+
+BLOCK = (3.0, 9.0)
+TRUTH = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
+TEXT = """
+[study]
+name = "a block"
+[surfaces]
+skin = "skin.stl"
+[indenter]
+width_mm = 10.0
+edge_radius_mm = 2.0
+[solver]
+load_steps = 8
+unload_steps = 8
+penalty_per_mm = 100.0
+[mesh.coarse]
+edge_near_mm = 6.0
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+"""
+
+
+def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
+    """A study of a block, whose record and ultrasound come from the same mesh and element."""
+    mesh = layered_block(BLOCK, ("skin", "muscle"), 12.0, 6, 3.0)
+
+    def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+        write_vtu(mesh, folder / "truth.vtu")
+        model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", layers=study.tissues)
+        model = replace(model, element=study.mesh.element)
+        times = np.linspace(0.0, model.knots_s[-1], 201)
+        job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
+        found = simulate(job)
+        made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
+        made.write(study.path(Path("a.csv")))
+        layers = {
+            tissue: (thick, lambda t, lost=lost: np.interp(t, times, lost))
+            for tissue, thick, lost in zip(study.tissues, BLOCK, found.compression_mm, strict=True)
+        }
+        write_ultrasound(folder / "a-layers.csv", made, layers, random)
+
+    monkeypatch.setattr(layered, "_write_record", write)
+    for name in ("skin.stl", "a.csv", "a-layers.csv"):
+        (folder / name).touch()
+    (folder / "study.toml").write_text(TEXT + more)
+    study = load_study(folder)
+    store = store_blocks(study, {"a": (BLOCK, 3.0, True)}, TRUTH, 4, coarse=4)
+    for place in (store["mesh"], store["mesh"] / COARSE):
+        write_vtu(mesh, place / "a.vtu")
+    return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+@pytest.mark.slow
+def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
+    """Beside one ramp: nothing is off at the truth, and every interval is narrower than by force alone."""
+    widths = []
+    for name, more in (("force", ""), ("both", 'ultrasound = "a-layers.csv"\n')):
+        (tmp_path / name).mkdir()
+        context = stored(tmp_path / name, monkeypatch, more)
+        study = context.study
+        laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
+        at = laboratory.anchored(study.vector(TRUTH))
+        known = linearised(study, laboratory.records, study.vector(TRUTH), at)
+        widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
+    assert [one.name for one in laboratory.records] == ["a", "a+skin", "a+muscle"]
+    assert [one.unit for one in laboratory.measured] == ["N", "mm", "mm"]
+    for one, response, noise in zip(
+        laboratory.records[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
+    ):
+        off = response.force_N - one.compared
+        assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.0
+    assert laboratory.simulated == 1
+    assert (widths[1] < widths[0]).all()
+    answer = {"parameters": TRUTH, "iterations": [{"starts": []}]}
+    told = {"covariance_log": known.covariance.tolist(), "residuals": known.residual_model.to_dict()}
+    context.store["calibrate"].mkdir()
+    content = {"stages": [answer], "uncertainty": told}
+    write_json(context.store["calibrate"] / "calibration.json", content)
+    context.store["predict"].mkdir()
+    run_predict(context, context.store["predict"])
+    (row,) = context.store.read("predict", "predict.json")["sites"]
+    assert {one["tissue"]: one["thickness_mm"] for one in row["layers"]} == pytest.approx(
+        {"skin": 3.0, "muscle": 9.0}, abs=0.1
+    )
+    assert (context.store["predict"] / "a+muscle.csv").is_file()
+    figure = layer_figure(load_store(study.results), fitted=True)
+    assert figure is not None
+    assert "a, muscle" in figure.markup

@@ -47,7 +47,8 @@ def compressions(result: Result, model: SiteModel, times_s: Array) -> tuple[Arra
     """What each of the model's layers has lost of its thickness at times (n,), mm: (t, n).
 
     And its derivatives (t, n, p) with respect to the solver's parameters, where the states have some. The
-    result must hold all of its states (``store="all"``). Zero where the indenter does not push.
+    result must hold all of its states (``store="all"``). Tissue that the indenter has left comes back by and
+    by, so compressions go on where the force has ended.
     """
     axis, states = np.array(model.axis), result.states
     gauges = layer_gauges(model, result.problem.mesh)
@@ -58,7 +59,8 @@ def compressions(result: Result, model: SiteModel, times_s: Array) -> tuple[Arra
         """Values (t, ...) of the states at the wanted times, (t, n, ...); at rest all are zero."""
         column = np.array([np.zeros_like(values[0]), *values])
         kinks = result.problem.history.kinks
-        return np.moveaxis(interpolate(result.times[steps], result.force[steps], kinks, column, at), 0, 1)
+        everywhere = np.ones(len(column))
+        return np.moveaxis(interpolate(result.times[steps], everywhere, kinks, column, at), 0, 1)
 
     def read(field: Array) -> Array:
         """What all gauges say of a nodal field (nodes, 3, ...)."""

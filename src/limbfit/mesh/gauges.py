@@ -84,7 +84,9 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
 
 def _gauge(region: str, pairs: list[tuple[_Crossing, _Crossing]]) -> Gauge:
     nodes = np.concatenate([one.nodes for pair in pairs for one in pair])
-    weights: Array = np.concatenate([part for top, bottom in pairs for part in (top.weights, -bottom.weights)])
+    weights: Array = np.concatenate(
+        [part for top, bottom in pairs for part in (top.weights, -bottom.weights)]
+    )
     kept, place = np.unique(nodes, return_inverse=True)
     thickness = sum(bottom.along_mm - top.along_mm for top, bottom in pairs)
     return Gauge(region, float(thickness), kept, np.bincount(place, weights).astype(np.float64))
