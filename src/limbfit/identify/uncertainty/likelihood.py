@@ -112,9 +112,10 @@ class Likelihood:
             forces, doubt = self.doubting(p)
         residual = self._whiten(forces.T).T - self._target
         variances = 1.0 + np.atleast_1d(factor)[:, None] ** 2 * self._misfit
-        variances = variances + doubt[:, self._site] ** 2 * self._per_N2
         beliefs = np.log(p) @ self._rows.T - self._known
-        found = self._told(residual, variances) + np.sum(beliefs**2, axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):  # far from all runs: not finite, so infinite
+            variances = variances + doubt[:, self._site] ** 2 * self._per_N2
+            found = self._told(residual, variances) + np.sum(beliefs**2, axis=1)
         found = np.where(np.isfinite(found), found, np.inf) + self._constant
         outside = np.any((z < self.space.lower - 1e-9) | (z > self.space.upper + 1e-9), axis=1)
         return np.where(outside, np.inf, found)
