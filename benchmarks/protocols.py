@@ -19,6 +19,7 @@ import os
 import resource
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,11 @@ from limbfit import load_study, plan_protocol, run_study
 from limbfit.anatomy.meshing.meshing import base_mesh, mesh_site
 from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
+from limbfit.execution import SerialExecutor
 from limbfit.fe import solve
+from limbfit.identify.checks.design import NoiseModel, information_of, prior_information
+from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan
+from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import SiteModel, build_problem, compressions, to_vector
 from limbfit.mesh import Mesh, gauges_along, read_vtu, write_vtu
 from limbfit.phantom.record import (
@@ -53,8 +58,12 @@ from limbfit.phantom.record import (
     ULTRASOUND_HZ,
     ULTRASOUND_NOISE_MM,
 )
+from limbfit.pipeline.experiments.protocol import DETERMINED
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
 from limbfit.pipeline.shared.store import Store, write_json
-from limbfit.study import IndenterTable
+from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.study import IndenterTable, Study
 
 SLOW, FAST, HOLD_S = 0.96, 4.8, 30.0
 BALL = IndenterTable(shape="sphere", width_mm=12.0)
@@ -62,6 +71,8 @@ BALL_TABLE = '\n[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
 PRIORS = 'priors = "population"\n'
 REST_S, SETUP_S, MINUTES = 30.0, 60.0, 25.0
 AFTER_S = 0.4
+# Of linear theory: noise of a compared force, and the model's own error, which drifts along a record.
+EXPECTED_N, EXPECTED_CORRELATION, MISFITS = 0.015, 0.95, (0.02, 0.01, 0.005, 0.002)
 TISSUES = ("skin", "muscle")
 
 
@@ -212,18 +223,27 @@ def minutes_of(takes: Sequence[Take]) -> float:
     return (sum(take.knots[0][-1] + REST_S for take in takes) + SETUP_S * len(places)) / 60.0
 
 
-def designed(folder: Path, limb: Limb, edge_mm: float, ultrasound: bool) -> tuple[Take, ...]:
-    """The protocol that limbfit designs before anybody is indented: at the start and two more tissues."""
-    place = folder / f"plan{'-seen' if ultrasound else ''}"
+def plan_study(folder: Path, limb: Limb, edge_mm: float) -> Study:
+    """The fitted sites as they are before anybody is indented but for a ramp at each, with both indenters."""
+    place = folder / "plan"
     if not (place / "study.toml").is_file():
         write_case(place, limb, RAMPS, edge_mm, True, ())
         text = (place / "study.toml").read_text()
         (place / "study.toml").write_text(text.replace("\n[[sites]]", f"{BALL_TABLE}\n[[sites]]", 1))
     study = load_study(place)
     run_study(study, until="mesh", listener=lambda event: None)
+    return study
+
+
+def designed(folder: Path, limb: Limb, edge_mm: float, ultrasound: bool) -> tuple[Take, ...]:
+    """The protocol that limbfit designs before anybody is indented: at the start and two more tissues."""
     seen = ULTRASOUND_NOISE_MM if ultrasound else None
     found = plan_protocol(
-        study, minutes=MINUTES, speeds_mm_s=(SLOW, FAST), holds_s=(0.0, HOLD_S), ultrasound_sd_mm=seen
+        plan_study(folder, limb, edge_mm),
+        minutes=MINUTES,
+        speeds_mm_s=(SLOW, FAST),
+        holds_s=(0.0, HOLD_S),
+        ultrasound_sd_mm=seen,
     )
     return tuple(
         Take(
@@ -236,6 +256,74 @@ def designed(folder: Path, limb: Limb, edge_mm: float, ultrasound: bool) -> tupl
         )
         for row in found["records"]
     )
+
+
+def told_of(
+    folder: Path, limb: Limb, edge_mm: float, takes: Sequence[Take], misfit: float
+) -> dict[Take, Option]:
+    """What records tell of the true tissue where the model's own error is ``misfit`` of the largest value.
+
+    With what ultrasound sees where a take is ``seen``. Simulated on the study's meshes, once.
+    """
+    study = plan_study(folder, limb, edge_mm)
+    context = Context(study, Store(study.results), SerialExecutor(), lambda event: None)
+    truth = study.vector(parameters_of(limb.seed))
+    force = NoiseModel(EXPECTED_N, misfit, EXPECTED_CORRELATION)
+    layers = NoiseModel(ULTRASOUND_NOISE_MM, misfit, EXPECTED_CORRELATION)
+    plain = [replace(take, seen=False) for take in takes]
+    jobs = []
+    for take in plain:
+        site = study.site(take.site).model_copy(update={"indenter": "ball" if take.ball else None})
+        model = site_model(context, site, *take.knots, searched=True, layers=TISSUES)
+        jobs.append(curve_job(replace(model, name=take.name), study.tissues, truth))
+    found = {}
+    done = SimulationCache(folder / f"expected-{limb.seed}").run(jobs, context.executor)
+    for take, one in zip(takes, done, strict=True):
+        if not one.completed:
+            raise SystemExit(f"{take.name} could not be simulated: {one.reason}")
+        information = information_of(SiteResponse(one.force_N, one.jacobian), truth, force)
+        if take.seen:
+            for lost, slopes in zip(one.compression_mm, one.compression_jacobian, strict=True):
+                information = information + information_of(SiteResponse(lost, slopes), truth, layers)
+        place = take.site, "ball" if take.ball else "punch"
+        found[take] = Option(place, take.knots[0][-1] + REST_S, information[None])
+    return found
+
+
+def expected(folder: Path, limb: Limb, edge_mm: float) -> list[dict[str, Any]]:
+    """What linear theory expects of every protocol at the true tissue, by the size of the model's own error.
+
+    The designed ones are the best that fit into the session; all within the study's bounds.
+    """
+    study, rows = plan_study(folder, limb, edge_mm), []
+    wanted = Wanted(prior_information(unknowns(study)), tuple(range(8)))
+    every = [
+        Take(site, speed, hold, ball, seen=seen)
+        for site, speed, hold, ball, seen in product(
+            FITTED, (SLOW, FAST), (0.0, HOLD_S), (False, True), (False, True)
+        )
+    ]
+    for misfit in MISFITS:
+        options = told_of(folder, limb, edge_mm, every, misfit)
+        chosen = {name: takes for name, takes in INGREDIENTS.items() if name != "prior"}
+        for name, seen in (("designed", True), ("designed without ultrasound", False)):
+            some = [take for take in every if take.seen == seen]
+            best = plan([options[take] for take in some], Budget(60.0 * MINUTES, SETUP_S), wanted)
+            chosen[name] = tuple(some[i] for i in best)
+        for name, takes in chosen.items():
+            told = [options[take] for take in takes]
+            (factors,) = factors_95(wanted.covariances(told, range(len(told)), 1))
+            rows.append(
+                {
+                    "case": name,
+                    "misfit_percent": 100 * misfit,
+                    "records": len(takes),
+                    "minutes": minutes_of(takes),
+                    "determined": int(np.sum(factors <= DETERMINED)),
+                    "factor_95": factors.tolist(),
+                }
+            )
+    return rows
 
 
 def judged(folder: Path, limb: Limb, takes: Sequence[Take]) -> dict[str, Any]:
@@ -290,6 +378,14 @@ def line(case: dict[str, Any]) -> str:
     )
 
 
+def told(row: dict[str, Any]) -> str:
+    factors = ", ".join(f"{factor:.2f}" for factor in row["factor_95"])
+    return (
+        f"{row['misfit_percent']:g} % of model error, {row['case']}: {row['records']} records in "
+        f"{row['minutes']:.0f} min, {row['determined']} of 8 determined; x/ {factors}"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--folder", type=Path, default=Path("runs/protocols"))
@@ -297,9 +393,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--edge", type=float, default=6.0, help="of the study's meshes near a site, mm")
     parser.add_argument("--json", type=Path, help="write every case here; cases found there are kept")
+    parser.add_argument("--expected", action="store_true", help="linear theory at the truth instead of fits")
     given = parser.parse_args()
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    if given.expected:
+        for seed in given.seeds:
+            for row in expected(given.folder, Limb(given.folder, seed), given.edge):
+                print(told(row), flush=True)
+        return
     cases = json.loads(given.json.read_text()) if given.json and given.json.is_file() else []
     for seed in given.seeds:
         for name in given.only:

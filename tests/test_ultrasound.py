@@ -19,7 +19,7 @@ from limbfit.mesh import gauges_along, write_vtu
 from limbfit.phantom.record import Ramp, record, write_ultrasound
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
-from limbfit.pipeline.shared.store import write_json
+from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.sections.layers import layer_figure
@@ -146,6 +146,9 @@ unload_steps = 8
 penalty_per_mm = 100.0
 [mesh.coarse]
 edge_near_mm = 6.0
+[calibration]
+max_iterations = 2
+corrections = 1
 [[sites]]
 name = "a"
 fitted = true
@@ -205,13 +208,14 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.0
     assert laboratory.simulated == 1
     assert (widths[1] < widths[0]).all()
-    answer = {"parameters": TRUTH, "iterations": [{"starts": []}]}
-    told = {"covariance_log": known.covariance.tolist(), "residuals": known.residual_model.to_dict()}
-    context.store["calibrate"].mkdir()
-    content = {"stages": [answer], "uncertainty": told}
-    write_json(context.store["calibrate"] / "calibration.json", content)
-    context.store["predict"].mkdir()
-    run_predict(context, context.store["predict"])
+    for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
+        context.store[stage].mkdir()
+        run(context, context.store[stage])
+    found = context.store.read("calibrate", "calibration.json")
+    assert list(found["contact"]) == ["a"]
+    assert found["uncertainty"]["residuals"]["sites"]["a+muscle"]["unit"] == "mm"
+    last = found["stages"][-1]["iterations"][-1]
+    assert list(last["error_percent_by_site"]) == ["a", "a+skin", "a+muscle"]
     (row,) = context.store.read("predict", "predict.json")["sites"]
     assert {one["tissue"]: one["thickness_mm"] for one in row["layers"]} == pytest.approx(
         {"skin": 3.0, "muscle": 9.0}, abs=0.1

@@ -88,6 +88,11 @@ class Laboratory:
         """How many simulations an evaluation takes: one of each record."""
         return sum(record.seen is None for record in self.records)
 
+    def of_records(self, responses: Sequence[SiteResponse]) -> Responses:
+        """Those of the records themselves, without what ultrasound saw beside them."""
+        pairs = zip(self.records, responses, strict=True)
+        return [response for record, response in pairs if record.seen is None]
+
     @property
     def measured(self) -> list[Measured]:
         return [record.measured for record in self.records]
