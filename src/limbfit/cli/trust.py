@@ -75,9 +75,11 @@ def design(
         str | None, typer.Option(help="with --protocol: parameters such as muscle.c_kPa; default: all")
     ] = None,
     criterion: Annotated[Literal["D", "A"], typer.Option(help="with --protocol: D or A")] = "D",
-    draws: Annotated[
-        int, typer.Option(help="with --protocol: how many tissues to judge by", min=1, max=64)
-    ] = 3,
+    draws: Annotated[int, typer.Option(help="with --protocol: how many tissues", min=1, max=64)] = 3,
+    ultrasound: Annotated[
+        float | None,
+        typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.
@@ -101,6 +103,7 @@ def design(
                 determine=determine.split(",") if determine else (),
                 criterion=criterion,
                 draws=draws,
+                ultrasound_sd_mm=ultrasound,
                 parameters=used,
                 listener=listener,
             )

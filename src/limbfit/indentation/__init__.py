@@ -1,6 +1,7 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
 from ..laws import Parameters, flat_names, to_parameters, to_vector
+from .layers import compressions, layers_under
 from .neighbourhood import Extension, neighbourhood
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
 from .sites import (
@@ -21,10 +22,12 @@ __all__ = [
     "SimulationJob",
     "SiteModel",
     "build_problem",
+    "compressions",
     "fibre_field",
     "first_steps",
     "flat_names",
     "job_fields",
+    "layers_under",
     "materials",
     "neighbourhood",
     "read_indenter",

@@ -59,6 +59,7 @@ class SiteModel:
     extensions_digest: str = ""
     site: str = ""
     knots_N: tuple[float, ...] = ()
+    layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
 
     @property
     def forced(self) -> bool:

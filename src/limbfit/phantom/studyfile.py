@@ -52,9 +52,14 @@ fitted = {fitted}
 trace = "traces/site-{name}.csv"
 near = [{x:.1f}, {y:.1f}, {z:.1f}]
 """
+_ULTRASOUND = """\
+ultrasound = "traces/site-{name}-layers.csv"   # thickness of the tissues under the indenter meanwhile
+"""
 
 
-def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequence[LayerSpec]) -> str:
+def study_text(
+    sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequence[LayerSpec], ultrasound: bool = False
+) -> str:
     """The content of ``study.toml`` for some sites of a limb under some layers."""
     head = _HEAD.format(
         seed=seed,
@@ -70,6 +75,8 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequen
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
+        if ultrasound:
+            parts.append(_ULTRASOUND.format(name=site.name))
     return "".join(parts)
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
 from ..pipeline.shared.simulations import newest_simulations
-from ..pipeline.stages.traces import read_curves
+from ..pipeline.shared.tabular import read_curves
 from ..study import Record
 from .folder import StudyFolder
 from .processes import running, start_run, starting, stop_run

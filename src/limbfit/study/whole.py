@@ -207,6 +207,7 @@ class Study(TomlTable):
             **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
             **{f"{record.key}.trace": record.trace for record in self.recorded},
+            **{f"{record.key}.ultrasound": record.ultrasound for record in self.recorded},
         }
         if self.image is not None:
             named |= {"image.path": self.image.path, "image.markers": self.image.marked}
@@ -291,12 +292,15 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _forces_beside_depths(self) -> Study:
-        forced = [record.name for record in self.recorded if record.forced]
-        if forced and self.calibration.objective == "paper":
-            raise ValueError(
-                f'{forced[0]}: control = "force" compares depths, and objective = "paper" adds squares of '
-                'forces; use "pointwise"'
-            )
+        if self.calibration.objective != "paper":
+            return self
+        for record in self.recorded:
+            why = 'control = "force"' if record.forced else "ultrasound" if record.ultrasound else ""
+            if why:
+                raise ValueError(
+                    f'{record.name}: {why} compares depths, and objective = "paper" adds squares of '
+                    'forces; use "pointwise"'
+                )
         return self
 
     @model_validator(mode="after")

@@ -27,8 +27,8 @@ from ...identify.uncertainty.uncertainty import (
     verdict_of,
 )
 from ..shared.store import write_json
-from ..shared.tabular import write_table
-from ..stages.traces import SiteRecord, write_curves
+from ..shared.tabular import write_curves, write_table
+from ..stages.traces import SiteRecord
 from .emulator_file import EMULATOR, write_runs
 from .uncertainty_sources import Change
 

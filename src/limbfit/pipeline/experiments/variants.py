@@ -16,7 +16,7 @@ from ...mesh import read_vtu
 from ...study import Indentation, Record, Site
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
-from ..stages.traces import write_curves
+from ..shared.tabular import write_curves
 
 Array = NDArray[np.float64]
 

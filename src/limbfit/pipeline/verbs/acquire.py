@@ -35,7 +35,7 @@ from ...acquire.virtual import Fault, Limb, Serving, Surrogate, VirtualFitSocket
 from ...errors import InputError, TraceError
 from ...study import AcquireTable, Indentation, Record, Site, Study
 from ..shared.store import Store, disk_errors, write_json
-from ..stages.traces import read_curves, write_curves
+from ..shared.tabular import read_curves, write_curves
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"

@@ -15,6 +15,7 @@ from .comparison import comparison
 from .doubted import search_doubts
 from .doubts import doubts
 from .experiments import experiment_sections
+from .layers import layer_figure
 from .methods import method_section
 from .priors import prior_shares
 from .records import record_figure, trace_table
@@ -127,6 +128,7 @@ def fit(store: Results) -> Section:
     rows = [row for row in store.predicted if row.get("fitted")]
     blocks = _blocks(
         figures.force_figure(store, rows, "time_s", "forces-fitted", 2),
+        layer_figure(store, fitted=True),
         pictures.field_figure(store, store.fitted[:4], "predict", "field"),
         otherwise="No simulated forces of fitted sites are stored yet.",
     )
@@ -141,6 +143,7 @@ def prediction(store: Results) -> Section:
         figures.error_figure(store),
         figures.force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
+        layer_figure(store, fitted=False),
         otherwise="No predictions are stored yet.",
     )
     if store.predicted and not rows:
@@ -174,7 +177,7 @@ def _residuals(store: Results) -> str:
     if not rows:
         return ""
     sites = ", ".join(
-        f"{name} {fixed(site['noise_sd_N'], 3)} N and {fixed(site['misfit_sd_N'], 3)} N"
+        f"{name} {fixed(site['noise_sd_N'], 3)} and {fixed(site['misfit_sd_N'], 3)} {site.get('unit', 'N')}"
         for name, site in rows.items()
     )
     meshes = ", ".join(
