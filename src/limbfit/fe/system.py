@@ -40,6 +40,7 @@ class Increment:
     (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grips`` hold points along the bodies;
     points deeper than ``flat_from`` (mm) have the tangent of a flat body; the ``drives`` move the
     rigid bodies.  The ``pressures (k,)`` in MPa act, with ``rims (n, 3)`` as `Pressures.rims` gave them.
+    ``activation``: share of the active stress.
     """
 
     time: float
@@ -52,6 +53,7 @@ class Increment:
     flat_from: float = np.inf
     pressures: tuple[float, ...] = ()
     rims: Array | float = 0.0
+    activation: float = 0.0
 
     @property
     def lags(self) -> bool:
@@ -196,12 +198,12 @@ class System:
         if laws.fibred and not len(self.fibres):
             raise ProblemError("the fibres of a material have no direction", remedy="state Problem.fibres")
         size = len(self.indices) if tangent else 0
-        mean = self.element.mean_dilatation
+        mean, tables = self.element.mean_dilatation, laws.acting(increment.activation, increment.scale)
 
         def part(cells: slice) -> tuple[float, Array, Array]:
             residual, data = np.zeros_like(u), np.zeros(size)
             energy = assemble(
-                self.elements(cells), mean, laws.tables, increment.scale, increment.history[cells], u,
+                self.elements(cells), mean, tables, increment.scale, increment.history[cells], u,
                 tangent, self.cell_positions[cells], residual, data,
             )  # fmt: skip
             return energy, residual, data

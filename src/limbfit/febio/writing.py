@@ -261,9 +261,11 @@ def material_lines(number: int, name: str, material: Material, axis: str = "") -
     Raises
     ------
     ProblemError
-        For more terms than FEBio takes.
+        For more terms than FEBio takes, and for tissue that contracts.
     """
     table = material.table()
+    if table.active > 0.0:
+        raise ProblemError(f"tissue {name!r} contracts, which is not written for other programs")
     prony = [(g, tau) for g, tau in table.prony if g != 0.0]
     if max(len(prony), len(table.terms)) > MOST_TERMS:
         raise ProblemError(f"tissue {name!r} has more than {MOST_TERMS} terms, which FEBio does not take")
