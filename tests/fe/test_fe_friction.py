@@ -165,7 +165,7 @@ def test_friction_lies_between_frictionless_and_sticky():
 
 @pytest.mark.parametrize("shape", ["square", "sphere"])
 @pytest.mark.parametrize("mu", [0.1, 0.5])
-@pytest.mark.parametrize("sticking", ["anchored", "stepwise"])
+@pytest.mark.parametrize("sticking", ["anchored", pytest.param("stepwise", marks=pytest.mark.slow)])
 def test_sensitivities_with_friction_equal_central_differences(shape, mu, sticking):
     """Along one direction in the space of all eight parameters, pressing, dragging and letting go."""
     tight = StepControl(load_steps=3, unload_steps=2, tolerance=1e-9)

@@ -213,10 +213,11 @@ class System:
             energy += more[0]
             residual += more[1]
             data += more[2]
-        load_norm = 0.0
+        load_norm = self._contracting(laws, increment.activation)
         if increment.pressures:
-            pressing, pressed, load_norm = self.pressures.evaluate(u, increment.pressures, increment.rims)
+            pressing, pressed, pressure_norm = self.pressures.evaluate(u, increment.pressures, increment.rims)
             energy, residual = energy + pressing, residual + pressed
+            load_norm = max(load_norm, pressure_norm)
             if tangent:
                 self.pressures.tangent(u, increment.pressures, data)
         if not np.isfinite(energy) or self.bodies is None:
@@ -232,6 +233,13 @@ class System:
             float(np.linalg.norm(found.residual[: self.nodes])), found.touch, found.reactions,
             max(loads.norm, load_norm),
         )  # fmt: skip
+
+    def _contracting(self, laws: Laws, share: float) -> float:
+        """The size of active forces, N: their stress on a section of the tissue that contracts."""
+        if share == 0.0 or not laws.fibre[:, 2].any():
+            return 0.0
+        volumes = np.bincount(self.regions, self.weights.sum(axis=1), len(laws.kappa))
+        return share * float((laws.fibre[:, 2] * volumes ** (2.0 / 3.0)).max())
 
     def _contact(self, u: Array, increment: Increment, tangent: bool = False) -> Contacts:
         assert self.bodies is not None

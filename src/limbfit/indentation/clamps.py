@@ -1,20 +1,19 @@
 """The pins that hold the limb while one indents it, as rigid bodies under force.
 
-The device of the source paper (section 2.1) has 14 pins in a ring.  The one at the site indents, the two beside
-it stay clear of the skin so that tissue can bulge, and the other eleven press the limb with 14 to 16 N before
-the test.  There they then stay where they are; here each keeps its force.
+The device of the source paper (section 2.1) has 14 pins in a ring.  The one at the site indents, the two
+beside it stay clear of the skin so that tissue can bulge, and the other eleven press the limb with 14 to 16 N
+before the test.  There they then stay where they are; here each keeps its force.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import History, Indenter, Motion, Problem, Result, RigidBody, StepControl, System, solve
+from ..fe import History, Indenter, Motion, Problem, Result, RigidBody, StepControl, solve
 from ..fe.contact.contact import ContactSurface, touching_offset
 from ..mesh import Mesh
 
@@ -106,8 +105,8 @@ def clamping_pins(mesh: Mesh, indenter: Indenter, along: Array, clamps: Clamps) 
 def clamped(problem: Problem, along: Array, clamps: Clamps, control: StepControl) -> Clamped:
     """An indentation by displacement as it is in a limb that pins hold.
 
-    The limb is clamped first, with the test pin off the skin.  Where the skin then is, the indentation begins:
-    its history is that of ``problem`` from there.
+    The limb is clamped first, with the test pin off the skin.  Where the skin then is, the indentation
+    begins: its history is that of ``problem`` from there.
 
     Parameters
     ----------

@@ -46,7 +46,9 @@ class Laws:
     def acting(self, share: float, scale: Array) -> Tables:
         """`tables` with a ``share`` of the active stress, which kernels multiply by ``scale (r,)``, as all
         that is elastic."""
-        fibre = np.column_stack([self.fibre[:, :2], share * self.fibre[:, 2] / scale])
+        active = share * self.fibre[:, 2]
+        active = np.divide(active, scale, out=np.zeros_like(active), where=active != 0.0)
+        fibre = np.column_stack([self.fibre[:, :2], active])
         return self.numbers, self.kappa, self.law, self.elastic, fibre
 
     @property
