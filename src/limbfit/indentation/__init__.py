@@ -1,13 +1,13 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
 from ..laws import Parameters, flat_names, to_parameters, to_vector
+from .fibres import Direction, fibre_field
 from .neighbourhood import Extension, neighbourhood
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
 from .sites import (
     Array,
     SiteModel,
     build_problem,
-    fibre_field,
     materials,
     read_indenter,
     steps_of,
@@ -15,6 +15,7 @@ from .sites import (
 
 __all__ = [
     "Array",
+    "Direction",
     "Extension",
     "Parameters",
     "Simulation",
