@@ -120,6 +120,11 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     lines = [contact, "indenter: facets, without the side walls", "time: FEBio's own steps"]
     if not automatic:
         lines.append("force: within 2 % of the peak of limbfit's, as far as these go")
+    if any(_slides(body.friction) and body.sticking == "anchored" for body in problem.rigid_bodies):
+        lines.append(
+            "sticking: FEBio anchors what sticks anew in every step, so that it slips on in time; "
+            'limbfit does so with sticking = "stepwise"'
+        )
     shapes = [body.shape for body in problem.rigid_bodies]
     if not all(blunt(shape) for shape in shapes if isinstance(shape, Indenter)):
         lines.append(
