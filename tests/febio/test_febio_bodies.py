@@ -41,7 +41,7 @@ def block(**changes):
 
 def sheet(motion, **changes):
     faces = punched_block("hex8", 6).mesh.face_sets["skin"]
-    return RigidBody(SHEET, faces, motion, 0.3, pivot=(1.0, 2.0, 4.0), name="sheet", **changes)
+    return RigidBody(SHEET, faces, motion, 0.3, (1.0, 2.0, 4.0), "sheet", sticking="stepwise", **changes)
 
 
 def back(problem, folder):
@@ -71,7 +71,7 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
     found = back(problem, tmp_path)
     assert found.indenter is None
     (mine,), (theirs,) = problem.bodies, found.bodies
-    assert (theirs.name, theirs.friction) == ("sheet", 0.3)
+    assert (theirs.name, theirs.friction, theirs.sticking) == ("sheet", 0.3, "stepwise")
     np.testing.assert_array_equal(theirs.pivot, mine.pivot)
     np.testing.assert_array_equal(theirs.faces, mine.faces)
     np.testing.assert_array_equal(theirs.shape.points[theirs.shape.faces], SIDE[SHEET.faces])

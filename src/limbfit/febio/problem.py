@@ -69,6 +69,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         supports=supports,
         start="as-given",
         friction=friction or "frictionless",
+        sticking="anchored" if placed is None else touching[name][0].sticking,
         bodies=tuple(
             rigid_body(model, name, touching[name], motion, tissue) for name, motion in driven.motions.items()
         ),

@@ -1,6 +1,7 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
 from ..laws import Parameters, flat_names, to_parameters, to_vector
+from .fibres import Direction, fibre_field
 from .layers import compressions, layers_under
 from .neighbourhood import Extension, neighbourhood
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
@@ -8,7 +9,6 @@ from .sites import (
     Array,
     SiteModel,
     build_problem,
-    fibre_field,
     materials,
     read_indenter,
     steps_of,
@@ -16,6 +16,7 @@ from .sites import (
 
 __all__ = [
     "Array",
+    "Direction",
     "Extension",
     "Parameters",
     "Simulation",

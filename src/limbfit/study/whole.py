@@ -115,7 +115,7 @@ class Study(TomlTable):
         return LAWS[self.material.law]
 
     @property
-    def fibres(self) -> dict[str, Literal["axis"] | Vector]:
+    def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:
         """Direction of the fibres in the tissues that have some: the limb's axis in the core by default."""
         if self.material.law != FIBRED:
             return {}

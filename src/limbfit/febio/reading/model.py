@@ -69,6 +69,11 @@ class Contact:
         """Whether it has a penalty of FEBio's; augmented and nodal contact are limbfit's own."""
         return not self.augmented and self.rule != "sliding-node-on-facet"
 
+    @property
+    def sticking(self) -> str:
+        """The law by which it sticks, as in `limbfit.Problem`."""
+        return "stepwise" if self.rule == "sliding-elastic" else "anchored"
+
     def acts_as(self, other: Contact) -> bool:
         """Whether both have one law, wherever they act."""
         return replace(self, surfaces=other.surfaces, line=other.line) == other

@@ -19,12 +19,12 @@ from ...donning import SETTLING, Donned, Fit, Held, Load, Patch, Row, don, socke
 from ...donning.model import OUTER
 from ...errors import RunError
 from ...fe.materials import Material
-from ...indentation import Parameters, fibre_field, materials
+from ...indentation import Direction, Parameters, fibre_field, materials
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
 from ...socket.regions import Region
-from ...study import Study, Vector
+from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import fibres_of
 from ..shared.socket_shape import load_of, regions_of
@@ -58,7 +58,7 @@ class SocketLimb:
     outer: Anatomy
     depth: Array | None
     regions: Mapping[str, Region]
-    fibres: tuple[tuple[str, Vector], ...]
+    fibres: tuple[tuple[str, Direction], ...]
 
     @classmethod
     def of(cls, context: Context, name: str) -> SocketLimb:

@@ -13,8 +13,8 @@ import numpy as np
 from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
-from ...indentation import Simulation, SimulationJob, SiteModel, simulate
-from ...study import Indentation, Record, Site, Study, Vector
+from ...indentation import Direction, Simulation, SimulationJob, SiteModel, simulate
+from ...study import Indentation, Record, Site, Study
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
@@ -142,10 +142,13 @@ def job_digest(job: SimulationJob) -> str:
     )
 
 
-def fibres_of(context: Context) -> tuple[tuple[str, Vector], ...]:
-    """The direction of the fibres in each tissue that has some, of length one."""
-    found = []
+def fibres_of(context: Context) -> tuple[tuple[str, Direction], ...]:
+    """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
+    found: list[tuple[str, Direction]] = []
     for tissue, stated in context.study.fibres.items():
+        if stated == "flow":
+            found.append((tissue, "flow"))
+            continue
         along = context.stored("surfaces", "surfaces.json")["cut_normal"] if stated == "axis" else stated
         x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
         found.append((tissue, (x, y, z)))
