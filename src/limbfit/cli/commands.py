@@ -62,6 +62,9 @@ def phantom(
     ] = Detail.coarse,
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
     fat: Annotated[bool, typer.Option("--fat", help="three tissues: skin, fat and muscle")] = False,
+    tendon: Annotated[
+        bool, typer.Option("--tendon", help="also a patellar tendon, a tissue of its own in the muscle")
+    ] = False,
     socket: Annotated[bool, typer.Option("--socket", help="also a rectified socket for it")] = False,
     ultrasound: Annotated[
         bool, typer.Option("--ultrasound", help="also what ultrasound sees under the indenter")
@@ -77,6 +80,7 @@ def phantom(
             fat=fat,
             socket=socket,
             ultrasound=ultrasound,
+            tendon=tendon,
             listener=listener,
         )
     if as_json:

@@ -13,6 +13,7 @@ from ...mesh import Mesh, MeshQuality, quality
 from ..surfaces.surfaces import Anatomy, Surface
 from .layered import inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
+from .regions import interfaces, region_level
 from .untangling import Repair
 
 Array = NDArray[np.float64]
@@ -30,6 +31,8 @@ class MeshReport:
     ``layer_mean_mm`` and ``layer_std_mm`` are the thickness of all layers together, measured from points all
     over their meshed inner face to the meshed skin; ``layer_thickness_mm`` gives mean, deviation, least and
     greatest of each. ``interface_error_mm`` is how far that inner face is from where it was asked for.
+    ``regions`` gives of each region inside the core the volume that its surface encloses there, mm3, and how
+    far its meshed surface is from that, mean and max, mm.
     ``repairs`` made inverted cells sound.
     """
 
@@ -46,6 +49,7 @@ class MeshReport:
     layer_std_mm: float
     layer_thickness_mm: Mapping[str, Mapping[str, float]]
     interface_error_mm: Mapping[str, float]
+    regions: Mapping[str, Mapping[str, float]]
     trimmed_bone: Mapping[str, TrimmedBone]
     thinned_skin: ThinnedSkin | None
     seconds: float
@@ -59,18 +63,21 @@ def mesh_report(
     fields: LimbFields,
     trimmed: Mapping[str, TrimmedBone],
     enclosed_mm3: float,
+    regions_mm3: Mapping[str, float],
     seconds: float,
     engine: str,
 ) -> MeshReport:
-    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have."""
+    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have, ``regions_mm3``
+    that of each region inside the core.
+    """
     found = quality(mesh)
     volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
-    layers = len(mesh.region_names) - 1
+    layers = len(fields.depths)
     faces = [_facets(mesh.face_sets["skin"]), *(_facets(inner_faces(mesh, i)) for i in range(layers))]
     whole = _thickness(mesh, faces[-1], faces[0])
     each = {
         name: _summary(_thickness(mesh, faces[i + 1], faces[i]))
-        for i, name in enumerate(mesh.region_names[:-1])
+        for i, name in enumerate(mesh.region_names[:layers])
     }
     error = np.abs(fields.layer(mesh.points[faces[-1]].mean(axis=1))[0])
     return MeshReport(
@@ -87,12 +94,26 @@ def mesh_report(
         layer_std_mm=float(whole.std()),
         layer_thickness_mm=each,
         interface_error_mm={"mean": float(error.mean()), "max": float(error.max())},
+        regions=_regions(mesh, fields, regions_mm3),
         trimmed_bone=trimmed,
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
         warnings=_warnings(found, volume_error),
     )
+
+
+def _regions(mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    found = {}
+    for number, faces in enumerate(interfaces(mesh, len(fields.depths))):
+        error = np.abs(region_level(fields, number)(mesh.points[faces[:, :3]].mean(axis=1))[0])
+        name = mesh.region_names[len(fields.depths) + number]
+        found[name] = {
+            "enclosed_mm3": regions_mm3[name],
+            "mean_mm": float(error.mean()) if len(error) else 0.0,
+            "max_mm": float(error.max(initial=0.0)),
+        }
+    return found
 
 
 def _warnings(found: MeshQuality, volume_error: float) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ def make_phantom_study(
     fat: bool = False,
     socket: bool = False,
     ultrasound: bool = False,
+    tendon: bool = False,
     listener: Listener = quiet,
     workers: int = 0,
 ) -> dict[str, Any]:
@@ -43,6 +44,7 @@ def make_phantom_study(
             fat=fat,
             socket=socket,
             ultrasound=ultrasound,
+            tendon=tendon,
             mapping=mapping,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
         )
