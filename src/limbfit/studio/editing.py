@@ -72,7 +72,7 @@ def set_site(file: Path, site: str, values: Mapping[str, Any]) -> Study:
 
     A new place removes ``near``, and the other way round: a site has one of them.
     """
-    return edit_study(file, lambda document: _assign(_table_of(document, site, file), values))
+    return edit_study(file, lambda document: assign(_table_of(document, site, file), values))
 
 
 def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> Study:
@@ -83,7 +83,7 @@ def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> Study:
     def change(document: tomlkit.TOMLDocument) -> None:
         for table in document["records"]:
             if f"{table['site']}-{table['name']}" == record.name:
-                _assign(table, values)
+                assign(table, values)
 
     return edit_study(file, change)
 
@@ -96,7 +96,7 @@ def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[s
         if not isinstance(sites, list):
             raise StudyError("the study has no [[sites]] to add to", file=file, place="sites")
         table = tomlkit.table()
-        _assign(table, {"name": name, "position": position, **values})
+        assign(table, {"name": name, "position": position, **values})
         sites.append(table)
 
     return edit_study(file, change)
@@ -119,7 +119,7 @@ def set_key(file: Path, table: str, key: str, value: Any) -> Study:
     def change(document: tomlkit.TOMLDocument) -> None:
         if table not in document:
             document[table] = tomlkit.table()
-        _assign(document[table], {key: value})
+        assign(document[table], {key: value})
 
     return edit_study(file, change)
 
@@ -132,7 +132,8 @@ def _table_of(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:
     raise StudyError(f"no site is named {name!r}", file=file, place="sites")
 
 
-def _assign(table: Any, values: Mapping[str, Any]) -> None:
+def assign(table: Any, values: Mapping[str, Any]) -> None:
+    """Set keys of a table of a document; None removes one, and a new place the other kind of it."""
     for key, value in values.items():
         if value is None:
             table.pop(key, None)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import igl
 import numpy as np
 from fastapi import APIRouter, Response
+from pydantic import BaseModel, ConfigDict, Field
 
 from ..errors import InputError
 from ..mesh import read_vtu
@@ -15,13 +16,38 @@ from ..pipeline.shared.socket_shape import regions_of
 from ..web.arrays import pack
 from ..web.shapes import patient_frame, volume_of
 from .folder import StudyFolder, fingerprint, stored
+from .identification_routes import last_run
+from .model_routes import Place, Text
 from .playback import arrays_of
-from .scene import anatomy_of
+from .processes import running, start_socket, starting
+from .scene import anatomy_of, on_skin
+from .socket_shape import face_block, remove_area, set_area, shape_of
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/socket")
 SOCKET = "socket"  # the run of `limbfit socket`; others are designs, by their names
 _FIELDS = {"pressure": "pressure_kPa", "shear": "shear_kPa"}
+Length = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class AreaOfPage(_Strict):
+    """An area of the page: at a ``position`` that was clicked, or at the middle of a ``region``."""
+
+    name: Text
+    position: Place | None = None
+    region: Text | None = None
+    radius_mm: Length
+    depth_mm: Length
+
+
+class WantedRun(_Strict):
+    """Which command to run: that of the socket, or its design."""
+
+    design: bool = False
 
 
 def runs_of(folder: StudyFolder) -> list[dict[str, Any]]:
@@ -94,3 +120,40 @@ def get_step(folder: Folder, run: str, step: int, field: str) -> Response:
 
 def _block(arrays: dict[str, Any], facts: dict[str, Any]) -> Response:
     return Response(pack(arrays, facts), media_type="application/octet-stream")
+
+
+@router.get("/shape")
+def get_shape(folder: Folder) -> dict[str, Any]:
+    """What the study says of the shape, whether it can be drawn, and the run that goes on or begins."""
+    run = running(folder)
+    more = {"run": run, "starting": starting(folder), "last": last_run(folder, run is not None)}
+    return shape_of(folder) | more
+
+
+@router.get("/face")
+def get_face(folder: Folder) -> Response:
+    """The face with its offset from the bare skin; see `face_block`."""
+    return Response(face_block(folder), media_type="application/octet-stream")
+
+
+@router.post("/areas")
+def post_area(folder: Folder, area: AreaOfPage) -> dict[str, Any]:
+    """Add an area to the study file, or change the one of that name; the shape as it is afterwards."""
+    values = area.model_dump(exclude={"name"})
+    if area.position is not None:
+        values["position"] = on_skin(folder, area.position)
+    set_area(folder.file, area.name, values)
+    return shape_of(folder)
+
+
+@router.post("/areas/{name}/remove")
+def post_removal(folder: Folder, name: str) -> dict[str, Any]:
+    """Take an area out of the study file."""
+    remove_area(folder.file, name)
+    return shape_of(folder)
+
+
+@router.post("/start")
+def post_start(folder: Folder, wanted: WantedRun) -> dict[str, Any]:
+    """Start ``limbfit socket`` or ``limbfit socket design``, as a process of its own."""
+    return start_socket(folder, design=wanted.design)

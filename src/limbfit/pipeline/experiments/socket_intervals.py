@@ -1,8 +1,8 @@
 """Intervals of what a socket does to a limb: from the identified parameters, and from which of them.
 
 To first order a value with the slopes g by the logarithms of the parameters, whose covariance is C, has the
-variance g'Cg.  The share of a parameter i is g_i (C g)_i of it: the shares add up to one, and where
-parameters are correlated one of them may be negative.
+variance g'Cg.  The share of a parameter i is what of it would go if that one were known: (C g)_i^2 / C_ii,
+the squared correlation of the two.  Parameters are correlated, so that shares do not add up to one.
 """
 
 from __future__ import annotations
@@ -57,15 +57,16 @@ class Spread:
         Returns
         -------
         interval : 95 %.
-        shares : of its variance, percent, of every identified parameter, largest first.
+        shares : of its variance, percent, that would go if a parameter were known, largest first.
         changes : of the value where each parameter of the simulation is ``CHANGE_PERCENT`` larger.
         """
-        own = slopes[self.identified]
-        parts = own * (self.covariance @ own)
-        variance = float(parts.sum())
+        own = slopes[list(self.identified)]
+        along = self.covariance @ own
+        variance = float(own @ along)
         half = Z95 * np.sqrt(max(variance, 0.0))
-        shares = 100.0 * parts / variance if variance > 0.0 else np.zeros_like(parts)
-        found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-np.abs(shares))}
+        scale = np.maximum(np.diag(self.covariance) * variance, np.finfo(float).tiny)
+        shares = 100.0 * along**2 / scale
+        found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-shares)}
         by = np.log1p(CHANGE_PERCENT / 100.0) * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
         return [max(value - half, 0.0), value + half], found, changes

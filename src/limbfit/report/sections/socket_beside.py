@@ -32,7 +32,7 @@ def parameter(name: str) -> str:
 
 
 def interval_blocks(held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
-    """How much of each interval every identified parameter causes, and what a stiffer liner changes."""
+    """How much of each interval goes with every identified parameter, and what a stiffer liner changes."""
     rows = [(row["region"], "kPa", "", row["mean_kPa"], row) for row in held["regions"]]
     if "settling_mm" in held:
         rows.append(("settling", "mm", "settling_", held["settling_mm"], held))
@@ -53,9 +53,9 @@ def interval_blocks(held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
             cells.append(f"{fixed(row[f'{begin}change_{unit}'][STIFFNESS], decimals)} {unit}")
         lines.append(Row((heading(name), *map(numeric, cells))))
     caption = (
-        f"What the intervals of means and settling come from, {title}: the share of the variance of each "
-        "identified parameter, to first order. Where parameters are correlated a share may be negative. The "
-        "liner counts as known; the last column says what it changes."
+        f"What the intervals of means and settling come from, {title}: the share of the variance that would "
+        "go if a parameter were known, to first order. Parameters are correlated, so that shares do not add "
+        "up to 100 %. The liner counts as known; the last column says what it changes."
     )
     return (Table("socket-intervals", caption, tuple(head), tuple(lines)),)
 
