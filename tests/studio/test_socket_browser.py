@@ -100,7 +100,7 @@ def test_areas_are_placed_by_a_click_written_and_drawn_and_a_run_says_what_is_wr
     page.get_by_role("combobox", name="view").select_option("its shape")
     words, canvas = page.locator(".socket-shape-words"), page.locator(".view.socket .lf-canvas")
     until(lambda: "cm³" in words.inner_text())
-    until(lambda: "offset from the limb" in page.locator(".view.socket .lf-bar").inner_text())
+    until(lambda: "offset (mm)" in page.locator(".view.socket .lf-bar").inner_text())
     plain = canvas.screenshot()
     page.get_by_role("button", name="Add an area").click()
     box = canvas.bounding_box()

@@ -20,6 +20,7 @@ from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import AoT
 
 from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..errors import StudyError
@@ -72,7 +73,7 @@ def set_site(file: Path, site: str, values: Mapping[str, Any]) -> Study:
 
     A new place removes ``near``, and the other way round: a site has one of them.
     """
-    return edit_study(file, lambda document: assign(_table_of(document, site, file), values))
+    return edit_study(file, lambda document: _assign(_table_of(document, site, file), values))
 
 
 def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> Study:
@@ -83,7 +84,7 @@ def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> Study:
     def change(document: tomlkit.TOMLDocument) -> None:
         for table in document["records"]:
             if f"{table['site']}-{table['name']}" == record.name:
-                assign(table, values)
+                _assign(table, values)
 
     return edit_study(file, change)
 
@@ -96,7 +97,7 @@ def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[s
         if not isinstance(sites, list):
             raise StudyError("the study has no [[sites]] to add to", file=file, place="sites")
         table = tomlkit.table()
-        assign(table, {"name": name, "position": position, **values})
+        _assign(table, {"name": name, "position": position, **values})
         sites.append(table)
 
     return edit_study(file, change)
@@ -119,9 +120,54 @@ def set_key(file: Path, table: str, key: str, value: Any) -> Study:
     def change(document: tomlkit.TOMLDocument) -> None:
         if table not in document:
             document[table] = tomlkit.table()
-        assign(document[table], {key: value})
+        _assign(document[table], {key: value})
 
     return edit_study(file, change)
+
+
+def set_area(file: Path, name: str, values: Mapping[str, Any]) -> Study:
+    """Change an area of ``[[socket.areas]]``, or add one of that name; None removes a key."""
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        rows = _areas(document)
+        known = next((row for row in rows if str(row.get("name")) == name), None)
+        if known is None:
+            known = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
+            _assign(known, {"name": name, **values})
+            rows.append(known)
+        else:
+            _assign(known, values)
+
+    return edit_study(file, change)
+
+
+def remove_area(file: Path, name: str) -> Study:
+    """Take an area out of the study file.
+
+    Raises
+    ------
+    StudyError
+        Where there is none of that name.
+    """
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        rows = _areas(document)
+        names = [str(row.get("name")) for row in rows]
+        if name not in names:
+            raise StudyError(f"no area is named {name!r}", file=file, place="socket.areas")
+        del rows[names.index(name)]
+
+    return edit_study(file, change)
+
+
+def _areas(document: tomlkit.TOMLDocument) -> Any:
+    """The list of areas, made where there is none."""
+    if "socket" not in document:
+        document["socket"] = tomlkit.table()
+    table: Any = document["socket"]
+    if "areas" not in table:
+        table["areas"] = tomlkit.aot()
+    return table["areas"]
 
 
 def _table_of(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:
@@ -132,8 +178,7 @@ def _table_of(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:
     raise StudyError(f"no site is named {name!r}", file=file, place="sites")
 
 
-def assign(table: Any, values: Mapping[str, Any]) -> None:
-    """Set keys of a table of a document; None removes one, and a new place the other kind of it."""
+def _assign(table: Any, values: Mapping[str, Any]) -> None:
     for key, value in values.items():
         if value is None:
             table.pop(key, None)

@@ -57,7 +57,7 @@ export class ShapeEditor {
     const sorted = Float32Array.from(this.values, Math.abs).sort();
     const most = Math.max(sorted[Math.floor(0.98 * (sorted.length - 1))], 0.1); // the brim turns far out
     const beyond = sorted.at(-1) > most;
-    this.view.viewer?.setColours({ map: this.view.map(), low: -most, high: most, beyond: [beyond, beyond], title: "offset from the limb (mm), negative: pressed in" });
+    this.view.viewer?.setColours({ map: this.view.map(), low: -most, high: most, beyond: [beyond, beyond], title: "offset (mm), negative: pressed in" });
   }
 
   /** Forget what is drawn: another picture takes its place. */
