@@ -68,7 +68,7 @@ FINDINGS = (
 
 def published(regions: Collection[str]) -> list[Mapping[str, Any]]:
     """The findings over any of the ``regions``, or over the whole limb, as they are stored."""
-    rows = []
+    rows: list[Mapping[str, Any]] = []
     for finding in FINDINGS:
         here = [name for name in finding.regions if name in regions or name == WHOLE]
         if here:

@@ -163,7 +163,7 @@ def shape_of(folder: StudyFolder) -> dict[str, Any]:
 def _place(position: Any, region: str | None, regions: Mapping[str, Any]) -> list[float] | None:
     if position is not None:
         return [float(x) for x in position]
-    return [float(x) for x in regions[region].position] if region in regions else None
+    return [float(x) for x in regions[region].position] if region and region in regions else None
 
 
 def face_block(folder: StudyFolder) -> bytes:

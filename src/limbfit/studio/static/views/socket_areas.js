@@ -79,7 +79,7 @@ export class ShapeEditor {
     replace(this.list, ...areas.map((area) => el("li", {},
       el("button", { type: "button", class: "quiet site", "aria-pressed": String(area.name === this.chosen), onclick: () => this.choose(area.name) },
         el("strong", {}, area.name), el("span", { class: "region" }, area.region ?? ""),
-        el("span", { class: "hint" }, `${area.depth_mm} mm, ${area.radius_mm} mm wide each way`)))));
+        el("span", { class: "hint" }, `${area.depth_mm} mm, radius ${area.radius_mm}`)))));
     this.showForm();
   }
 
