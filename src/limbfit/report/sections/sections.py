@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from .. import site_tables, tables
 from ..drawing import figures, pictures
 from ..drawing.interactive import convergence_curves, explorer, record_curves
+from ..drawing.layer_figures import layer_figure
 from ..drawing.slices import slices_figure
 from ..formats import fixed
 from ..page import Block, Bullets, Figure, Note, Page, Prose, Section, Table
@@ -15,7 +16,6 @@ from .comparison import comparison
 from .doubted import search_doubts
 from .doubts import doubts
 from .experiments import experiment_sections
-from .layers import layer_figure
 from .methods import method_section
 from .priors import prior_shares
 from .records import record_figure, trace_table

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import matplotlib
 
-from ..drawing.figures import thin
-from ..drawing.ink import MEASURED, SIMULATED, STYLE, legend_above, panels, svg
 from ..formats import fixed
 from ..page import Figure
 from ..store import Results
+from .figures import thin
+from .ink import MEASURED, SIMULATED, STYLE, legend_above, panels, svg
 
 
 def layer_figure(store: Results, fitted: bool) -> Figure | None:
