@@ -16,7 +16,7 @@ from limbfit.study import Study
 
 # Keys that hold tables.
 TABLES = (
-    *("geometry.proximal_cut", "geometry.amputation", "geometry.layers"),
+    *("geometry.proximal_cut", "geometry.amputation", "geometry.layers", "geometry.regions"),
     *("socket.areas", "socket.trim_planes"),
 )
 DOCS = Path(__file__).parents[1] / "docs" / "study.md"

@@ -48,6 +48,7 @@ IMAGED: dict[str, Any] = {
 GIVEN: dict[str, Any] = {
     "study": {"name": "one"},
     "surfaces": {"skin": "skin.stl", "bones": {"tibia": "tibia.stl"}},
+    "geometry": {"regions": [{"name": "scar", "surface": "other.stl"}]},
     "sites": [
         {"name": "1", "fitted": True, "trace": "1.csv", "position": [0.0, -50.0, 10.0]},
         {"name": "2", "depth_mm": 6.0, "position": [0.0, 50.0, 10.0]},
@@ -173,6 +174,8 @@ ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
     "geometry.amputation": ("surfaces", {"point": [0.0, 0.0, 0.0]}),
     "geometry.proximal_cut": ("surfaces", {"point": [0.0, 0.0, 90.0]}),
     "geometry.layers": ("mesh", [{"name": "hide", "thickness_mm": 3.0}]),
+    "geometry.regions.0.name": ("mesh", "tendon"),
+    "geometry.regions.0.surface": ("surfaces", "tibia.stl"),
     "calibration.objective": ("calibrate", "paper"),
     "indenter": ("calibrate", {"shape": "stl", "file": "other.stl"}),
     "sites.0.position": ("sites", [0.0, -51.0, 10.0]),
@@ -205,6 +208,7 @@ READ: dict[str, str] = {
 # How else the tables above name them.
 OTHER_NAMES = {
     "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
+    "geometry.regions.label": "geometry.regions.surface",  # instead of it
     "indenter.file": "indenter",
     "indenters.file": "indenters.ball",
     "calibration.prior.median": "calibration.prior.skin.c_kPa.median",

@@ -42,3 +42,12 @@ def limb(turn: np.ndarray | None = None, bone_offset: float = 8.0) -> Anatomy:
     move = np.array([12.0, -80.0, 300.0]) if turn is not None else np.zeros(3)
     skin, bone = (Surface(part.points @ turn.T + move, part.faces) for part in (skin, bone))
     return Anatomy(skin, {"tibia": bone}, move, turn[:, 2])
+
+
+def ellipsoid(centre: np.ndarray, axes: np.ndarray, rings: int = 24) -> Surface:
+    """A closed ellipsoid about a centre, its axes along x, y and z."""
+    angle = np.linspace(0, np.pi, rings)[1:-1]
+    ball = revolved(np.sin(angle), -np.cos(angle), 48)
+    points = ball.points.copy()
+    points[[0, -1]] = [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]
+    return Surface(points * axes + centre, ball.faces)

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from limbfit import run_study
+from limbfit.anatomy.imaging import read_labels
 from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError, SiteError
 from limbfit.laws import LAWS
@@ -155,3 +157,35 @@ def test_simulated_forces_are_those_of_soft_tissue(tmp_path) -> None:
     stiffness = [site["peak_force_N"] / site["depth_mm"] for site in (tibia, posterior)]
     assert stiffness[0] > 1.5 * stiffness[1]  # thin tissue over bone is stiffer
     assert all(site["simulation"]["element"] == "tet10g8p0" for site in truth["sites"])
+
+
+@pytest.fixture(scope="module")
+def with_tendon(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("phantom") / "tendon"
+    make_phantom(folder, sites=["01"], tendon=True, mapping=cubic_law)
+    return folder
+
+
+def test_a_tendon_is_a_tissue_of_the_study_and_a_label_of_its_map(with_tendon: Path) -> None:
+    study = load_study(with_tendon)
+    assert study.tissues == ("skin", "tendon", "muscle")
+    truth = json.loads((with_tendon / "truth.json").read_text())["parameters"]
+    assert truth["tendon"]["c_kPa"] > 4.0 * truth["muscle"]["c_kPa"]
+    assert truth["tendon"] | {"c_kPa": 0} == truth["muscle"] | {"c_kPa": 0}
+    for name, _ in study.parameters:
+        lower, upper = (study.material.of(name, end)["c_kPa"] for end in ("lower", "upper"))
+        assert lower < truth[name]["c_kPa"] < upper
+    labels = read_labels(study.path(study.segmentation.labels))
+    drawn = float(labels.mask("patellar tendon").sum()) * labels.voxel_mm3
+    assert drawn == pytest.approx(load_anatomy(with_tendon / "truth").regions["tendon"].volume, rel=0.05)
+
+
+@pytest.mark.slow
+def test_its_mesh_has_the_tendon(with_tendon: Path) -> None:
+    study = load_study(with_tendon)
+    run_study(study, until="mesh")
+    facts = json.loads((study.results / "mesh" / "mesh.json").read_text())["sites"]["01"]
+    true = load_anatomy(with_tendon / "truth").regions["tendon"].volume
+    assert facts["region_volumes_mm3"]["tendon"] == pytest.approx(true, rel=0.05)
+    assert facts["regions"]["tendon"]["mean_mm"] < 0.5
+    assert facts["min_dihedral_deg"] > 5.0

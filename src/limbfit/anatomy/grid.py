@@ -184,9 +184,13 @@ class Volume(Grid):
 
 @dataclass(frozen=True)
 class LabelMap(Grid):
-    """What each voxel is: ``array`` uint8, 0 outside the limb, ``names`` of the other values."""
+    """What each voxel is: ``array`` uint8, 0 outside the limb, ``names`` of the other values.
+
+    ``regions`` are the labels that are bodies of soft tissue, not bones: what each is called as a tissue.
+    """
 
     names: Mapping[int, str] = field(default_factory=lambda: dict(DEFAULT_NAMES))
+    regions: Mapping[str, str] = field(default_factory=dict)
 
     def _as_array(self, array: ArrayLike) -> NDArray[Any]:
         raw = np.asarray(array)
@@ -210,9 +214,29 @@ class LabelMap(Grid):
     def bone_names(self) -> tuple[str, ...]:
         """Names of the bones that have voxels, in order of their label."""
         present = set(np.unique(self.array).tolist())
+        soft = SOFT_NAMES | self.regions.keys()
         return tuple(
-            name for value, name in sorted(self.names.items()) if value in present and name not in SOFT_NAMES
+            name for value, name in sorted(self.names.items()) if value in present and name not in soft
         )
+
+    def with_regions(self, regions: Mapping[str, str]) -> LabelMap:
+        """The map with some labels as regions: the label of each, by the region's name.
+
+        Raises
+        ------
+        LabelError
+            For a label that has no voxel, or that is soft tissue as a whole.
+        """
+        present = {self.names.get(value) for value in np.unique(self.array).tolist()} - {None}
+        for name, label in regions.items():
+            if label not in present - SOFT_NAMES:
+                have = ", ".join(sorted(map(str, present - SOFT_NAMES))) or "none but soft tissue"
+                raise LabelError(
+                    f"no voxel is labelled {label!r}",
+                    place=f"geometry.regions.{name}",
+                    remedy=f"name a label of the map ({have}), or label the region",
+                )
+        return replace(self, regions={label: name for name, label in regions.items()})
 
     def value(self, name: str) -> int:
         """The label value of a name."""

@@ -62,13 +62,22 @@ def phantom(
     ] = Detail.coarse,
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
     fat: Annotated[bool, typer.Option("--fat", help="three tissues: skin, fat and muscle")] = False,
+    tendon: Annotated[
+        bool, typer.Option("--tendon", help="also a patellar tendon, a tissue of its own in the muscle")
+    ] = False,
     socket: Annotated[bool, typer.Option("--socket", help="also a rectified socket for it")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
     with listening() as listener:
         truth = limbfit.make_phantom_study(
-            folder, detail=detail.value, seed=seed, fat=fat, socket=socket, listener=listener
+            folder,
+            detail=detail.value,
+            seed=seed,
+            fat=fat,
+            socket=socket,
+            tendon=tendon,
+            listener=listener,
         )
     if as_json:
         print_json({"study": str(folder / "study.toml"), **truth})

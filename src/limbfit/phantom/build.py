@@ -2,6 +2,7 @@
 
 DIR/
   mri/plain/, mri/markers/    DICOM series without and with skin markers
+  labels/labels.seg.nrrd      the true label map, where the limb has a tendon
   traces/site-<name>.csv      what the robot recorded
   truth/                      the true surfaces
   truth.json                  parameters, sites, limb, how the forces were made
@@ -26,7 +27,8 @@ from ..anatomy.surfaces.surfaces import save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
 from .forces import DISCRETISATIONS, ForceJob, MeshJob, TrueForce, site_force, site_mesh
-from .geometry import SKIN_AND_FAT, SKIN_LAYER, Limb, make_limb
+from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
+from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
 from .record import Ramp, record
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
@@ -43,18 +45,25 @@ PARAMETER_BASE: Parameters = {
     "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.2, "tau_s": 0.3},
 }
 FAT_BASE = {"c_kPa": 2.2, "m": 4.0, "gamma": 1.2, "tau_s": 0.9}
+TENDON_KPA = 30.0
 PARAMETER_SPREAD = 0.15
 KAPPA_RATIO = 100.0
 
 
-def true_parameters(seed: int, fat: bool = False) -> Parameters:
-    """The tissues of a seed, with or without fat: within 15 % of the base, three digits."""
+def true_parameters(seed: int, fat: bool = False, tendon: bool = False) -> Parameters:
+    """The tissues of a seed, with or without fat and tendon: within 15 % of the base, three digits.
+
+    The tendon is a stiffer muscle.
+    """
     random = np.random.default_rng([seed, 7])
     found = {tissue: _drawn(values, random) for tissue, values in PARAMETER_BASE.items()}
-    if not fat:
-        return found
-    between = _drawn(FAT_BASE, np.random.default_rng([seed, 9]))
-    return {"skin": found["skin"], "fat": between, "muscle": found["muscle"]}
+    between: Parameters = {}
+    if fat:
+        between["fat"] = _drawn(FAT_BASE, np.random.default_rng([seed, 9]))
+    if tendon:
+        stiffness = _drawn({"c_kPa": TENDON_KPA}, np.random.default_rng([seed, 11]))
+        between[TENDON] = found["muscle"] | stiffness
+    return {"skin": found["skin"], **between, "muscle": found["muscle"]}
 
 
 def _drawn(values: dict[str, float], random: np.random.Generator) -> dict[str, float]:
@@ -71,6 +80,7 @@ def make_phantom(
     sites: Sequence[str] | None = None,
     fat: bool = False,
     socket: bool = False,
+    tendon: bool = False,
     mapping: Mapping = map,
     progress: Listener | None = None,
 ) -> dict[str, Any]:
@@ -84,6 +94,7 @@ def make_phantom(
     sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
     fat : three tissues, skin of 2 mm over fat of 4 mm over muscle, instead of two.
     socket : also a rectified socket for the limb with a liner, as a file that the study names.
+    tendon : also a patellar tendon, a stiffer region of the muscle, in a label map that the study names.
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
     progress : called with what is being done, how much of it is done, and of how much.
@@ -102,15 +113,15 @@ def make_phantom(
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
-    limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER)
-    parameters = true_parameters(seed, fat)
+    limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon)
+    parameters = true_parameters(seed, fat, tendon)
     everywhere = true_sites(limb, seed)
     indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
     with _appearing(folder) as work:
         _write_images(work, limb, everywhere, detail, seed, tell)
         truth = _truth(limb, everywhere, detail, seed, parameters)
         truth["sites"] = _write_traces(work, limb, indented, detail, seed, parameters, mapping, tell)
-        text = study_text(indented, detail, seed, limb.layers)
+        text = study_text(indented, detail, seed, limb)
         if socket:
             truth["socket"] = write_socket(work, limb)
             text += SOCKET_STUDY
@@ -141,6 +152,8 @@ def _write_images(
     work: Path, limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, tell: Listener
 ) -> None:
     grid = make_grid(limb, detail, seed)
+    if limb.has_tendon:
+        write_true_labels(work, limb, grid)
     series = (("plain", (), "UTE residuum"), ("markers", markers_of(everywhere), "UTE residuum, markers"))
     for number, (name, markers, description) in enumerate(series, start=1):
         write_series(

@@ -19,6 +19,7 @@ from ..anatomy.meshing.layers import LayerSpec
 Array = NDArray[np.floating]
 BONES = ("tibia", "fibula", "patella", "femur")
 PROXIMAL_CUT_MM = 250.0
+TENDON, TENDON_MM = "tendon", (24.0, 6.0)  # the region's name; width and thickness of the patellar tendon
 # Tissue over the muscle, outermost first: as in the paper, or with fat of its own.
 SKIN_LAYER = (LayerSpec("skin", 3.0),)
 SKIN_AND_FAT = (LayerSpec("skin", 2.0), LayerSpec("fat", 4.0))
@@ -88,6 +89,7 @@ class Limb:
     rotation: NDArray[np.float64]
     origin: NDArray[np.float64]
     layers: tuple[LayerSpec, ...] = SKIN_LAYER
+    has_tendon: bool = False
 
     @property
     def layers_mm(self) -> float:
@@ -114,6 +116,10 @@ class Limb:
         """Field of all bones together at LPS points (..., 3)."""
         local = self.to_limb(points)
         return np.minimum.reduce([bone_field(self.shape, name, local) for name in BONES])
+
+    def tendon(self, points: Array) -> Array:
+        """Field of the patellar tendon between the bones at LPS points (..., 3)."""
+        return np.maximum(tendon_field(self.shape, self.to_limb(points)), -self.bones(points))
 
     def skin_point(self, angle: float, height: float) -> NDArray[np.float64]:
         """The LPS point of the skin at an angle around the limb and a height above its tip."""
@@ -142,7 +148,7 @@ class Limb:
         return self.rotation @ np.array([0.0, 0.0, 1.0])
 
 
-def make_limb(seed: int, layers: tuple[LayerSpec, ...] = SKIN_LAYER) -> Limb:
+def make_limb(seed: int, layers: tuple[LayerSpec, ...] = SKIN_LAYER, tendon: bool = False) -> Limb:
     """The limb of a seed: its shape, lying 8 to 14 degrees off the patient axes, under some layers."""
     random = np.random.default_rng([seed, 2])
     lean = np.deg2rad(random.uniform(8, 14))
@@ -150,7 +156,7 @@ def make_limb(seed: int, layers: tuple[LayerSpec, ...] = SKIN_LAYER) -> Limb:
     lean_axis = np.array([np.cos(towards), np.sin(towards), 0.0])
     turn = rotation_about(np.array([0.0, 0.0, 1.0]), np.deg2rad(random.uniform(-8, 8)))
     origin = np.array([-95.0, 15.0, -420.0]) + random.uniform(-15, 15, 3)
-    return Limb(limb_shape(seed), rotation_about(lean_axis, lean) @ turn, origin, layers)
+    return Limb(limb_shape(seed), rotation_about(lean_axis, lean) @ turn, origin, layers, tendon)
 
 
 def gradient_of(field, points: Array, step: float = 0.05) -> NDArray[np.float64]:  # type: ignore[no-untyped-def]
@@ -301,6 +307,17 @@ def _patella(shape: LimbShape, points: Array) -> Array:
     anterior = float(section_radius(shape, np.asarray(0.0), np.asarray(height)))
     axes = (shape.patella, 9.5, shape.patella + 1)
     return _ellipsoid(points, (0.0, -(anterior - 7.0 - axes[1]), height), axes)
+
+
+def tendon_field(shape: LimbShape, points: Array) -> Array:
+    """A flat band from within the patella's lower half to within the tibial tuberosity, under the skin."""
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    above = z - shape.joint
+    depth = 9.5 + 5.5 * _smoothstep((above - 2) / 16) + 4.5 * _smoothstep((-14 - above) / 24)
+    across = y + section_radius(shape, 0 * z, z) - depth
+    a, b = np.abs(x) - TENDON_MM[0] / 2 + 2.5, np.abs(across) - TENDON_MM[1] / 2 + 2.5
+    section = np.minimum(np.maximum(a, b), 0) + np.hypot(np.maximum(a, 0), np.maximum(b, 0)) - 2.5
+    return _between(section, z, shape.joint - 40, shape.joint + 17, 2.0)
 
 
 _BONE_FIELDS = {"tibia": _tibia, "fibula": _fibula, "patella": _patella, "femur": _femur}

@@ -24,7 +24,7 @@ from scipy.special import ndtr
 from ..anatomy.grid import Volume
 from .geometry import BONES, PROXIMAL_CUT_MM, Limb, rotation_about
 
-FAT, MUSCLE, MARROW, CORTEX, MARKER = 1.0, 0.5, 0.8, 0.12, 1.15
+FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 CORTEX_MM = {"tibia": 3.2, "fibula": 2.4, "patella": 2.4, "femur": 2.8}
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
 NOISE = MUSCLE / 27.0
@@ -43,6 +43,7 @@ class Contrast:
     muscle: float
     marrow: float
     cortex: float
+    tendon: float
     marker: float
     noise: float
     bias: float
@@ -50,9 +51,9 @@ class Contrast:
 
 
 CONTRASTS = {
-    "UTE": Contrast(0.0, FAT, MUSCLE, MARROW, CORTEX, MARKER, NOISE, BIAS),
-    "T1": Contrast(0.0, 1.0, 0.35, 0.95, 0.03, 1.15, 0.02, BIAS),
-    "CT": Contrast(-1000.0, -100.0, 50.0, 60.0, 1300.0, 400.0, 25.0, 0.0, rician=False),
+    "UTE": Contrast(0.0, FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER, NOISE, BIAS),
+    "T1": Contrast(0.0, 1.0, 0.35, 0.95, 0.03, 0.1, 1.15, 0.02, BIAS),
+    "CT": Contrast(-1000.0, -100.0, 50.0, 60.0, 1300.0, 90.0, 400.0, 25.0, 0.0, rician=False),
 }
 UTE = CONTRASTS["UTE"]
 
@@ -128,6 +129,9 @@ def _tissue(
     """Noise-free signal of a block and the share of each voxel inside the skin."""
     skin, inner = _occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
     signal = levels.air + (levels.fat - levels.air) * skin + (levels.muscle - levels.fat) * inner
+    if limb.has_tendon:
+        (band,) = _occupancy(limb.tendon(points), spacing, (0.0,))
+        signal += (levels.tendon - signal) * band
     for name in BONES:
         bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, CORTEX_MM[name]))
         signal = signal * (1 - bone) + levels.cortex * bone + (levels.marrow - levels.cortex) * marrow

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..anatomy.meshing.layers import LayerSpec
+from .geometry import TENDON, Limb
+from .labels import FILE, TENDON_LABEL
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 _HEAD = """\
@@ -19,16 +21,17 @@ description = "Synthetic transtibial residuum, {detail} detail"
 path = "mri/plain"        # DICOM, ultra-short echo time
 markers = "mri/markers"   # the same limb with skin markers on
 
-[geometry]
+{labels}[geometry]
 {layers}
-surface_edge_mm = {surface:.1f}
+{regions}surface_edge_mm = {surface:.1f}
 
 [indenter]
 shape = "square"
 width_mm = {width:.1f}
 edge_radius_mm = {edge:.1f}       # as a real punch has; meshes resolve it, a sharp edge they never do
 
-{mesh}# One table per indentation. 'near' is where the site is as measured by hand: it is matched to a marker.
+{mesh}{tissues}# One table per indentation.
+# 'near' is where the site is as measured by hand: it is matched to a marker.
 # The fitted sites identify the material; all others are predicted and compared.
 """
 
@@ -42,6 +45,24 @@ accuracy = "fine"
 """,
 }
 
+_LABELS = f"""\
+[segmentation]
+labels = "{FILE.as_posix()}"   # the tendon was drawn by hand
+
+"""
+_REGIONS = f"""\
+regions = [{{ name = "{TENDON}", label = "{TENDON_LABEL}" }}]   # a tissue of its own
+"""
+# What the records tell of a tendon is its stiffness; all else of it is the muscle's.
+_TISSUES = f"""\
+[material.tissues.{TENDON}]
+start = {{ c_kPa = 20.0 }}
+upper = {{ c_kPa = 500.0 }}
+
+[calibration]
+tied = [["{TENDON}.m", "muscle.m"], ["{TENDON}.gamma", "muscle.gamma"], ["{TENDON}.tau_s", "muscle.tau_s"]]
+
+"""
 _SURFACE_EDGE_MM = {"coarse": 4.0, "paper": 3.0}
 
 _SITE = """
@@ -54,12 +75,15 @@ near = [{x:.1f}, {y:.1f}, {z:.1f}]
 """
 
 
-def study_text(sites: Sequence[TrueSite], detail: str, seed: int, layers: Sequence[LayerSpec]) -> str:
-    """The content of ``study.toml`` for some sites of a limb under some layers."""
+def study_text(sites: Sequence[TrueSite], detail: str, seed: int, limb: Limb) -> str:
+    """The content of ``study.toml`` for some sites of a limb."""
     head = _HEAD.format(
         seed=seed,
         detail=detail,
-        layers=_layers(layers),
+        layers=_layers(limb.layers),
+        labels=_LABELS if limb.has_tendon else "",
+        regions=_REGIONS if limb.has_tendon else "",
+        tissues=_TISSUES if limb.has_tendon else "",
         surface=_SURFACE_EDGE_MM[detail],
         width=INDENTER_MM,
         edge=INDENTER_EDGE_MM,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import bodies, from_pyvista, half_edges
-from .geometry import BONES, PROXIMAL_CUT_MM, Limb, bone_field, skin_field
+from .geometry import BONES, PROXIMAL_CUT_MM, TENDON, Limb, bone_field, skin_field
 
 Array = NDArray[np.floating]
 Field = Callable[[Array], Array]
@@ -30,22 +30,24 @@ STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is
 
 
 def true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
-    """Skin and bones of a limb (LPS mm); the skin is closed by the flat proximal cut.
+    """Skin, bones and tendon of a limb (LPS mm); the skin is closed by the flat proximal cut.
 
     Parameters
     ----------
     limb : the residuum.
-    spacing : of the grid on which the skin is contoured, mm (bones: two thirds of it).
+    spacing : of the grid on which the skin is contoured, mm (bones: two thirds of it, the tendon: half).
     """
     shape = limb.shape
     box = Box((-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM), spacing)
     skin = contour(lambda p: skin_field(shape, p), box)
     bones = {name: _bone(limb, name, spacing / 1.5) for name in BONES}
+    regions = {TENDON: _placed(limb, _tendon(limb, spacing / 2))} if limb.has_tendon else {}
     return Anatomy(
         skin=_placed(limb, skin),
         bones={name: _placed(limb, bone) for name, bone in bones.items()},
         cut_point=limb.to_patient(np.array([0.0, 0.0, PROXIMAL_CUT_MM])),
         cut_normal=limb.proximal_normal,
+        regions=regions,
     )
 
 
@@ -59,6 +61,12 @@ def outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surf
 def _bone(limb: Limb, name: str, spacing: float) -> Surface:
     box = Box((-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM), spacing)
     return contour(lambda p: bone_field(limb.shape, name, p), box)
+
+
+def _tendon(limb: Limb, spacing: float) -> Surface:
+    middle = limb.shape.joint - 12.0
+    box = Box((-24.0, -66.0, middle - 36.0), (24.0, -22.0, middle + 36.0), spacing)
+    return contour(lambda p: limb.tendon(limb.to_patient(p)), box)
 
 
 def _placed(limb: Limb, surface: Surface) -> Surface:

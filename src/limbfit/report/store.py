@@ -81,9 +81,10 @@ class Results:
 
     @property
     def surface_files(self) -> dict[str, Path]:
-        """``skin`` and each ``bone-<name>``: the surfaces that are stored."""
+        """``skin``, each ``bone-<name>`` and each ``region-<name>``: the surfaces that are stored."""
         folder = self.folder / "surfaces"
-        files = {"skin": folder / "skin.stl"} | {p.stem: p for p in sorted(folder.glob("bone-*.stl"))}
+        inner = (p for kind in ("bone", "region") for p in sorted(folder.glob(f"{kind}-*.stl")))
+        files = {"skin": folder / "skin.stl"} | {p.stem: p for p in inner}
         return {name: path for name, path in files.items() if path.is_file()}
 
     def region(self, site: str) -> str:

@@ -135,7 +135,8 @@ def _place_row(row: Json) -> Row:
 def volume_table(store: Results) -> Table | None:
     """Volumes from the label map and inside the surfaces."""
     labels = store.segment.get("volumes_cm3") or {}
-    bodies = {"skin": store.surfaces.get("skin"), **(store.surfaces.get("bones") or {})}
+    bones, regions = (store.surfaces.get(kind) or {} for kind in ("bones", "regions"))
+    bodies = {"skin": store.surfaces.get("skin"), **bones, **regions}
     closed = {name: body["volume_mm3"] / 1000 for name, body in bodies.items() if body}
     names = list(dict.fromkeys([*labels, *closed]))
     if not names:

@@ -50,7 +50,7 @@ def scene_of(folder: StudyFolder) -> dict[str, Any]:
             for site in study.sites
             if (file := _mesh_file(folder, site.name)) is not None
         },
-        "layers": list(study.tissues[:-1]),
+        "layers": [layer.name for layer in study.geometry.model_layers],
         "quality": meshes.get("sites", {}),
     }
 

@@ -130,12 +130,34 @@ class Layer(TomlTable):
         return self
 
 
+class Region(TomlTable):
+    """A body of its own inside the core, as a tendon or a scar: a label of the map, or a closed surface.
+
+    A ``surface`` is in the coordinates and the unit of ``[surfaces]``; beside an image in LPS and mm, unless
+    it says otherwise itself.
+    """
+
+    name: str = Field(pattern=TISSUE_NAME)
+    label: str | None = None
+    surface: Path | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Region:
+        if (self.label is None) == (self.surface is None):
+            raise ValueError("give either label (of the label map) or surface (a file)")
+        return self
+
+
 class GeometryTable(TomlTable):
-    """How surfaces become a model: one ``skin_layer_mm``, or ``layers`` (outermost first) over ``core``."""
+    """How surfaces become a model: one ``skin_layer_mm``, or ``layers`` (outermost first) over ``core``.
+
+    ``regions`` are bodies inside the core; of two that overlap the first has what they share.
+    """
 
     skin_layer_mm: Positive = 3.0
     layers: tuple[Layer, ...] = ()
     core: str = Field(default="muscle", pattern=TISSUE_NAME)
+    regions: tuple[Region, ...] = ()
     bone_policy: Literal["trim-bone", "thin-skin"] = "trim-bone"
     bone_clearance_mm: Positive = 1.5
     proximal_cut: Plane | None = None
@@ -151,9 +173,9 @@ class GeometryTable(TomlTable):
             raise ValueError("give either skin_layer_mm or layers")
         if not self.layers and "core" in self.model_fields_set:
             raise ValueError("core belongs to layers; give layers too")
-        names = [layer.name for layer in self.layers] + [self.core]
+        names = [*(one.name for one in self.model_layers), *(one.name for one in self.regions), self.core]
         if len(set(names)) < len(names):
-            raise ValueError(f"layers and core need different names, not {', '.join(names)}")
+            raise ValueError(f"layers, core and regions need different names, not {', '.join(names)}")
         if sum(layer.thickness == "map" for layer in self.layers) > 1:
             raise ValueError('only one layer can have thickness = "map": that of the fat')
         return self

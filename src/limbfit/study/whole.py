@@ -106,8 +106,9 @@ class Study(TomlTable):
 
     @property
     def tissues(self) -> tuple[str, ...]:
-        """Names of the materials and of the mesh's regions: the layers, outermost first, and the core."""
-        return (*(layer.name for layer in self.geometry.model_layers), self.geometry.core)
+        """Names of the materials and of the mesh's regions: layers, outermost first, regions, the core."""
+        layers, regions = self.geometry.model_layers, self.geometry.regions
+        return (*(one.name for one in layers), *(one.name for one in regions), self.geometry.core)
 
     @property
     def law(self) -> TissueLaw:
@@ -204,6 +205,7 @@ class Study(TomlTable):
             "segmentation.contours": self.segmentation.contours,
             "indenter.file": self.indenter.file,
             "socket.file": self.socket.file,
+            **{f"geometry.regions.{one.name}.surface": one.surface for one in self.geometry.regions},
             **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
             **{f"{record.key}.trace": record.trace for record in self.recorded},
@@ -356,11 +358,26 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
+    def _mesher_of_regions(self) -> Study:
+        if self.geometry.regions and self.mesh.engine != "mmg":
+            raise ValueError(
+                f'mesh.engine = "{self.mesh.engine}" cannot mesh geometry.regions; choose "mmg", or leave '
+                "the regions out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _one_door(self) -> Study:
         if (self.image is None) == (self.surfaces is None):
             raise ValueError("give either [image] or [surfaces], not both")
         if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
             raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
+        labelled = [one.name for one in self.geometry.regions if one.label is not None]
+        if self.surfaces is not None and labelled:
+            raise ValueError(
+                f"geometry.regions.{labelled[0]}: [surfaces] has no labels; give surface, a closed surface "
+                "file"
+            )
         if self.surfaces is not None or (self.image is not None and self.image.markers is None):
             blind = [site.name for site in self.sites if site.position is None]
             if blind:

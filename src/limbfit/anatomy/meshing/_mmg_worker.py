@@ -19,7 +19,7 @@ def remesh(task: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     points, tets, triangles = task["points"], task["tets"], task["triangles"]
     mesh.set_mesh_size(vertices=len(points), tetrahedra=len(tets), triangles=len(triangles))
     mesh.set_vertices(points)
-    mesh.set_tetrahedra(tets.astype(np.int32), np.ones(len(tets), np.int64))
+    mesh.set_tetrahedra(tets.astype(np.int32), task["regions"].astype(np.int64) + 1)  # MMG keeps 0 for itself
     mesh.set_triangles(triangles.astype(np.int32), task["triangle_refs"].astype(np.int64))
     mesh["metric"] = np.ascontiguousarray(task["size"][:, None])
     mesh.remesh(
@@ -30,9 +30,11 @@ def remesh(task: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         verbose=-1,
     )
     triangles, triangle_refs = mesh.get_triangles_with_refs()
+    tets, regions = mesh.get_elements_with_refs()
     return {
         "points": mesh.get_vertices(),
-        "tets": mesh.get_elements().astype(np.int64),
+        "tets": tets.astype(np.int64),
+        "regions": np.asarray(regions) - 1,
         "triangles": triangles.astype(np.int64),
         "triangle_refs": triangle_refs,
     }

@@ -36,7 +36,14 @@ def remesh(task: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         raise RuntimeError("Netgen moved or renumbered points of the surface")
     tets = mesh.Elements3D().NumPy()["nodes"][:, :4].astype(np.int64) - 1
     tets = tets[:, [0, 1, 3, 2]]  # Netgen's tetrahedra are oriented the other way round
-    return {"points": filled, "tets": tets, "triangles": triangles, "triangle_refs": refs}
+    regions = np.zeros(len(tets), dtype=np.int64)
+    return {
+        "points": filled,
+        "tets": tets,
+        "regions": regions,
+        "triangles": triangles,
+        "triangle_refs": refs,
+    }
 
 
 def surface(task: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,7 +3,8 @@
 Cutting bisects every tetrahedron at its crossed edges in one global order of edges. Two tetrahedra that share
 a face see that face's edges in the same order, so the result conforms without a table of cases.
 
-Each vertex carries a bit mask of the surfaces it must stay on: ``PLANE`` and one bit per level set.
+Each vertex carries a bit mask of the surfaces it must stay on: ``PLANE`` and one bit per level set; each
+tetrahedron the number of its region: 0 for the core, 1 for the first region inside it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
 
-PLANE, LAYER, BONE = 1, 2, 4
+PLANE, LAYER, BONE, REGION = 1, 2, 4, 8  # of regions the first's; each further one's is twice as large
 TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 # Kuhn's subdivision of a cube into six tetrahedra; corner bits are (x, y, z), all share the diagonal 0-7.
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
@@ -32,17 +33,22 @@ SMALLEST_VOLUME = 1e-3  # of a grid tetrahedron: a snap that leaves less is undo
 
 @dataclass(frozen=True)
 class TetGrid:
-    """Points (n, 3), tetrahedra (m, 4) of positive volume, surface mask (n,) of the points, spacing in mm."""
+    """Points (n, 3), tetrahedra (m, 4) of positive volume, surface mask (n,) of the points, spacing in mm.
+
+    ``regions`` (m,) number the tetrahedra's regions.
+    """
 
     points: Array
     tets: Ints
     mask: Ints
     spacing: float
+    regions: Ints
 
     def kept(self, keep: NDArray[np.bool_]) -> TetGrid:
         """The grid of the chosen tetrahedra with its unused points dropped."""
         used, tets = np.unique(self.tets[keep], return_inverse=True)
-        return TetGrid(self.points[used], tets.reshape(-1, 4), self.mask[used], self.spacing)
+        tets = tets.reshape(-1, 4)
+        return TetGrid(self.points[used], tets, self.mask[used], self.spacing, self.regions[keep])
 
 
 def box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
@@ -56,7 +62,25 @@ def box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
                for z in (0, 1) for y in (0, 1) for x in (0, 1)]  # fmt: skip
     tets = np.stack(corners, axis=1)[:, KUHN].reshape(-1, 4)
     mask = np.where(points[:, 2] == axes[2][-1], PLANE, 0)
-    return TetGrid(points, tets, mask, spacing)
+    return TetGrid(points, tets, mask, spacing, np.zeros(len(tets), dtype=np.int64))
+
+
+def refined(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spacing: float) -> TetGrid:
+    """The grid of a box halved, again and again, where ``near`` says so of its edges' middles.
+
+    Halving the cubes' diagonals, their faces' and their edges in turn gives eight tetrahedra like the first
+    (Maubach 1995, SIAM J Sci Comput 16, 210-227); beside them the order of edges keeps it conforming.
+    """
+    edge = grid.spacing
+    while edge > spacing:
+        for length in edge * np.sqrt([3.0, 2.0, 1.0]):
+            ends = np.unique(np.sort(grid.tets[:, TET_EDGES].reshape(-1, 2), axis=1), axis=0)
+            a, b = grid.points[ends[:, 0]], grid.points[ends[:, 1]]
+            long = np.linalg.norm(b - a, axis=1) > 0.95 * length
+            edges = ends[long][near((a[long] + b[long]) / 2)]
+            grid = _divided(grid, edges, np.full(len(edges), 0.5), 0)
+        edge /= 2
+    return grid
 
 
 def volumes(points: Array, tets: Ints) -> Array:
@@ -65,7 +89,9 @@ def volumes(points: Array, tets: Ints) -> Array:
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0
 
 
-def cut(grid: TetGrid, field: Field, bit: int, slack: float = 0.0) -> tuple[TetGrid, NDArray[np.bool_]]:
+def cut(
+    grid: TetGrid, field: Field, bit: int, slack: float = 0.0, region: int | None = None
+) -> tuple[TetGrid, NDArray[np.bool_]]:
     """Cut a grid along ``field = 0``.
 
     Parameters
@@ -74,26 +100,33 @@ def cut(grid: TetGrid, field: Field, bit: int, slack: float = 0.0) -> tuple[TetG
     field : signed function of points (k, 3) that gives values (k,) and gradients (k, 3).
     bit : mask bit that the points on the level set receive.
     slack : as for :func:`banded`.
+    region : of the tetrahedra that are cut; others are divided where they share an edge. None: all.
 
     Returns
     -------
-    The cut grid and, per tetrahedron, whether it lies where the field is positive.
+    The cut grid and, per tetrahedron that was to be cut, whether it lies where the field is positive.
     """
     values = banded(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
-    edges = _crossed_edges(grid.tets, values)
+    wanted = grid.tets if region is None else grid.tets[grid.regions == region]
+    edges = _crossed_edges(wanted, values)
     t = _roots(grid.points, edges, values, field)
     grid, snapped = _snapped(grid, edges, t, bit)
     values = np.where(snapped, 0.0, values)
     crossed = ~snapped[edges].any(axis=1)
     edges, t = edges[crossed], t[crossed]
+    on_level = np.isin(np.arange(len(values)), wanted) & (values == 0)
+    grid = _divided(replace(grid, mask=np.where(on_level, grid.mask | bit, grid.mask)), edges, t, bit)
+    values = np.concatenate([values, np.zeros(len(edges))])
+    return grid, values[grid.tets].sum(axis=1) > 0
+
+
+def _divided(grid: TetGrid, edges: Ints, t: Array, bit: int) -> TetGrid:
+    """The grid with edges (k, 2), sorted, divided at ``t`` (k,); the fresh points receive a mask bit too."""
     a, b = edges.T
     fresh = grid.points[a] + t[:, None] * (grid.points[b] - grid.points[a])
-    tets = _bisected(grid.tets, edges, len(grid.points))
-    mask = np.concatenate(
-        [np.where(values == 0, grid.mask | bit, grid.mask), (grid.mask[a] & grid.mask[b]) | bit]
-    )
-    values = np.concatenate([values, np.zeros(len(fresh))])
-    return TetGrid(np.vstack([grid.points, fresh]), tets, mask, grid.spacing), values[tets].sum(axis=1) > 0
+    tets, parent = _bisected(grid.tets, edges, len(grid.points))
+    mask = np.concatenate([grid.mask, (grid.mask[a] & grid.mask[b]) | bit])
+    return TetGrid(np.vstack([grid.points, fresh]), tets, mask, grid.spacing, grid.regions[parent])
 
 
 def banded(field: Field, points: Array, band: float, spacing: float, slack: float = 0.0) -> Array:
@@ -176,18 +209,23 @@ def _without_inversion(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) -
     return moved
 
 
-def _bisected(tets: Ints, edges: Ints, offset: int) -> Ints:
-    """Bisect tetrahedra at their crossed ``edges``, the first in order first; edge i gets node offset + i."""
-    done = []
+def _bisected(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints]:
+    """Bisect tetrahedra at their crossed ``edges``, the first in order first; edge i gets node offset + i.
+
+    Also the number of the tetrahedron that each came from.
+    """
+    done, origin = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    parent = np.arange(len(tets))
     while len(tets):
         first = _first_crossed(tets, edges, offset)
         whole = first == len(edges)
         done.append(tets[whole])
-        tets, first = tets[~whole], first[~whole]
+        origin.append(parent[whole])
+        tets, first, parent = tets[~whole], first[~whole], np.tile(parent[~whole], 2)
         a, b = edges[first].T[:, :, None]
         middle = offset + first[:, None]
         tets = np.vstack([np.where(tets == b, middle, tets), np.where(tets == a, middle, tets)])
-    return np.vstack([*done, np.zeros((0, 4), dtype=np.int64)])
+    return np.vstack(done), np.concatenate(origin)
 
 
 def _first_crossed(tets: Ints, edges: Ints, offset: int) -> Ints:

@@ -35,13 +35,16 @@ class VolumeTask:
     Attributes
     ----------
     points, tets : (n, 3) mm and (m, 4).
-    triangles, triangle_refs : boundary triangles (k, 3), outward, and the surface (k,) that each lies on.
+    regions : (m,) the region of each tetrahedron; faces between two are kept.
+    triangles, triangle_refs : boundary triangles (k, 3), outward, and those between regions, and the surface
+        (k,) that each lies on.
     size : (n,) wanted edge length at the points, mm.
     hausdorff_mm : how far the new surface may stray from the old one.
     """
 
     points: NDArray[np.float64]
     tets: NDArray[np.int64]
+    regions: NDArray[np.int64]
     triangles: NDArray[np.int64]
     triangle_refs: NDArray[np.int64]
     size: NDArray[np.float64]
@@ -50,10 +53,12 @@ class VolumeTask:
 
 @dataclass(frozen=True)
 class VolumeMesh:
-    """What an engine returns: points (n, 3), tets (m, 4), triangles (k, 3) and their surfaces (k,)."""
+    """What an engine returns: points (n, 3), tets (m, 4) and their regions (m,), triangles (k, 3) and their
+    surfaces (k,)."""
 
     points: NDArray[np.float64]
     tets: NDArray[np.int64]
+    regions: NDArray[np.int64]
     triangles: NDArray[np.int64]
     triangle_refs: NDArray[np.int64]
 
@@ -75,8 +80,11 @@ def netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     Raises
     ------
     MeshingError
-        When Netgen is not installed, or crashes, gives nothing or exceeds the time limit (`MesherError`).
+        When Netgen is not installed, or there are regions inside the core, which it would not see; when it
+        crashes, gives nothing or exceeds the time limit (`MesherError`).
     """
+    if task.regions.any():
+        raise MeshingError('Netgen knows no regions inside the core; choose mesh.engine = "mmg"')
     if find_spec("netgen") is None:
         raise MeshingError(
             "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "

@@ -14,6 +14,7 @@ from .columns import Columns, columns, even_steps
 from .engines import VolumeMesh
 from .layers import Level, LimbFields
 from .projection import projected
+from .regions import interfaces, mesh_numbers, region_level, same_faces
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,20 +24,14 @@ MOST_STEPS = 8  # elements across one layer
 
 
 def core_mesh(points: Array, tets: Ints) -> Mesh:
-    """The tetrahedra under the layers as a mesh of one region."""
+    """The tetrahedra under the layers as a mesh that tells no regions."""
     return Mesh(points, tets, "tet4", np.zeros(len(tets), np.int64), ("core",))
-
-
-def same_faces(faces: Ints, chosen: Ints, count: int) -> NDArray[np.bool_]:
-    """Which faces (m, 3) are among the chosen (k, 3), in any order of nodes; ``count`` nodes in all."""
-    packed = [np.sort(part, axis=1) @ [count * count, count, 1] for part in (faces, chosen)]
-    return np.isin(packed[0], packed[1])
 
 
 def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) -> tuple[Mesh, Columns]:
     """The tet4 mesh of core and extruded layers with its sets, and the columns of the layers' nodes.
 
-    ``regions`` names the layers, outermost first, and the core.
+    ``regions`` names the layers, outermost first, the regions inside the core, and the core.
     """
     count = len(core.points)
     faces = boundary_faces(core_mesh(core.points, core.tets))
@@ -50,12 +45,13 @@ def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) 
     stack = columns(base, across, count)
     shares = (depths[-1] - np.vstack([depths[::-1], np.zeros(len(base))])) / depths[-1]
     tets, layer = stack.tets(interface)
-    outermost = len(regions) - 2
+    innermost = len(fields.depths) - 1
+    numbers = mesh_numbers(core.regions, len(fields.depths), len(fields.regions))
     mesh = Mesh(
         points=np.vstack([core.points, stack.placed(low, high, shares)]),
         cells=np.vstack([tets, core.tets]),
         cell_type="tet4",
-        regions=np.concatenate([outermost - layer, np.full(len(core.tets), outermost + 1)]),
+        regions=np.concatenate([innermost - layer, numbers]),
         region_names=regions,
     )
     return _with_sets(mesh, core, stack), stack
@@ -85,7 +81,7 @@ def _with_sets(mesh: Mesh, core: VolumeMesh, stack: Columns) -> Mesh:
 
 
 def curved_target(mesh: Mesh, fields: LimbFields) -> Array:
-    """Where the mid-edge nodes of skin, the layers' inner face and bone would lie on the smooth surfaces."""
+    """Where the mid-edge nodes of skin, layers' inner face, bone and regions would lie on smooth surfaces."""
     target = mesh.points.copy()
     free = np.where(mesh.points[:, 2] == 0.0, 0.0, 1.0)
     for nodes, level in _smooth_mid_nodes(mesh, fields):
@@ -94,13 +90,18 @@ def curved_target(mesh: Mesh, fields: LimbFields) -> Array:
 
 
 def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callable[[Array], Level]]]:
-    corners = mesh.cells[:, :4].max() + 1
+    corners, layers = mesh.cells[:, :4].max() + 1, len(fields.depths)
     faces = boundary_faces(mesh)
     on_plane = (mesh.points[faces[:, :3], 2] == 0.0).all(axis=1)
     bone = faces[~on_plane & np.isin(faces[:, :3], mesh.node_sets["fixed_bone"]).all(axis=1)]
+    regions = [
+        (_mid_nodes(found, corners), region_level(fields, number))
+        for number, found in enumerate(interfaces(mesh, layers))
+    ]
     return [
+        *regions,
         (_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
-        (_mid_nodes(inner_faces(mesh, len(mesh.region_names) - 2), corners), fields.layer),
+        (_mid_nodes(inner_faces(mesh, layers - 1), corners), fields.layer),
         (_mid_nodes(bone, corners), fields.void),
     ]
 

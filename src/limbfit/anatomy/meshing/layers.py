@@ -17,7 +17,7 @@ the flat cap would count as skin and be offset too.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -71,8 +71,9 @@ class TrimmedBone:
 class LimbFields:
     """Fields of a limb in its frame; build it with :func:`limb_fields`.
 
-    ``skin`` and ``bones`` are prolonged beyond the cut, in limb coordinates. ``depths`` (layers, n) are those
-    of the layers' inner faces at the skin's n vertices, outermost first, mm; (layers, 1) where uniform.
+    ``skin``, ``bones`` and ``regions`` (bodies inside the core) are prolonged beyond the cut, in limb
+    coordinates. ``depths`` (layers, n) are those of the layers' inner faces at the skin's n vertices,
+    outermost first, mm; (layers, 1) where uniform.
     """
 
     frame: Frame
@@ -81,6 +82,7 @@ class LimbFields:
     depths: Array
     bone_clearance_mm: float
     thinned: ThinnedSkin | None = None
+    regions: Mapping[str, Surface] = field(default_factory=dict)
 
     @property
     def uniform(self) -> bool:
@@ -130,7 +132,7 @@ class LimbFields:
         """Signed distance (n,) to the nearest bone as segmented, and its gradient."""
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         for bone in self.bones.values():
-            candidates = np.flatnonzero(_box_distance(bone, points) < value)
+            candidates = np.flatnonzero(box_distance(bone, points) < value)
             distance, slope = signed_distance(bone, points[candidates])
             nearer = distance < value[candidates]
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
@@ -151,7 +153,7 @@ class LimbFields:
         low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
         high[2] = min(high[2], 0.0)
         spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
-        samples = _box_samples(low, high, spacing)
+        samples = box_samples(low, high, spacing)
         inside = signed_distance(bone, samples)[0] < 0
         cut = self.layer(samples[inside])[0] < self.bone_clearance_mm
         return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
@@ -182,21 +184,26 @@ def limb_fields(
     """
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
-    bones = {name: Surface(frame.to_limb(bone.points), bone.faces) for name, bone in anatomy.bones.items()}
     top = skin.points[:, 2].max()
     if top < -END_TOLERANCE_MM:
         raise SurfaceError(
             f"the skin ends {-top:.1f} mm below the proximal cut plane",
             remedy="move the plane or check its normal",
         )
-    ends_at_cut = {
-        name: -END_TOLERANCE_MM < bone.points[:, 2].max() < SEAM_MM for name, bone in bones.items()
-    }
-    bones = {name: prolonged(bone) if ends_at_cut[name] else bone for name, bone in bones.items()}
+    bones, regions = (_inner(bodies, frame) for bodies in (anatomy.bones, anatomy.regions))
     long = prolonged(skin)
     depths = _layer_depths(layers, skin, long, fat_depth_mm)
-    fields = LimbFields(frame, long, bones, depths, bone_clearance_mm)
+    fields = LimbFields(frame, long, bones, depths, bone_clearance_mm, regions=regions)
     return _thinned(fields) if policy == "thin-skin" else fields
+
+
+def _inner(bodies: Mapping[str, Surface], frame: Frame) -> dict[str, Surface]:
+    """Bodies inside the skin in the limb frame, those that end at the cut prolonged beyond it."""
+    found = {name: Surface(frame.to_limb(body.points), body.faces) for name, body in bodies.items()}
+    ends_at_cut = {
+        name: -END_TOLERANCE_MM < body.points[:, 2].max() < SEAM_MM for name, body in found.items()
+    }
+    return {name: prolonged(body) if ends_at_cut[name] else body for name, body in found.items()}
 
 
 def _layer_depths(
@@ -270,7 +277,7 @@ def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return edges[counts[inverse.ravel()] == 1]
 
 
-def _box_distance(surface: Surface, points: Array) -> Array:
+def box_distance(surface: Surface, points: Array) -> Array:
     """Distance (n,) to the surface's bounding box, a lower bound of that to the surface; -inf inside."""
     low, high = surface.points.min(axis=0), surface.points.max(axis=0)
     outside = np.maximum(np.maximum(low - points, points - high), 0.0)
@@ -283,7 +290,7 @@ def _longest_edge(surface: Surface) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
-def _box_samples(low: Array, high: Array, spacing: float) -> Array:
+def box_samples(low: Array, high: Array, spacing: float) -> Array:
     """Cell centres of a regular grid over a box."""
     counts = np.maximum(1, np.round((high - low) / spacing)).astype(int)
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low, high, counts)]

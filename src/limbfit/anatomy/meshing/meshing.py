@@ -1,11 +1,12 @@
-"""Per-site tetrahedral meshes of a limb: skin layer and muscle, bones as voids, graded by distance.
+"""Per-site tetrahedral meshes of a limb: skin layer, muscle and what is in it, bones as voids, graded.
 
 The recipe
 ----------
 1. A base mesh of the muscle, once per anatomy: a tetrahedral grid under the proximal cut plane, cut along the
-   layer (level set of depth at the skin's thickness) and along the bones.
-2. Per site, a mesher adapts the base to the site's size field.
-3. Nodes of the layer and the bones are put on their smooth surfaces; the skin layer is extruded from the
+   layer (level set of depth at the skin's thickness), along the bones, and along the regions inside the core,
+   whose both sides are kept.
+2. Per site, a mesher adapts the base to the site's size field; it keeps the faces between regions.
+3. Nodes of layer, bones and regions are put on their smooth surfaces; the skin layer is extruded from the
    interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
 4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound.
 """
@@ -24,13 +25,23 @@ from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, to_tet10
 from ..surfaces.surfaces import Anatomy
 from . import background
-from .background import BONE, LAYER, PLANE, TetGrid, volumes
+from .background import BONE, LAYER, PLANE, REGION, TetGrid, volumes
 from .curving import curved, with_diagonals
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .layered import core_mesh, curved_target, with_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
 from .projection import guarded, projected
+from .regions import (
+    check_regions,
+    cut_at_regions,
+    interfaces,
+    mesh_numbers,
+    refined_at_regions,
+    region_level,
+    region_volumes,
+    thickness,
+)
 from .smoothing import polished
 from .untangling import inverted, narrowest, repaired, unrepaired, untangled
 
@@ -41,7 +52,9 @@ SURFACES = (PLANE, LAYER, BONE)
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
 LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
+REGION_RATIO = 0.6  # greatest edge over thickness in a region inside the core
 STRAY = 0.5  # of the layers' thickness: a node of their inner face so far outside it is put back
+NEAR_RADII = 2.0  # of the fine zone: within them elements have to be good
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
 
 
@@ -70,11 +83,6 @@ class MeshSettings:
     engine: str = "mmg"
 
     @property
-    def regions(self) -> tuple[str, ...]:
-        """The mesh's regions: the layers, outermost first, and the core."""
-        return (*(layer.name for layer in self.layers), self.core)
-
-    @property
     def base_spacing_mm(self) -> float:
         """Edge of the base grid: fine enough for the layer, no finer than the far mesh needs."""
         return float(np.clip(self.edge_far_mm / 3.0, 3.0, 6.0 * np.sqrt(self.flatness)))
@@ -89,7 +97,8 @@ class MeshSettings:
 class BaseMesh:
     """The muscle of an anatomy as an ungraded grid, in the limb frame; shared by all its sites.
 
-    ``size_limit`` (n,) is the edge length that layer and bones allow at the grid's points, mm.
+    ``size_limit`` (n,) is the edge length that layer, bones and regions allow at the grid's points, mm.
+    ``regions_mm3`` is the volume of each region inside the core.
     """
 
     fields: LimbFields
@@ -97,6 +106,7 @@ class BaseMesh:
     size_limit: Array
     trimmed: Mapping[str, TrimmedBone]
     enclosed_mm3: float
+    regions_mm3: Mapping[str, float]
 
 
 def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | None = None) -> BaseMesh:
@@ -111,7 +121,8 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | No
     Raises
     ------
     SurfaceError
-        When the skin does not reach the cut plane, or the fat's depth is needed and not given.
+        When the skin does not reach the cut plane, the fat's depth is needed and not given, or a region
+        cannot be meshed.
     MeshingError
         When nothing is left between layer, bones and cut.
     """
@@ -121,15 +132,18 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | No
     spacing = settings.base_spacing_mm
     low = fields.skin.points.min(axis=0) - spacing
     high = fields.skin.points.max(axis=0) + spacing
-    grid = background.box_grid(low, np.array([*high[:2], 0.0]), spacing)
+    check_regions(fields, settings.edge_near_mm)
+    grid = refined_at_regions(background.box_grid(low, np.array([*high[:2], 0.0]), spacing), fields)
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
         grid = grid.kept(positive)
         if not len(grid.tets):
             raise MeshingError(f"no {settings.core} is left under the layers; choose thinner layers")
+    grid = cut_at_regions(grid, fields)
     trimmed = fields.trimmed()
     limit = size_limit(fields, grid, settings)
-    return BaseMesh(fields, grid, limit, trimmed, enclosed_volume(anatomy, fields, trimmed))
+    enclosed = enclosed_volume(anatomy, fields, trimmed)
+    return BaseMesh(fields, grid, limit, trimmed, enclosed, region_volumes(fields))
 
 
 def mesh_site(
@@ -139,7 +153,7 @@ def mesh_site(
     settings: MeshSettings,
     base: BaseMesh | None = None,
 ) -> tuple[Mesh, MeshReport]:
-    """A conforming two-region mesh graded about an indentation site.
+    """A conforming mesh graded about an indentation site.
 
     Parameters
     ----------
@@ -151,8 +165,8 @@ def mesh_site(
 
     Returns
     -------
-    mesh : regions ``skin`` and ``muscle``; node sets ``fixed_bone`` (on bones) and ``fixed_proximal`` (on the
-        cut plane); face set ``skin`` (outward, without the cut plane).
+    mesh : regions named as the layers, the anatomy's regions and the core; node sets ``fixed_bone`` (on
+        bones) and ``fixed_proximal`` (on the cut plane); face set ``skin`` (outward, without the cut plane).
     report : quality and what was trimmed.
 
     Raises
@@ -163,7 +177,8 @@ def mesh_site(
     base = base or base_mesh(anatomy, settings)
     frame = base.fields.frame
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
-    return _meshed(base, site_size(base.grid.points, base.size_limit, site, inward, settings), settings)
+    size = site_size(base.grid.points, base.size_limit, site, inward, settings)
+    return _meshed(base, size, settings, (site, NEAR_RADII * settings.near_radius_mm))
 
 
 def mesh_limb(
@@ -181,13 +196,17 @@ def mesh_limb(
     return _meshed(base, limb_size(base, fine_to_mm, settings), settings)
 
 
-def _meshed(base: BaseMesh, size: Array, settings: MeshSettings) -> tuple[Mesh, MeshReport]:
-    """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points."""
+def _meshed(
+    base: BaseMesh, size: Array, settings: MeshSettings, near: tuple[Array, float] | None = None
+) -> tuple[Mesh, MeshReport]:
+    """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points; ``near``: as
+    for `mesh_report`."""
     start = time.perf_counter()
     fields = base.fields
     task = _task(base.grid, size, settings)
     core = _snapped(_adapted(task, fields, settings), fields)
-    mesh, stack = with_layers(core, fields, settings.regions)
+    names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
+    mesh, stack = with_layers(core, fields, names)
     mesh = polished(mesh, fields, stack)
     mesh, repairs = repaired(mesh, fields, stack)
     if settings.element == "tet10" and not inverted(mesh).any():
@@ -196,7 +215,9 @@ def _meshed(base: BaseMesh, size: Array, settings: MeshSettings) -> tuple[Mesh, 
             mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack))
     _check_usable(mesh, fields)
     seconds = time.perf_counter() - start
-    report = mesh_report(mesh, fields, base.trimmed, base.enclosed_mm3, seconds, settings.engine)
+    report = mesh_report(
+        mesh, fields, base.trimmed, base.enclosed_mm3, base.regions_mm3, seconds, settings.engine, near
+    )
     return mesh.with_points(fields.frame.to_patient(mesh.points)), replace(report, repairs=repairs)
 
 
@@ -241,7 +262,7 @@ def _graded(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
 
 
 def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
-    """Edge length (n,) at which layers and sheets of core over bone stay as thick as elements need."""
+    """Edge length (n,) at which layers, sheets of core over bone and regions keep their shape."""
     far, points, slack = settings.edge_far_mm, grid.points, fields.floor_range_mm
     under_layers = np.maximum(background.banded(fields.layer, points, far, grid.spacing, slack), 0.0)
     sheet = np.abs(background.banded(fields.void, points, far, grid.spacing, slack)) + under_layers
@@ -249,23 +270,41 @@ def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Arr
     over_bone = np.maximum(SHEET_RATIO * settings.flatness * sheet, smallest)
     depths = fields.layer_depths(points)
     thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
-    return np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
+    limit = np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
+    for number in range(len(fields.regions)):
+        away = background.banded(region_level(fields, number), points, far, grid.spacing, slack)
+        edge = max(REGION_RATIO * thickness(fields, number), settings.edge_near_mm)
+        limit = np.minimum(limit, edge + np.maximum(away, 0.0))
+    return limit
 
 
 def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
     triangles = boundary_faces(core_mesh(grid.points, grid.tets))
     common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
     surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
-    return VolumeTask(grid.points, grid.tets, triangles, surfaces, size, settings.hausdorff_mm)
+    count = int(grid.regions.max())
+    numbers = mesh_numbers(grid.regions, 0, count)
+    inner = interfaces(Mesh(grid.points, grid.tets, "tet4", numbers, tuple(map(str, range(count + 1)))), 0)
+    refs = [np.full(len(faces), REGION << number) for number, faces in enumerate(inner)]
+    return VolumeTask(
+        grid.points,
+        grid.tets,
+        grid.regions,
+        np.vstack([triangles, *inner]),
+        np.concatenate([surfaces, *refs]),
+        size,
+        settings.hausdorff_mm,
+    )
 
 
 def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
-    """Boundary nodes put on cut plane, layer and bone as far as their elements allow."""
+    """Nodes of surfaces put on cut plane, regions, layer and bone as far as their elements allow."""
     in_plane = _nodes_on(core, PLANE)
     target = core.points.copy()
     target[in_plane, 2] = 0.0
     free = np.where(in_plane, 0.0, 1.0)
-    for surface, level in ((BONE, fields.void), (LAYER, fields.layer)):
+    regions = [(REGION << number, region_level(fields, number)) for number in range(len(fields.regions))]
+    for surface, level in (*regions, (BONE, fields.void), (LAYER, fields.layer)):
         nodes = np.flatnonzero(_nodes_on(core, surface))
         target[nodes] = projected(level, target[nodes], free[nodes])
     points = guarded(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)

@@ -9,17 +9,19 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from ...mesh import Mesh, MeshQuality, quality
+from ...mesh import Mesh, MeshQuality, dihedral_angles, quality
 from ..surfaces.surfaces import Anatomy, Surface
 from .layered import inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
+from .regions import interfaces, region_level
 from .untangling import Repair
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-GOOD_DIHEDRAL_DEG = 8.0
-GOOD_VOLUME = 0.005
+# Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.
+GOOD_DIHEDRAL_DEG, SOUND_DIHEDRAL_DEG = 8.0, 3.0
+GOOD_VOLUME = 0.02  # long edges far from the indenter cut across a round limb by up to a hundredth
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class MeshReport:
     ``layer_mean_mm`` and ``layer_std_mm`` are the thickness of all layers together, measured from points all
     over their meshed inner face to the meshed skin; ``layer_thickness_mm`` gives mean, deviation, least and
     greatest of each. ``interface_error_mm`` is how far that inner face is from where it was asked for.
+    ``regions`` gives of each region inside the core the volume that its surface encloses there, mm3, and how
+    far its meshed surface is from that, mean and max, mm.
     ``repairs`` made inverted cells sound.
     """
 
@@ -46,6 +50,7 @@ class MeshReport:
     layer_std_mm: float
     layer_thickness_mm: Mapping[str, Mapping[str, float]]
     interface_error_mm: Mapping[str, float]
+    regions: Mapping[str, Mapping[str, float]]
     trimmed_bone: Mapping[str, TrimmedBone]
     thinned_skin: ThinnedSkin | None
     seconds: float
@@ -59,18 +64,24 @@ def mesh_report(
     fields: LimbFields,
     trimmed: Mapping[str, TrimmedBone],
     enclosed_mm3: float,
+    regions_mm3: Mapping[str, float],
     seconds: float,
     engine: str,
+    near: tuple[Array, float] | None = None,
 ) -> MeshReport:
-    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have."""
+    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have, ``regions_mm3``
+    that of each region inside the core.
+
+    ``near``: the place (3,) and radius (mm) within which elements have to be good.
+    """
     found = quality(mesh)
     volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
-    layers = len(mesh.region_names) - 1
+    layers = len(fields.depths)
     faces = [_facets(mesh.face_sets["skin"]), *(_facets(inner_faces(mesh, i)) for i in range(layers))]
     whole = _thickness(mesh, faces[-1], faces[0])
     each = {
         name: _summary(_thickness(mesh, faces[i + 1], faces[i]))
-        for i, name in enumerate(mesh.region_names[:-1])
+        for i, name in enumerate(mesh.region_names[:layers])
     }
     error = np.abs(fields.layer(mesh.points[faces[-1]].mean(axis=1))[0])
     return MeshReport(
@@ -87,18 +98,42 @@ def mesh_report(
         layer_std_mm=float(whole.std()),
         layer_thickness_mm=each,
         interface_error_mm={"mean": float(error.mean()), "max": float(error.max())},
+        regions=_regions(mesh, fields, regions_mm3),
         trimmed_bone=trimmed,
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
-        warnings=_warnings(found, volume_error),
+        warnings=mesh_warnings(mesh, found, volume_error, near),
     )
 
 
-def _warnings(found: MeshQuality, volume_error: float) -> tuple[str, ...]:
+def _regions(mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    found = {}
+    for number, faces in enumerate(interfaces(mesh, len(fields.depths))):
+        error = np.abs(region_level(fields, number)(mesh.points[faces[:, :3]].mean(axis=1))[0])
+        name = mesh.region_names[len(fields.depths) + number]
+        found[name] = {
+            "enclosed_mm3": regions_mm3[name],
+            "mean_mm": float(error.mean()) if len(error) else 0.0,
+            "max_mm": float(error.max(initial=0.0)),
+        }
+    return found
+
+
+def mesh_warnings(
+    mesh: Mesh, found: MeshQuality, volume_error: float, near: tuple[Array, float] | None = None
+) -> tuple[str, ...]:
+    """What is wrong with a mesh of this quality for its purpose; ``near`` is as for `mesh_report`."""
     warnings = []
-    if found.min_dihedral_deg < GOOD_DIHEDRAL_DEG:
-        warnings.append(f"smallest dihedral angle {found.min_dihedral_deg:.1f} degrees; choose smaller edges")
+    smallest, least, where = found.min_dihedral_deg, SOUND_DIHEDRAL_DEG, ""
+    if near is not None and smallest >= SOUND_DIHEDRAL_DEG:
+        place, radius = near
+        inside = np.linalg.norm(mesh.points[mesh.corners].mean(axis=1) - place, axis=1) < radius
+        angles = dihedral_angles(mesh.points, mesh.corners[inside])
+        smallest, least = float(angles.min(initial=180.0)), GOOD_DIHEDRAL_DEG
+        where = f" within {radius:g} mm of the site"
+    if smallest < least:
+        warnings.append(f"smallest dihedral angle{where} {smallest:.1f} degrees; choose smaller edges")
     if abs(volume_error) > GOOD_VOLUME:
         warnings.append(
             f"volume differs by {100 * volume_error:.1f} % from the surfaces'; choose smaller edges"

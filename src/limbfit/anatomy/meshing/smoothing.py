@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from ...mesh import Mesh
 from ..surfaces.triangles import Surface
+from .background import Field
 from .columns import Columns
 from .layers import LimbFields
 from .projection import guarded, projected
+from .regions import interfaces, region_level
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -74,11 +76,13 @@ def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
 
 
 def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
-    """Moved points (n, 3) of a mesh, those of bone and layers put on their surfaces as far as cells allow."""
+    """Moved points (n, 3) of a mesh, those of surfaces put on them as far as cells allow."""
     on_plane, in_layers, on_bone = _places(mesh, stack)
+    walls = _region_walls(mesh, fields)
     target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
-    bone = np.flatnonzero(on_bone & (on_plane.astype(int) + in_layers + on_bone < 2))
-    for nodes, level in ((bone, fields.void), (stack.base, fields.layer), (stack.top, fields.depth)):
+    alone = _count(on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)) < 2
+    own = [(np.flatnonzero(chosen & alone), level) for chosen, level in (*walls, (on_bone, fields.void))]
+    for nodes, level in (*own, (stack.base, fields.layer), (stack.top, fields.depth)):
         target[nodes] = projected(level, target[nodes], free[nodes])
     return guarded(points, target, mesh.cells, GOOD_DEG)
 
@@ -88,9 +92,26 @@ def held(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray
     points = mesh.points
     on_plane, in_layers, on_bone = _places(mesh, stack)
     normals = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(points), 3)))
-    for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void)):
-        normals[chosen] = level(points[chosen])[1]
-    return normals, on_plane.astype(int) + in_layers + on_bone < 2
+    walls = _region_walls(mesh, fields)
+    for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void), *walls):
+        slope = level(points[chosen])[1]
+        normals[chosen] = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+    return normals, _count(on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)) < 2
+
+
+def _count(*places: NDArray[np.bool_]) -> Ints:
+    """On how many surfaces (n,) each node lies."""
+    return np.sum(places, axis=0)
+
+
+def _region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[NDArray[np.bool_], Field]]:
+    """Which nodes (n,) lie on the surface of each region inside the core, and its level."""
+    found = []
+    for number, faces in enumerate(interfaces(mesh, len(fields.depths))):
+        chosen = np.zeros(len(mesh.points), dtype=bool)
+        chosen[faces] = True
+        found.append((chosen, region_level(fields, number)))
+    return found
 
 
 def _places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:

@@ -162,10 +162,11 @@ def thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: 
 def unrepaired(mesh: Mesh, fields: LimbFields) -> str:
     """Where the inverted cells of a mesh in the limb frame are (LPS mm), next to what, and why."""
     bad = inverted(mesh)
-    region, core = mesh.region_names[int(mesh.regions[bad][0])], mesh.region_names[-1]
+    number = int(mesh.regions[bad][0])
+    region = mesh.region_names[number]
     why = (
-        f"there is too little {core} for its elements"
-        if region == core
+        f"there is too little {region} for its elements"
+        if number >= len(fields.depths)
         else "the skin is folded, or bent more sharply than its layers are thick"
     )
     where = _place(mesh.points[mesh.corners[bad]].mean(axis=1)[0], fields)

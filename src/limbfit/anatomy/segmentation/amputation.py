@@ -6,7 +6,7 @@ plane is carried on distally and rounded off, so that the limb ends ``pad_mm`` b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,7 +95,7 @@ def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
     array = np.where(inside.pop(0), labels.soft_value, 0).astype(np.uint8)
     for value, mask in inside.items():
         array[mask] = value
-    return LabelMap(array, spacing, labels.index_to_point(start), labels.direction, labels.names)
+    return replace(labels, array=array, spacing=spacing, origin=labels.index_to_point(start))
 
 
 def _interpolated(field: NDArray[np.float32], place: Array, axis: int) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,8 +57,10 @@ def voxelised(anatomy: Anatomy, distal_mm: float = _MARGIN_MM, spacing_mm: float
     corner = np.array([*low[:2], -size[2] * spacing_mm]) + spacing_mm / 2
     empty = np.zeros(size[::-1], dtype=np.uint8)
     grid = Grid(empty, np.full(3, spacing_mm), frame.to_patient(corner), frame.rotation.T)
-    bones = {name: filled(bone, grid) for name, bone in anatomy.bones.items()}
-    return label_map(grid, filled(anatomy.skin, grid), bones)
+    inner = {**anatomy.regions, **anatomy.bones}  # bones last: they stay whole where the two overlap
+    masks = {name: filled(body, grid) for name, body in inner.items()}
+    labels = label_map(grid, filled(anatomy.skin, grid), masks)
+    return replace(labels, regions={name: name for name in anatomy.regions})
 
 
 def label_map(grid: Grid, limb: Mask, bones: Mapping[str, Mask]) -> LabelMap:

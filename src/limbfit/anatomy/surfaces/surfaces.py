@@ -1,4 +1,4 @@
-"""The limb as closed surfaces: skin with a flat proximal cap, and bones.
+"""The limb as closed surfaces: skin with a flat proximal cap, bones, and regions of soft tissue.
 
 Bones that reach the proximal cut stick out of the skin's cap by a few millimetres, so that the void they
 leave in the soft tissue is open there.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +49,7 @@ Array = NDArray[np.float64]
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
+_OVERLAP_MM = 3.0  # of a region with a bone, or with the air: voxels and smoothing come to that
 _JOIN_MM = 1e-3
 # Passes of remeshing before and after the cap is cut: the rim gets better triangles from even ones, and its
 # shortest edges need more passes than a smooth surface.
@@ -65,12 +66,14 @@ class Anatomy:
     skin : closed, flat where the limb was cut proximally.
     bones : closed, by name; they may stick out of the skin beyond the cut plane, nowhere else.
     cut_point, cut_normal : (3,) the plane of the proximal cut; the unit normal points out, proximally.
+    regions : closed, by name: bodies of soft tissue that are no layer, as a tendon or a scar; as for bones.
     """
 
     skin: Surface
     bones: Mapping[str, Surface]
     cut_point: Array
     cut_normal: Array
+    regions: Mapping[str, Surface] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         point, normal = _plane(self.cut_point, self.cut_normal)
@@ -113,12 +116,16 @@ def build_anatomy(
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
     built = _built(labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal))
-    bones = {name: _placed(bone, labels) for name, bone in built.bones.items()}
+    bones, regions = (
+        {name: _placed(body, labels) for name, body in bodies.items()}
+        for bodies in (built.bones, built.regions)
+    )
     return Anatomy(
         _placed(built.skin, labels),
         bones,
         labels.direction @ built.cut_point + labels.origin,
         labels.direction @ built.cut_normal,
+        regions,
     )
 
 
@@ -136,7 +143,16 @@ def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, nor
     for name in labels.bone_names:
         if _distal_volume(labels, name, point, normal) >= _STUMP_MM3:
             bones[name] = extract_surface(reach, name, edge_mm)
-    return Anatomy(skin, bones, point, normal)
+    regions = {}
+    for label, name in labels.regions.items():
+        if _distal_volume(labels, label, point, normal) <= 0.0:
+            raise LabelError(
+                f"nothing of {label!r} is left in the limb",
+                place=f"geometry.regions.{name}",
+                remedy="leave the region out or move the cut",
+            )
+        regions[name] = extract_surface(reach, label, edge_mm)
+    return Anatomy(skin, bones, point, normal, regions)
 
 
 def _default_cut(labels: LabelMap, end: ProximalEnd) -> tuple[Array, Array]:
@@ -221,14 +237,47 @@ def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> 
     Raises
     ------
     SurfaceError
-        For a surface that :func:`check_closed` refuses, a bone outside the skin (beyond the cut is allowed),
-        or bones that overlap.
+        For a surface that :func:`check_closed` refuses, a bone or region outside the skin (beyond the cut is
+        allowed), or a region that reaches into a bone.
     """
     files = files or {}
     check_closed(anatomy.skin, "skin", files.get("skin"))
     for name, bone in anatomy.bones.items():
         check_closed(bone, name, files.get(name))
         _check_inside(anatomy, name, files.get(name))
+    for name, region in anatomy.regions.items():
+        check_closed(region, name, files.get(name), smallest_mm=0.0)
+        _check_region(anatomy, name, files.get(name))
+
+
+def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
+    """Refuse a region that lies beyond the cut, outside the skin or in a bone by more than voxels explain."""
+    region, place = anatomy.regions[name], f"geometry.regions.{name}"
+    points = region.points[anatomy.height(region.points) < 0.0]
+    if not len(points):
+        raise SurfaceError(
+            "the region lies wholly beyond the proximal cut",
+            file=file,
+            place=place,
+            remedy="leave it out or move the cut",
+        )
+    outside = float(signed_distance(anatomy.skin, points).max())
+    if outside > _OVERLAP_MM:
+        raise SurfaceError(
+            f"the region lies outside the limb by up to {outside:.1f} mm",
+            file=file,
+            place=place,
+            remedy="check that it is in the same coordinates (LPS or RAS) and unit as the skin",
+        )
+    for bone, body in anatomy.bones.items():
+        deep = max(-signed_distance(body, points).min(), -signed_distance(region, body.points).min())
+        if deep > _OVERLAP_MM:
+            raise SurfaceError(
+                f"the region and the bone {bone} overlap by up to {deep:.1f} mm",
+                file=file,
+                place=place,
+                remedy="let the region end at the bone's surface",
+            )
 
 
 def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
@@ -255,12 +304,14 @@ def signed_distance(surface: Surface, points: ArrayLike) -> Array:
 
 
 def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()) -> None:
-    """Write skin.stl, bone-<name>.stl and surfaces.json (cut plane, volumes, areas, notes) into a folder."""
+    """Write skin.stl, bone-<name>.stl, region-<name>.stl and surfaces.json (cut, volumes, areas, notes)."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_surface(folder / "skin.stl", anatomy.skin)
     for name, bone in anatomy.bones.items():
         write_surface(folder / f"bone-{name}.stl", bone)
+    for name, region in anatomy.regions.items():
+        write_surface(folder / f"region-{name}.stl", region)
     summary = {
         "coordinates": "LPS",
         "unit": "mm",
@@ -268,6 +319,7 @@ def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()
         "cut_normal": anatomy.cut_normal.tolist(),
         "skin": _measures(anatomy.skin),
         "bones": {name: _measures(bone) for name, bone in anatomy.bones.items()},
+        "regions": {name: _measures(region) for name, region in anatomy.regions.items()},
         "notes": list(notes),
     }
     (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -286,11 +338,13 @@ def load_anatomy(folder: str | Path) -> Anatomy:
     folder = Path(folder)
     try:
         summary = json.loads((folder / "surfaces.json").read_text(encoding="utf-8"))
-        names, point, normal = list(summary["bones"]), summary["cut_point"], summary["cut_normal"]
+        names, inner = list(summary["bones"]), list(summary["regions"])
+        point, normal = summary["cut_point"], summary["cut_normal"]
     except (OSError, ValueError, KeyError, TypeError):
         raise SurfaceError(
             "surfaces.json is missing or unreadable", file=folder, remedy="run the surfaces stage again"
         ) from None
     skin = read_surface(folder / "skin.stl")
     bones = {name: read_surface(folder / f"bone-{name}.stl") for name in names}
-    return Anatomy(skin, bones, point, normal)
+    regions = {name: read_surface(folder / f"region-{name}.stl") for name in inner}
+    return Anatomy(skin, bones, point, normal, regions)

@@ -133,7 +133,13 @@ def half_edges(faces: Faces) -> Faces:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def check_closed(surface: Surface, name: str = "skin", file: str | Path | None = None) -> None:
+def check_closed(
+    surface: Surface,
+    name: str = "skin",
+    file: str | Path | None = None,
+    *,
+    smallest_mm: float | None = None,
+) -> None:
     """Refuse a surface that does not bound a body.
 
     Parameters
@@ -141,6 +147,7 @@ def check_closed(surface: Surface, name: str = "skin", file: str | Path | None =
     surface : LPS mm.
     name : ``skin`` or the bone's; a skin is expected to be as large as a limb.
     file : for the error's text.
+    smallest_mm : least diagonal of its box; by default as large as such a body from a file is.
 
     Raises
     ------
@@ -148,7 +155,9 @@ def check_closed(surface: Surface, name: str = "skin", file: str | Path | None =
         Open, non-manifold, inconsistently or inwardly oriented, several bodies, of a size that only another
         unit explains, or crossing itself.
     """
-    _check_size(surface, name, file)
+    if smallest_mm is None:
+        smallest_mm = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
+    _check_size(surface, name, file, smallest_mm)
     _check_edges(surface, name, file)
     parts = len(bodies(surface))
     if parts > 1:
@@ -173,11 +182,10 @@ def check_closed(surface: Surface, name: str = "skin", file: str | Path | None =
         )
 
 
-def _check_size(surface: Surface, name: str, file: str | Path | None) -> None:
+def _check_size(surface: Surface, name: str, file: str | Path | None, smallest: float) -> None:
     if len(surface.faces) < 4:
         raise SurfaceError(f"{name}: only {len(surface.faces)} faces", file=file)
     diagonal = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
-    smallest = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
     if diagonal < smallest or diagonal > _LARGEST_MM:
         units = "metres, centimetres or inches" if diagonal < smallest else "another unit"
         raise SurfaceError(

@@ -68,6 +68,7 @@ def input_files(study: Study) -> dict[str, list[Path]]:
         files["segment"] += [names] if study.path(names).is_file() else []
     if study.surfaces is not None:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
+    files["surfaces"] += [one.surface for one in study.geometry.regions if one.surface is not None]
     files_of_indenters = [one.file for one in study.all_indenters.values() if one.file is not None]
     if files_of_indenters:
         files["calibrate"] = files_of_indenters

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, read_labels
+from ...anatomy.labels.naming import plain_name
 from ...anatomy.segmentation.amputation import amputate
 from ...anatomy.segmentation.voxels import amputated
 from ...anatomy.surfaces.mending import closed_anatomy
@@ -40,7 +42,9 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
 def _limb_labels(context: Context) -> LabelMap:
     """The label map of the segment stage, after the virtual amputation where there is one."""
     geometry = context.study.geometry
-    labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
+    named = {one.name: plain_name(one.label) for one in geometry.regions if one.label is not None}
+    with naming(labelled_file(context.study)):
+        labels = read_labels(context.store["segment"] / "labels.seg.nrrd").with_regions(named)
     if geometry.amputation is None:
         return labels
     plane = geometry.amputation
@@ -56,8 +60,21 @@ def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
             edge_mm=geometry.surface_edge_mm,
             proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
         )
-        check_anatomy(anatomy)
+    anatomy, files = _with_given_regions(study, anatomy)
+    with naming(labelled_file(study)):
+        check_anatomy(anatomy, files)
     return anatomy
+
+
+def _with_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[str, Path]]:
+    """The anatomy with the regions that come as surfaces, in the study's order, and their files by name."""
+    files = {one.name: study.path(one.surface) for one in study.geometry.regions if one.surface is not None}
+    tables = study.surfaces
+    coordinates, unit = (None, "mm") if tables is None else (tables.coordinates, tables.unit)
+    found = {name: read_surface(file, coordinates, unit) for name, file in files.items()}
+    found |= anatomy.regions
+    order = [one.name for one in study.geometry.regions]
+    return replace(anatomy, regions={name: found[name] for name in order}), files
 
 
 def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
@@ -74,6 +91,9 @@ def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
     surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
     skin, cut = surfaces.pop("skin"), geometry.proximal_cut
     anatomy, notes = closed_anatomy(skin, surfaces, None if cut is None else (cut.point, cut.normal), files)
+    if geometry.regions:
+        anatomy, region_files = _with_given_regions(study, anatomy)
+        check_anatomy(anatomy, files | region_files)
     if geometry.amputation is None:
         return anatomy, notes
     plane, pad = geometry.amputation, geometry.amputation_pad_mm

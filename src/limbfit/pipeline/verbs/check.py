@@ -143,7 +143,7 @@ def _sampling(name: str, volume: Volume) -> str:
 def _surface_facts(study: Study, anatomy: Anatomy) -> list[str]:
     facts = [
         f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
-        for name, surface in {"skin": anatomy.skin, **anatomy.bones}.items()
+        for name, surface in {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}.items()
     ]
     for site in study.sites:
         place_site(site, study, anatomy, None)

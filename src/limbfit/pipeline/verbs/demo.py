@@ -24,6 +24,7 @@ def make_phantom_study(
     seed: int = 0,
     fat: bool = False,
     socket: bool = False,
+    tendon: bool = False,
     listener: Listener = quiet,
     workers: int = 0,
 ) -> dict[str, Any]:
@@ -41,6 +42,7 @@ def make_phantom_study(
             seed=seed,
             fat=fat,
             socket=socket,
+            tendon=tendon,
             mapping=mapping,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
         )

@@ -79,7 +79,7 @@ def _segment_facts(study: Study, store: Store) -> dict[str, Any]:
 def _surface_facts(study: Study, store: Store) -> dict[str, Any]:
     anatomy = load_anatomy(store["surfaces"])
     plane = study.geometry.amputation
-    bodies = {"skin": anatomy.skin, **anatomy.bones}
+    bodies = {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}
     return {
         "volumes_cm3": {name: round(body.volume / 1000, 2) for name, body in bodies.items()},
         "triangles": {name: len(body.faces) for name, body in bodies.items()},

@@ -21,7 +21,17 @@ from ...web.shapes import interface, read_shell, shell_of, volume_of
 from ..formats import symbol, unit_of
 from ..page import Interactive
 from ..store import Curves, Json, Results
-from .pictures import BONE, FITTED, HELD_OUT, SKIN_SURFACE, cut_views, drawable, far_side, limb_frame, linear
+from .pictures import (
+    FITTED,
+    HELD_OUT,
+    SKIN_SURFACE,
+    cut_views,
+    drawable,
+    far_side,
+    inner_colour,
+    limb_frame,
+    linear,
+)
 
 MOST_FACES, MOST_SAMPLES = 12_000, 300
 FIELD_RADIUS_MM = 50.0
@@ -58,14 +68,14 @@ def _surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     rows = []
     for name, file in store.surface_files.items():
         shell = read_shell(file, MOST_FACES)
-        bone = name != "skin"
+        kind, _, title = name.partition("-")
         rows.append(
             {
                 "name": name,
-                "title": name.removeprefix("bone-") if bone else "skin",
-                "kind": "bone" if bone else "skin",
-                "colour": BONE if bone else SKIN_SURFACE,
-                "opacity": 1.0 if bone else 0.38,
+                "title": title or name,
+                "kind": "skin" if name == "skin" else "bone",
+                "colour": SKIN_SURFACE if name == "skin" else inner_colour(name),
+                "opacity": 0.38 if kind == "skin" else 1.0,
             }
         )
         arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
@@ -82,7 +92,8 @@ def _layers(store: Results) -> Iterable[tuple[str, Any]]:
         return
     mesh = read_vtu(file)
     volume = volume_of(mesh)
-    for index, name in enumerate(mesh.region_names[:-1]):
+    inner = {file.removeprefix("region-") for file in store.surface_files if file.startswith("region-")}
+    for index, name in enumerate(name for name in mesh.region_names[:-1] if name not in inner):
         yield f"inner face of {name}", interface(volume, index)
 
 

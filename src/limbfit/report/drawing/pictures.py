@@ -4,7 +4,7 @@ and 6) and the deformed cut at the peak.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,7 @@ def new_plotter() -> Any:
 
 @without_display_warning()
 def surface_figure(store: Results) -> Figure | None:
-    """The limb from four sides: skin translucent, bones inside, sites named on the side that shows them."""
+    """The limb from four sides: skin translucent, bones and regions inside, sites named where they show."""
     files = store.surface_files
     if "skin" not in files:
         return None
@@ -87,9 +87,7 @@ def surface_figure(store: Results) -> Figure | None:
     skin = pv.read(files["skin"])
     plotter.enable_depth_peeling(8)
     plotter.add_mesh(skin, color=SKIN_SURFACE, opacity=0.36, smooth_shading=True, **MATT)
-    for name, file in files.items():
-        if name != "skin":
-            plotter.add_mesh(pv.read(file), color=BONE, **MATT)
+    add_inner(plotter, files)
     views = four_sides(store, skin)
     shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
     plotter.close()
@@ -99,6 +97,18 @@ def surface_figure(store: Results) -> Figure | None:
         "Filled: sites that were fitted; open: held out."
     )
     return Figure("model", strip(shots, SIDES, alt), caption)
+
+
+def add_inner(plotter: Any, files: Mapping[str, Path]) -> None:
+    """The surfaces inside the skin: bones, and regions of soft tissue in a colour of their own."""
+    for name, file in files.items():
+        if name != "skin":
+            plotter.add_mesh(pv.read(file), color=inner_colour(name), **MATT)
+
+
+def inner_colour(name: str) -> str:
+    """The colour of a surface inside the skin, by the name of its file."""
+    return BONE if name.startswith("bone-") else BETWEEN[0]
 
 
 @without_display_warning()
@@ -281,7 +291,7 @@ def add_regions(plotter: Any, grid: Grid) -> None:
 
 
 def region_colours(grid: Grid) -> dict[str, str]:
-    """The colour of each region: layers, outermost first, and the core."""
+    """The colour of each region: layers, outermost first, what is inside the core, and the core."""
     names = [str(name) for name in grid.field_data["region_names"]]
     between = [BETWEEN[i % len(BETWEEN)] for i in range(len(names) - 2)]
     return dict(zip(names, [SKIN, *between, MUSCLE], strict=False))

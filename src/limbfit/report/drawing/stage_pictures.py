@@ -19,11 +19,13 @@ from .pictures import (
     MATT,
     SIDES,
     SKIN_SURFACE,
+    add_inner,
     add_regions,
     cut_views,
     drawable,
     far_side,
     four_sides,
+    inner_colour,
     linear,
     new_plotter,
     region_colours,
@@ -76,7 +78,9 @@ def surfaces_sheet(store: Results) -> Drawing:
             skin.copy(), scalars=thickness, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, **MATT
         )
         rows.append(Row(_shots(plotter, views), ("",) * 4, (limits, title)))
+    regions = [name for name in store.surface_files if name.startswith("region-")]
     keys = [Key("skin", SKIN_SURFACE), Key("bone", BONE), Key("proximal cut", CUT_PLANE)]
+    keys += [Key(name.removeprefix("region-"), inner_colour(name)) for name in regions]
     return sheet("Surfaces", rows, keys)
 
 
@@ -154,9 +158,7 @@ def _limb_plotter(store: Results, skin: Any) -> Any:
     plotter = new_plotter()
     plotter.enable_depth_peeling(8)
     plotter.add_mesh(skin, color=SKIN_SURFACE, opacity=0.36, smooth_shading=True, **MATT)
-    for name, file in store.surface_files.items():
-        if name != "skin":
-            plotter.add_mesh(pv.read(file), color=BONE, **MATT)
+    add_inner(plotter, store.surface_files)
     return plotter
 
 
@@ -183,7 +185,7 @@ def _cut_plane(store: Results, skin: Any) -> Any:
 def _thicknesses(store: Results, skin: Any) -> list[tuple[Any, str]]:
     """What is known on the skin: tissue down to the nearest bone, and the fat's depth where it was mapped."""
     found = []
-    bones = [pv.read(file) for name, file in store.surface_files.items() if name != "skin"]
+    bones = [pv.read(file) for name, file in store.surface_files.items() if name.startswith("bone-")]
     if bones:
         far = [np.abs(skin.compute_implicit_distance(bone)["implicit_distance"]) for bone in bones]
         found.append((np.min(far, axis=0), "tissue over the nearest bone (mm)"))

@@ -79,12 +79,14 @@ def _geometry(store: Results) -> str:
     )
     repairs = len(store.segment.get("repairs") or ())
     edge = geometry.get("surface_edge_mm")
+    inner = ", ".join(region["name"] for region in geometry.get("regions") or ())
     return _said(
         (
             start,
             f"{repairs} repairs were made to the label map." if repairs else "",
             f"Smooth closed surfaces have edges of about {edge} mm." if edge else "",
             _layers(geometry),
+            f"Regions inside the core, to which the mesh conforms: {inner}." if inner else "",
             "Bones are voids. Where bone lies shallower than the layer, the rule is "
             f"“{geometry['bone_policy']}”, with {geometry.get('bone_clearance_mm')} mm between."
             if geometry.get("bone_policy")

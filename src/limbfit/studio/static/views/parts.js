@@ -8,7 +8,7 @@ export const FITTED = "#0072b2", HELD_OUT = "#d55e00"; // as the dots of the sit
 export const NAVIGATION = "Drag turns the picture, Shift and drag moves it; the wheel enlarges once it was clicked.";
 const BETWEEN = ["#7d6a2e", "#f7efce", "#4a6472"];
 
-/** The colour of a tissue: layers, outermost first, and the core last; as in the report. */
+/** The colour of a tissue: layers, outermost first, what is inside the core, the core last; as in the report. */
 export const REGION_COLOURS = (index, count) => (index === 0 ? "#e3c878" : index === count - 1 ? "#c8717a" : BETWEEN[(index - 1) % BETWEEN.length]);
 
 /** A control with its label before it. */
