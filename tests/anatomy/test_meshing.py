@@ -19,6 +19,7 @@ from limbfit.anatomy.meshing.columns import columns
 from limbfit.anatomy.meshing.curving import with_diagonals
 from limbfit.anatomy.meshing.layers import LayerSpec, limb_fields, signed_distance
 from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.meshing.meshreport import mesh_warnings
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces, quality, to_tet10
@@ -67,6 +68,26 @@ def test_volume_layer_and_quality(meshed: tuple) -> None:
     assert report.interface_error_mm["mean"] < 0.1
     assert report.warnings == ()
     assert sum(report.region_cells.values()) == report.cells == len(mesh.cells)
+
+
+def test_a_flat_element_is_told_where_it_matters(meshed: tuple) -> None:
+    """Below 8 degrees near the site, below 3 degrees anywhere."""
+    mesh, _, position = meshed
+    distance = np.linalg.norm(mesh.points[mesh.corners].mean(axis=1) - position, axis=1)
+
+    def told(cell: int, height: float) -> tuple[str, ...]:
+        a, b, c, top = mesh.corners[cell]
+        points = mesh.points.copy()
+        foot = points[[a, b, c]].mean(axis=0)
+        points[top] = foot + height * (points[top] - foot)
+        flat = mesh.with_points(points)
+        return mesh_warnings(flat, quality(flat), 0.0, (position, 20.0))
+
+    near, far = int(distance.argmin()), int(distance.argmax())
+    assert mesh_warnings(mesh, quality(mesh), 0.01, (position, 20.0)) == ()
+    assert [text.startswith("smallest dihedral angle within 20 mm") for text in told(near, 0.06)] == [True]
+    assert told(far, 0.001)[0].startswith("smallest dihedral angle 0.")
+    assert "volume differs by 3.0 %" in mesh_warnings(mesh, quality(mesh), 0.03)[0]
 
 
 def test_nodes_of_the_skin_stay_on_a_rough_one(oblique: Anatomy) -> None:

@@ -54,6 +54,7 @@ LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 de
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
 REGION_RATIO = 0.6  # greatest edge over thickness in a region inside the core
 STRAY = 0.5  # of the layers' thickness: a node of their inner face so far outside it is put back
+NEAR_RADII = 2.0  # of the fine zone: within them elements have to be good
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
 
 
@@ -176,7 +177,8 @@ def mesh_site(
     base = base or base_mesh(anatomy, settings)
     frame = base.fields.frame
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
-    return _meshed(base, site_size(base.grid.points, base.size_limit, site, inward, settings), settings)
+    size = site_size(base.grid.points, base.size_limit, site, inward, settings)
+    return _meshed(base, size, settings, (site, NEAR_RADII * settings.near_radius_mm))
 
 
 def mesh_limb(
@@ -194,8 +196,11 @@ def mesh_limb(
     return _meshed(base, limb_size(base, fine_to_mm, settings), settings)
 
 
-def _meshed(base: BaseMesh, size: Array, settings: MeshSettings) -> tuple[Mesh, MeshReport]:
-    """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points."""
+def _meshed(
+    base: BaseMesh, size: Array, settings: MeshSettings, near: tuple[Array, float] | None = None
+) -> tuple[Mesh, MeshReport]:
+    """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points; ``near``: as
+    for `mesh_report`."""
     start = time.perf_counter()
     fields = base.fields
     task = _task(base.grid, size, settings)
@@ -211,7 +216,7 @@ def _meshed(base: BaseMesh, size: Array, settings: MeshSettings) -> tuple[Mesh, 
     _check_usable(mesh, fields)
     seconds = time.perf_counter() - start
     report = mesh_report(
-        mesh, fields, base.trimmed, base.enclosed_mm3, base.regions_mm3, seconds, settings.engine
+        mesh, fields, base.trimmed, base.enclosed_mm3, base.regions_mm3, seconds, settings.engine, near
     )
     return mesh.with_points(fields.frame.to_patient(mesh.points)), replace(report, repairs=repairs)
 

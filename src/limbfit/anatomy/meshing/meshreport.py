@@ -9,7 +9,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from ...mesh import Mesh, MeshQuality, quality
+from ...mesh import Mesh, MeshQuality, dihedral_angles, quality
 from ..surfaces.surfaces import Anatomy, Surface
 from .layered import inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
@@ -19,8 +19,9 @@ from .untangling import Repair
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-GOOD_DIHEDRAL_DEG = 8.0
-GOOD_VOLUME = 0.005
+# Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.
+GOOD_DIHEDRAL_DEG, SOUND_DIHEDRAL_DEG = 8.0, 3.0
+GOOD_VOLUME = 0.02  # long edges far from the indenter cut across a round limb by up to a hundredth
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,12 @@ def mesh_report(
     regions_mm3: Mapping[str, float],
     seconds: float,
     engine: str,
+    near: tuple[Array, float] | None = None,
 ) -> MeshReport:
     """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have, ``regions_mm3``
     that of each region inside the core.
+
+    ``near``: the place (3,) and radius (mm) within which elements have to be good.
     """
     found = quality(mesh)
     volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
@@ -99,7 +103,7 @@ def mesh_report(
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
-        warnings=_warnings(found, volume_error),
+        warnings=mesh_warnings(mesh, found, volume_error, near),
     )
 
 
@@ -116,10 +120,20 @@ def _regions(mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]) -
     return found
 
 
-def _warnings(found: MeshQuality, volume_error: float) -> tuple[str, ...]:
+def mesh_warnings(
+    mesh: Mesh, found: MeshQuality, volume_error: float, near: tuple[Array, float] | None = None
+) -> tuple[str, ...]:
+    """What is wrong with a mesh of this quality for its purpose; ``near`` is as for `mesh_report`."""
     warnings = []
-    if found.min_dihedral_deg < GOOD_DIHEDRAL_DEG:
-        warnings.append(f"smallest dihedral angle {found.min_dihedral_deg:.1f} degrees; choose smaller edges")
+    smallest, least, where = found.min_dihedral_deg, SOUND_DIHEDRAL_DEG, ""
+    if near is not None and smallest >= SOUND_DIHEDRAL_DEG:
+        place, radius = near
+        inside = np.linalg.norm(mesh.points[mesh.corners].mean(axis=1) - place, axis=1) < radius
+        angles = dihedral_angles(mesh.points, mesh.corners[inside])
+        smallest, least = float(angles.min(initial=180.0)), GOOD_DIHEDRAL_DEG
+        where = f" within {radius:g} mm of the site"
+    if smallest < least:
+        warnings.append(f"smallest dihedral angle{where} {smallest:.1f} degrees; choose smaller edges")
     if abs(volume_error) > GOOD_VOLUME:
         warnings.append(
             f"volume differs by {100 * volume_error:.1f} % from the surfaces'; choose smaller edges"

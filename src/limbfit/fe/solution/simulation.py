@@ -48,7 +48,7 @@ NOTHING = 1e-6
 MOST_DEEPER = 3.0
 # Contact pressure over the mean shear modulus from which a rounded edge is flat in the tangents far from
 # equilibrium: over the radius it is a negative stiffness, there beside that of the tissue.
-STEEP_PRESSURE = 1.0
+STEEP_PRESSURE = 3.0
 
 
 class Simulation:
