@@ -55,8 +55,8 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
     """A gauge of each region that a line meets, from where it enters the mesh nearest to ``origin``.
 
     It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
-    that is met twice, as skin is where the line passes no bone, the first part counts. Curved faces are met as the flat triangles of their corners, and
-    quadrilaterals as two.
+    that is met twice, as skin is where the line passes no bone, the first part counts. Curved faces are met
+    as the flat triangles of their corners, and quadrilaterals as two.
 
     Parameters
     ----------
