@@ -152,7 +152,8 @@ class Limb:
             gauges = gauges_along(mesh, np.array(position), np.array(axis))
             model = replace(model, layers=tuple(one.region for one in gauges))
             problem = build_problem(model, mesh, parameters_of(self.seed))
-            result = solve(replace(problem, element=TRUE_ELEMENT), steps=TRUE_STEPS, store="all")
+            steps = replace(TRUE_STEPS, load_steps=12, unload_steps=20)  # holds take those of unloading
+            result = solve(replace(problem, element=TRUE_ELEMENT), steps=steps, store="all")
             if not result.completed:
                 raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
             times = model.curve_times(401)
@@ -201,6 +202,7 @@ def write_case(
     every = (*takes, *held_out)
     save_anatomy(folder / "limb", Stump().anatomy(STUDY_SPACING_MM))
     text = HEAD.replace("edge_near_mm = 6.0", f"edge_near_mm = {edge_mm}")
+    text = text.replace("load_steps = 5\nunload_steps = 4", "load_steps = 8\nunload_steps = 12")
     if prior:
         text = text.replace("[calibration]\n", f"[calibration]\n{PRIORS}")
     text += BALL_TABLE if any(take.ball for take in takes) else ""

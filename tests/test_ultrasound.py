@@ -53,6 +53,14 @@ def test_quadratic_faces_are_followed_by_their_own_functions() -> None:
     assert muscle.weights @ sunk[muscle.nodes] == pytest.approx(0.0, abs=1e-12)
 
 
+def test_what_lies_on_the_other_side_is_not_counted() -> None:
+    """Skin above and below muscle: ultrasound sees the near one."""
+    mesh = layered_block((3.0, 9.0, 2.0), ("skin", "muscle", "far"), 12.0, 4, 3.0)
+    mesh = replace(mesh, regions=np.where(mesh.regions == 2, 0, mesh.regions))
+    found = gauges_along(mesh, np.array([1.0, 2.0, 0.0]), DOWN)
+    assert {one.region: one.thickness_mm for one in found} == pytest.approx({"skin": 3.0, "muscle": 9.0})
+
+
 def test_no_tissue_under_the_axis_is_told() -> None:
     with pytest.raises(ProblemError, match="no tissue lies under the indenter's axis"):
         gauges_along(block_of("hex8", 4), np.array([100.0, 0.0, 0.0]), DOWN)

@@ -54,9 +54,9 @@ class _Crossing:
 def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
     """A gauge of each region that a line meets, from where it enters the mesh nearest to ``origin``.
 
-    It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. A region
-    that is met twice is measured in all. Curved faces are met as the flat triangles of their corners, and
-    quadrilaterals as two.
+    It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
+    that is met twice, as skin is where the line passes no bone, the first part counts. Curved faces are met
+    as the flat triangles of their corners, and quadrilaterals as two.
 
     Parameters
     ----------
@@ -76,20 +76,17 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
     end = next((k for k in range(first + 1, len(crossings)) if crossings[k].below < 0), None)
     if end is None:
         raise ProblemError("the mesh under the indenter is not closed", remedy="mesh the site anew")
-    spans: dict[int, list[tuple[_Crossing, _Crossing]]] = {}
+    spans: dict[int, tuple[_Crossing, _Crossing]] = {}
     for top, bottom in pairwise(crossings[first : end + 1]):
-        spans.setdefault(top.below, []).append((top, bottom))
-    return tuple(_gauge(mesh.region_names[region], pairs) for region, pairs in spans.items())
+        spans.setdefault(top.below, (top, bottom))
+    return tuple(_gauge(mesh.region_names[region], *span) for region, span in spans.items())
 
 
-def _gauge(region: str, pairs: list[tuple[_Crossing, _Crossing]]) -> Gauge:
-    nodes = np.concatenate([one.nodes for pair in pairs for one in pair])
-    weights: Array = np.concatenate(
-        [part for top, bottom in pairs for part in (top.weights, -bottom.weights)]
-    )
-    kept, place = np.unique(nodes, return_inverse=True)
-    thickness = sum(bottom.along_mm - top.along_mm for top, bottom in pairs)
-    return Gauge(region, float(thickness), kept, np.bincount(place, weights).astype(np.float64))
+def _gauge(region: str, top: _Crossing, bottom: _Crossing) -> Gauge:
+    weights: Array = np.concatenate([top.weights, -bottom.weights])
+    kept, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
+    thickness = bottom.along_mm - top.along_mm
+    return Gauge(region, thickness, kept, np.bincount(place, weights).astype(np.float64))
 
 
 def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
