@@ -22,6 +22,7 @@ from ..mesh import Mesh
 from ..study import Vector
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Direction = Vector | Literal["flow"]
 DISTAL_MM = 10.0  # of the bone's far end, along the limb, that fibres run to
 _SOLVED = 1e-8  # residual of the potential
@@ -76,7 +77,7 @@ def flow_directions(mesh: Mesh, tissue: str) -> Array:
     return np.asarray(flow / size)
 
 
-def _ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[Bools, Bools]:
     """Which of the ``nodes`` are on the proximal cut, and which at the far end of the bone."""
     none = np.zeros(0, dtype=np.int64)
     cut, bone = (mesh.node_sets.get(name, none) for name in ("fixed_proximal", "fixed_bone"))
@@ -90,7 +91,7 @@ def _ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDAr
 
 
 def _potential(
-    count: int, cells: NDArray[np.int64], gradients: Array, weights: Array, start: Array, end: Array
+    count: int, cells: NDArray[np.int64], gradients: Array, weights: Array, start: Bools, end: Bools
 ) -> Array:
     """The solution (n,) of Laplace's equation by linear tetrahedra: 0 at ``start``, 1 at ``end``."""
     blocks = np.einsum("mia,mib,m->mab", gradients, gradients, weights)
