@@ -1,11 +1,13 @@
-"""Intervals of a socket's results: what they come from, against drawn parameters."""
+"""Intervals of a socket's results: what they come from, against drawn parameters; doubts in its words."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from limbfit.fe import Doubt
 from limbfit.pipeline.experiments.socket_intervals import Z95, Spread, spread_facts
+from limbfit.pipeline.experiments.socket_limb import warning
 
 NAMES = ("skin.c_kPa", "skin.tau_s", "liner.c_kPa")
 SLOPES = np.array([3.0, -1.0, 2.0])
@@ -30,3 +32,11 @@ def test_what_is_stored_has_the_same_keys_with_and_without_intervals():
     known = spread_facts(spread, "settling_", "mm", 5.0, SLOPES)
     assert known.keys() == spread_facts(None, "settling_", "mm", 5.0, None).keys()
     assert known["settling_interval_mm"][0] >= 0.0
+
+
+def test_folded_elements_are_told_with_a_remedy_that_a_socket_has():
+    found = warning(Doubt("folded", "27 elements are inside out: a rounded indenter", 27, 0.0, 0.0))
+    assert found.startswith("27 elements of the limb")
+    assert "socket.edge_mm" in found
+    assert "indenter" not in found
+    assert warning(Doubt("unsettled", "use more steps", 1, 0.0, 0.0)) == "use more steps"

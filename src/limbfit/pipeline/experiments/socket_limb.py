@@ -18,6 +18,7 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...donning import SETTLING, Donned, Fit, Held, Load, Patch, Row, don, socket_problem
 from ...donning.model import OUTER
 from ...errors import RunError
+from ...fe import Doubt
 from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
 from ...mesh import Mesh, read_vtu
@@ -196,7 +197,7 @@ class SocketLimb:
             "loads": loads,
             "steps": [_step(row, fit) for row in found.rows],
             # How far it sinks in is told by itself: the wall's stiffness is stated, and no study's.
-            "warnings": [doubt.text for doubt in found.result.doubts if doubt.kind != "sunk"],
+            "warnings": [warning(doubt) for doubt in found.result.doubts if doubt.kind != "sunk"],
             "statistics": {
                 key: statistics[key] for key in ("steps", "cuts", "newton_iterations", "unknowns")
             },
@@ -207,6 +208,16 @@ class SocketLimb:
         """What is stored of the liner."""
         table = self.study.socket.liner
         return {"thickness_mm": table.thickness_mm, "material": table.material} | table.parameters
+
+
+def warning(doubt: Doubt) -> str:
+    """A doubt about a simulation in the words of a socket: that of folded elements names an indenter."""
+    if doubt.kind != "folded":
+        return doubt.text
+    return (
+        f"{doubt.count} elements of the limb are inside out at a node, and pressures near them may be too "
+        "small: choose a smaller socket.edge_mm"
+    )
 
 
 def _stopped(found: Donned, fit: Fit) -> str:
