@@ -70,7 +70,7 @@ def soft_inside(array: np.ndarray) -> np.ndarray:
     return np.asarray(binary_erosion(array > 0, iterations=3) & ~binary_dilation(array > 1, iterations=3))
 
 
-@kind("labels", "repaired", "made soft tissue")
+@kind("labels", "repaired", "became soft tissue")
 def bone_islands(random: Random, whole: Whole, folder: Path) -> Inputs:
     array = editable(whole)
     inner = soft_inside(array)

@@ -2,12 +2,13 @@
 
     python benchmarks/donning.py --detail 6 --json socket.json
     python benchmarks/donning.py --detail 4 --cases 20 --seed 0 --json rectified.json
+    python benchmarks/donning.py --detail 4 --grown --penalty 50 --json pressure.json
 
 A synthetic residual limb: tapered, elliptical, with a rounded distal end and a rigid bone; muscle, 3 mm of
 skin and a liner of 6 mm, `tet10p0`.  A socket smaller in circumference, pressed in here and relieved there,
 grows onto it in 2 s, is held for 10 s, and is then pushed on by 800 N with all six coordinates free, friction
 0.5: 1 s of ramp, 1 s of hold.  ``--cases`` draws rectifications: 0 to 6 % of circumference, three areas of -4
-(relieved) to 6 mm (pressed in).
+(relieved) to 6 mm (pressed in).  ``--grown`` ends when the socket has grown, with the pressure by region.
 """
 
 from __future__ import annotations
@@ -22,8 +23,21 @@ from pathlib import Path
 
 import numpy as np
 
-from limbfit.fe import History, Motion, NeoHookean, OgdenQLV, Problem, RigidBody, SmoothSurface, StepControl
+from limbfit.fe import (
+    History,
+    Motion,
+    NeoHookean,
+    OgdenQLV,
+    Problem,
+    RigidBody,
+    SmoothSurface,
+    Step,
+    StepControl,
+    System,
+    tractions,
+)
 from limbfit.fe import solve as simulate
+from limbfit.fe.kernel.laws import Laws
 from limbfit.mesh import TET_FACES, Mesh, to_tet10
 
 LENGTH, BRIM, TIP = 160.0, 125.0, 35.0  # mm from where the rounded end begins
@@ -164,30 +178,65 @@ def donned(
     areas: tuple[tuple[float, ...], ...],
     mu: float,
     hard: float | None,
+    grown_only: bool = False,
 ) -> Problem:
     grown = Motion.of([0.0, 2.0, 12.0], growth=[0.0, 1.0, 1.0])
     force = dict.fromkeys(("x", "y", "turn_x", "turn_y", "turn_z"), 0.0)
     loaded = Motion.of([0.0, 1.0, 2.0], force={**force, "z": [0.0, 800.0, 800.0]})
-    shape = socket(smaller, areas, 2.0)
+    shape, end = socket(smaller, areas, 2.0), GROWN_S if grown_only else 14.0
     one = RigidBody(
-        shape, faces, grown.then(loaded), mu, pivot=(0.0, 0.0, LENGTH), name="socket", hardness=hard
+        shape,
+        faces,
+        grown if grown_only else grown.then(loaded),
+        mu,
+        pivot=(0.0, 0.0, LENGTH),
+        name="socket",
+        hardness=hard,
     )
     return Problem(
         mesh, LAWS, mesh.node_sets["held"], np.zeros((0, 6), int), None,
-        History(np.array([0.0, 14.0]), np.zeros(2)), bodies=(one,), element="tet10p0",
+        History(np.array([0.0, end]), np.zeros(2)), bodies=(one,), element="tet10p0",
     )  # fmt: skip
 
 
+GROWN_S = 2.0
 TIMES = (
     *np.linspace(0.0, 2.0, 9)[1:], 2.1, 2.4, 3.0, 4.5, 7.0, 12.0,
     12.1, 12.25, 12.5, 12.75, 13.0, 13.1, 13.4, 14.0,
 )  # fmt: skip
 
 
+def pressures(problem: Problem, last: Step) -> dict[str, dict[str, float]]:
+    """Largest and mean contact pressure, kPa, on the liner below the brim, and within the radius of each of
+    the `AREAS`, by where it is at rest."""
+    system = System(problem)
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    found = tractions(system, laws, last.state, 0)
+    surface = system.bodies.all[0].surface
+    rest, pressure, areas = (
+        surface.points_at_rest.reshape(-1, 3),
+        found.pressure_kPa.ravel(),
+        surface.areas.ravel(),
+    )
+    inside = {"below the brim": rest[:, 2] < BRIM}
+    angle = np.degrees(np.arctan2(rest[:, 1], rest[:, 0]))
+    for height, towards, radius, _ in AREAS:
+        around = np.radians((angle - towards + 180.0) % 360.0 - 180.0) * np.hypot(rest[:, 0], rest[:, 1])
+        inside[f"{height:g} mm, {towards:g} degrees"] = np.hypot(around, rest[:, 2] - height) < radius
+    return {
+        name: {
+            "largest_kPa": float(pressure[own].max()),
+            "mean_kPa": float(np.average(pressure[own], weights=areas[own])),
+        }
+        for name, own in inside.items()
+    }
+
+
 def run(problem: Problem, control: StepControl, tell: bool) -> dict:
-    started = time.process_time()
+    started, last = time.process_time(), []
 
     def on_step(step) -> None:
+        last[:] = [step]
         if tell:
             z, r = step.coordinates[0, 2], np.round(step.reactions[0], 2).tolist()
             print(f"{step.time:8.3f} s  {step.newton_iterations:3d} its  {time.process_time() - started:7.1f}"
@@ -205,7 +254,7 @@ def run(problem: Problem, control: StepControl, tell: bool) -> dict:
         "imbalance": float(found.imbalance.max()), "settled_mm": float(found.coordinates[-1, 0, 2]),
         "contact_points": 3 * len(problem.bodies[0].faces),
         "seconds": {name: round(value, 1) for name, value in stats["seconds"].items()},
-        "doubts": list(found.warnings),
+        "doubts": list(found.warnings), "pressure": pressures(problem, last[0]) if last else {},
     }  # fmt: skip
 
 
@@ -220,9 +269,11 @@ def main() -> int:
     parser.add_argument("--hardness", type=float, default=None, help="of sticking, over that of contact")
     parser.add_argument("--penalty", type=float, default=None, help="1/mm")
     parser.add_argument("--json", type=Path, default=None)
+    parser.add_argument("--grown", action="store_true", help="end when the socket has grown")
     given = parser.parse_args()
     mesh, faces = body(given.detail)
-    control = StepControl(times=TIMES, penalty=given.penalty)
+    times = tuple(t for t in TIMES if t <= GROWN_S) if given.grown else TIMES
+    control = StepControl(times=times, penalty=given.penalty)
     rows, failed = [], 0
     for case in range(max(given.cases, 1)):
         rng = np.random.default_rng([given.seed, case])
@@ -232,7 +283,9 @@ def main() -> int:
             areas = tuple((rng.uniform(10, 100), rng.uniform(0, 360), rng.uniform(15, 30), rng.uniform(-4, 6))
                           for _ in range(3))  # fmt: skip
         row = run(
-            donned(mesh, faces, smaller, areas, given.friction, given.hardness), control, not given.cases
+            donned(mesh, faces, smaller, areas, given.friction, given.hardness, given.grown),
+            control,
+            not given.cases,
         )
         rows.append({"case": case, "smaller": smaller, "areas": areas, **row})
         failed += not row["completed"]

@@ -45,8 +45,8 @@ from limbfit.indentation import (
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.simulations import job_digest
 from limbfit.pipeline.shared.store import RUNS, Store, digest
+from limbfit.pipeline.shared.tabular import read_curves
 from limbfit.pipeline.stages.laboratory import unknowns
-from limbfit.pipeline.stages.traces import read_curves
 
 Record = dict[str, Any]
 SAME = 0.01  # of the squared error: as good a fit as the best

@@ -11,10 +11,11 @@ import numpy as np
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
-from limbfit.bench.blocks import SIX_TETS, block_site, boxes, upright
+from limbfit.bench.blocks import block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
+from limbfit.mesh.boxes import SIX_TETS, boxes, upright
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, fibres_of

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "anatomy"))
-from bodies import limb
+from bodies import limb, revolved
 
 from limbfit.anatomy.surfaces.surfaces import write_surface
 
@@ -28,7 +28,7 @@ edge_mm = 14.0
 distal_clearance_mm = 3.0
 """
 
-__all__ = ["limb", "small_limb"]
+__all__ = ["limb", "revolved", "small_limb"]
 
 
 def small_limb(folder: Path, text: str) -> Path:

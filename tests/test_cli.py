@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import matplotlib.image
 import numpy as np
@@ -64,6 +67,18 @@ def test_help_lists_every_verb_once_with_its_whole_sentence(limbfit):
     assert sorted(listed) == sorted(typer.main.get_command(app).commands)
     assert "..." not in told.replace("[ARGS]...", "")
     assert all(f"{group}:" in told for group in GROUPS)
+
+
+@pytest.mark.parametrize(
+    ("typed", "word", "offered"), [("limbfit unc", 1, ["uncertainty"]), ("limbfit run --un", 2, ["--until"])]
+)
+def test_the_shell_completes_verbs_and_options(typed, word, offered):
+    script = "import sys; sys.argv[0] = 'limbfit'; from limbfit.cli import main; main()"
+    asked = {"_LIMBFIT_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(word)}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | asked, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == offered
 
 
 def test_check_as_json(limbfit, study):

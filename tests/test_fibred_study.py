@@ -84,6 +84,14 @@ def test_the_axis_is_the_normal_of_the_proximal_cut(context):
     assert axis == (("muscle", (0.0, 0.0, -1.0)),)
 
 
+def test_a_flow_is_known_site_by_site(context):
+    """The study names it; the directions follow from each mesh."""
+    study = study_of(context.study.folder, 'fibres = { muscle = "flow" }')
+    assert fibres_of(Context(study, context.store, context.executor, context.listener)) == (
+        ("muscle", "flow"),
+    )
+
+
 def test_a_site_s_problem_has_them_and_its_force_their_derivatives(context):
     model = recorded_model(context, context.study.recorded[0])
     problem = build_problem(model, read_vtu(model.mesh), TRUTH)

@@ -144,7 +144,7 @@ def test_an_interrupt_ends_the_run_with_its_workers_and_meshers(study, workers, 
     start = time.monotonic()
     _, err = run.communicate(timeout=60)
     assert run.returncode == 130
-    assert "run the same command again to go on" in err.splitlines()[-1]
+    assert "run the same command again to continue" in err.splitlines()[-1]
     assert group_is_empty(run.pid)
     print(
         f"{at}, {workers} worker(s): ended {time.monotonic() - start:.1f} s after the interrupt", flush=True

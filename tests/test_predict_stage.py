@@ -18,8 +18,8 @@ from limbfit.mesh import write_vtu
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, job_digest
 from limbfit.pipeline.shared.store import Store, write_json
+from limbfit.pipeline.shared.tabular import read_curves
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.pipeline.stages.traces import read_curves
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "muscle")

@@ -11,7 +11,7 @@ import pytest
 import limbfit
 from conftest import COARSE
 from limbfit.errors import InputError
-from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, drawn
+from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, UNSEEN, drawn
 from limbfit.pipeline.stages.laboratory import unknowns
 
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
@@ -67,6 +67,18 @@ def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
     for row, one in zip(content["records"], again.recorded, strict=True):
         assert (one.indenter or "indenter", one.hold_s) == (row["indenter"], row["hold_s"])
         assert one.depth_mm == pytest.approx(row["depth_mm"], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_ultrasound_tells_more_in_the_same_time(found) -> None:
+    study, content = found
+    seen = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0,), draws=1, ultrasound_sd_mm=0.1)
+    rows = {row["design"]: row for row in seen["protocols"]}
+    assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
+    plain = {row["design"]: row for row in content["protocols"]}[PLAIN]
+    assert rows[PLAIN]["factor_95"] == pytest.approx(plain["factor_95"], rel=1e-6)
+    (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
+    assert (record["ultrasound"], record["ultrasound_sd_mm"]) == ("records/1-1-layers.csv", 0.1)
 
 
 def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:

@@ -36,12 +36,12 @@ IMAGED: dict[str, Any] = {
     "mesh": {"coarse": {}},
     "calibration": {"prior": {"skin.c_kPa": {"median": 5.0, "factor": 2.0}}, "starts": 2},
     "sites": [
-        {"name": "1", "fitted": True, "trace": "1.csv", "near": [0.0, -50.0, 10.0]},
+        {"name": "1", "fitted": True, "trace": "1.csv", "near": [0.0, -50.0, 10.0], "ultrasound": "3.csv"},
         {"name": "2", "trace": "2.csv", "near": [0.0, 50.0, 10.0], "indenter": "ball"},
     ],
     "indenters": {"ball": {}},
     "records": [
-        {"site": "2", "name": "fast", "trace": "2.csv"},
+        {"site": "2", "name": "fast", "trace": "2.csv", "ultrasound": "3.csv"},
         {"site": "2", "name": "slow", "trace": "2.csv"},
     ],
 }
@@ -116,6 +116,10 @@ ACTS: dict[str, tuple[str, Any]] = {
     "records.1.indenter": ("sites", "ball"),
     "records.1.control": ("traces", "force"),
     "sites.0.control": ("traces", "force"),
+    "sites.0.ultrasound": ("traces", "2.csv"),
+    "sites.0.ultrasound_sd_mm": ("traces", 0.2),
+    "records.0.ultrasound": ("traces", "1.csv"),
+    "records.0.ultrasound_sd_mm": ("traces", 0.2),
     "traces.time_s": ("traces", "t"),
     "traces.displacement_mm": ("traces", "d"),
     "traces.force_N": ("traces", "F"),
@@ -349,6 +353,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ),
     (GIVEN, {"material.fibres": {"muscle": "axis"}}, "material.fibres"),
     (GIVEN, {"sites.1.control": "force"}, "sites.control"),
+    (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
     (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),

@@ -1,6 +1,6 @@
 """Tissue laws by name: what a study may ask for, and what is known of their parameters beforehand.
 
-A law of one's own is registered by `register_law`; see docs/extending.md.
+Your own law is registered by `register_law`; see docs/extending.md.
 """
 
 from __future__ import annotations

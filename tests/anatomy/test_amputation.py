@@ -81,8 +81,8 @@ def test_the_stump_becomes_surfaces(plane, stump):
         (0, 0, PAD, "normal .* is zero"),
         (0, 1, -1, "thicker"),
         (-66, 1, PAD, "less than 16 mm distal|cuts nothing off"),
-        (60, -1, PAD, "points distally; turn it round"),
-        (0, -1, PAD, "points distally; turn it round"),
+        (60, -1, PAD, "points distally; reverse it"),
+        (0, -1, PAD, "points distally; reverse it"),
     ],
 )
 def test_impossible_planes_are_refused(leg, plane, shift, factor, pad, expected):

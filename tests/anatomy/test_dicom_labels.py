@@ -135,7 +135,7 @@ def test_segments_on_another_grid_are_refused(tmp_path):
     labels = labels_on(image)
     moved = LabelMap(labels.array, labels.spacing, labels.index_to_point([0.5, 0, 0]), labels.direction)
     write_seg(tmp_path / "labels.dcm", moved, RANDOM)
-    with pytest.raises(LabelError, match="another grid"):
+    with pytest.raises(LabelError, match="different grid"):
         read_labels(tmp_path / "labels.dcm", image)
     write_seg(tmp_path / "labels.dcm", labels, RANDOM, SegmentationType="FRACTIONAL")
     with pytest.raises(LabelError, match="fractional"):

@@ -130,7 +130,7 @@ def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, anatomy, s
 
 def test_a_mesher_that_fails_is_told_with_a_place(anatomy, site):
     hurried = replace(COARSE, time_limit_s=0.01)
-    told = r"did not end in 0\.01 s; .*; what it was given is flattest at \(.*\) mm, [\d.]+ mm from the "
+    told = r"did not end in 0\.01 s; .*; its input is flattest at \(.*\) mm, [\d.]+ mm from the "
     with pytest.raises(MeshingError, match=told):
         mesh_site(anatomy, *site, hurried)
 

@@ -39,7 +39,7 @@ def test_strays_and_holes_are_repaired_and_said(leg):
     assert notes == [
         "dropped 2 pieces (0.05 cm3) apart from the limb",
         "filled 1 hole (0.02 cm3) inside the limb",
-        "1 piece (0.02 cm3) of 'fibula' apart from the bone made soft tissue",
+        "1 piece (0.02 cm3) of 'fibula' apart from the bone became soft tissue",
     ]
 
 

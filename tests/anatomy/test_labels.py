@@ -117,7 +117,7 @@ def moved(labels: LabelMap, how: str) -> LabelMap:
 def test_another_grid_is_refused(tmp_path, how, suffix):
     image = volume(np.eye(3))
     write_labels(tmp_path / f"other{suffix}", moved(labels_on(image), how))
-    with pytest.raises(LabelError, match="another grid") as caught:
+    with pytest.raises(LabelError, match="different grid") as caught:
         read_labels(tmp_path / f"other{suffix}", image)
     assert "export" in str(caught.value)
 

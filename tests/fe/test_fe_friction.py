@@ -130,6 +130,24 @@ def test_what_sticks_does_not_creep():
     np.testing.assert_allclose(force, force[0], rtol=1e-3)
 
 
+def test_stepwise_sticking_slips_on_by_a_like_share_in_every_step():
+    """The law of FEBio: held for 12 steps, the force across falls by the share that the tissue has of the
+    stiffness of tissue and contact in series, in every step the same; the steps' lengths do not matter."""
+    history = History(
+        np.array([0.0, 1.0, 2.0, 100.0]), np.array([0.0, 1.0, 1.0, 1.0]),
+        np.array([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0], [0.1, 0.0]]),
+    )  # fmt: skip
+    problem = replace(dragged_block(20.0, history), sticking="stepwise")
+    times = (0.5, 1.0, 1.5, 2.0, *np.geomspace(4.0, 100.0, 12))
+    result = solve(problem, StepControl(times=times, penalty=2.0, hold_penalty=True, penetration=1.0))
+    assert result.completed, result.reason
+    across = result.reaction[result.times >= 2.0, 0]
+    shares = across[1:] / across[:-1]
+    assert across[0] > 0.0
+    assert 0.5 < shares[0] < 0.99
+    np.testing.assert_allclose(shares, shares[-1], rtol=0.02)
+
+
 def test_friction_lies_between_frictionless_and_sticky():
     """Without friction and with a very large coefficient it is what those two are."""
     tool = Indenter("sphere", 40.0, centre=(0.0, 0.0, 1.0))
@@ -147,14 +165,15 @@ def test_friction_lies_between_frictionless_and_sticky():
 
 @pytest.mark.parametrize("shape", ["square", "sphere"])
 @pytest.mark.parametrize("mu", [0.1, 0.5])
-def test_sensitivities_with_friction_equal_central_differences(shape, mu):
+@pytest.mark.parametrize("sticking", ["anchored", pytest.param("stepwise", marks=pytest.mark.slow)])
+def test_sensitivities_with_friction_equal_central_differences(shape, mu, sticking):
     """Along one direction in the space of all eight parameters, pressing, dragging and letting go."""
     tight = StepControl(load_steps=3, unload_steps=2, tolerance=1e-9)
     tool = Indenter(shape, 30.0, 2.0 * (shape == "square"), axis=(0.05, 0.02, -1.0), centre=(0, 0, 3.0))
     times = np.array([0.0, 4.0, 6.0, 10.0])
     across = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.5], [1.0, 0.5]])
     history = History(times, np.array([0.0, 4.0, 4.0, 0.0]), across)
-    problem = punch("tet10", 2, 1, indenter=tool, friction=mu, history=history)
+    problem = punch("tet10", 2, 1, indenter=tool, friction=mu, sticking=sticking, history=history)
     centre = solve(problem, tight, sensitivities=True, store="all")
     assert centre.completed
     assert not centre.doubts
@@ -166,6 +185,11 @@ def test_sensitivities_with_friction_equal_central_differences(shape, mu):
 def test_friction_that_is_none_is_refused(friction):
     with pytest.raises(ProblemError, match="unknown friction"):
         solve(punch("tet4", 2, 1, friction=friction))
+
+
+def test_a_law_of_sticking_that_is_none_is_refused():
+    with pytest.raises(ProblemError, match="unknown law of sticking 'glued'"):
+        solve(punch("tet4", 2, 1, friction=0.3, sticking="glued"))
 
 
 def test_a_move_across_needs_two_numbers_for_each_time():

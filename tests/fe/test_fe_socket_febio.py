@@ -27,10 +27,10 @@ def both(case: str, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 def test_a_dragged_block_is_febios(tmp_path):
-    """A plate presses 1.5 mm, is dragged 6 mm and back, with mu 0.3: within 1 % of the largest force while it
-    slips, and within 3 % while it goes over from sticking to slipping.
+    """A plate presses 1.5 mm, is dragged 6 mm and back, with mu 0.3: within 1 % of the largest force, and
+    within 1.2 % while it goes over from sticking to slipping.
 
-    At the end of pressing the normal force is 1.6 % above FEBio's, where 1 % was aimed at.
+    When it first touches, all points rub: there the forces are FEBio's to 1e-4.
     """
     t, found, expected = both("slide", tmp_path)
     np.testing.assert_allclose(found[:, 3:], expected[:, 3:], atol=1e-5)
@@ -38,8 +38,9 @@ def test_a_dragged_block_is_febios(tmp_path):
     turning = ((t > 1.0) & (t < 1.5)) | ((t > 3.0) & (t < 3.5))
     pressing = t <= 1.0
     assert off[~turning & ~pressing].max() < 0.01
-    assert off[turning].max() < 0.03
-    assert off[pressing].max() < 0.02
+    assert off[turning].max() < 0.012
+    assert off[pressing].max() < 0.01
+    assert found[1, 2] == pytest.approx(expected[1, 2], rel=1e-4)
 
 
 @pytest.mark.slow
@@ -49,8 +50,8 @@ def test_a_press_fit_with_friction_is_febios(tmp_path):
     off = np.abs(found - expected)[:, :3] / np.abs(expected[:, :3]).max()
     pushing = t <= 2.5
     assert off[pushing, 2].max() < 0.01  # axial
-    assert off[pushing, :2].max() < 0.02  # radial
-    assert off[~pushing].max() < 0.03
+    assert off[pushing, :2].max() < 0.011  # radial
+    assert off[~pushing].max() < 0.01
 
 
 @pytest.mark.slow
@@ -68,12 +69,11 @@ def test_a_follower_pressure_is_febios(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_load_on_the_socket_is_nearly_febios(tmp_path):
-    """Then pressed on by 5.2 N, left to creep, and let go: the way within 2 % of its largest, where 1 % was
-    aimed at; FEBio's socket slips on where limbfit's sticks."""
+def test_a_load_on_the_socket_is_febios(tmp_path):
+    """Then pressed on by 5.2 N, left to creep, and let go: the way within 1 % of its largest."""
     t, found, expected = both("cone-load", tmp_path)
     off = np.abs(found[:, 5] - expected[:, 5]) / expected[:, 5].max()
-    assert off.max() < 0.02
-    assert off[t <= 6.5].max() < 0.006
+    assert off.max() < 0.01
+    assert off[t <= 6.5].max() < 0.003
     forced = t > 5.5
     np.testing.assert_allclose(found[forced, 2], expected[forced, 2], atol=2e-3)

@@ -61,7 +61,8 @@ MOTIONS = {
 
 @pytest.mark.parametrize("case", MOTIONS)
 def test_a_body_is_read_back_as_it_was(tmp_path, case):
-    """An open sheet with friction, beside a pressure: every number, and hence the forces."""
+    """An open sheet with friction, beside a pressure: every number, and hence the forces; with FEBio's law
+    of sticking, in the place of which the forces are taken with limbfit's."""
     problem = block(bodies=(sheet(MOTIONS[case]),))
     problem = replace(
         problem,
@@ -71,7 +72,7 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
     found = back(problem, tmp_path)
     assert found.indenter is None
     (mine,), (theirs,) = problem.bodies, found.bodies
-    assert (theirs.name, theirs.friction) == ("sheet", 0.3)
+    assert (theirs.name, theirs.friction, theirs.sticking) == ("sheet", 0.3, "stepwise")
     np.testing.assert_array_equal(theirs.pivot, mine.pivot)
     np.testing.assert_array_equal(theirs.faces, mine.faces)
     np.testing.assert_array_equal(theirs.shape.points[theirs.shape.faces], SIDE[SHEET.faces])
@@ -82,7 +83,8 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
     (pressed,) = found.pressures
     np.testing.assert_array_equal(pressed.faces, problem.pressures[0].faces)
     assert [pressed.at(t) for t in (0.7, 1.8)] == pytest.approx([7e-4 / 1.5, 4e-4])
-    runs = [solve(one, STEPS, store="none") for one in (problem, found)]
+    alike = replace(found, bodies=(replace(theirs, sticking="anchored"),))
+    runs = [solve(one, STEPS, store="none") for one in (problem, alike)]
     assert runs[0].completed, runs[0].reason
     assert np.abs(runs[0].reactions).max() > 0.1
     size = np.abs(runs[0].reactions).max()

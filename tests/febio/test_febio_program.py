@@ -35,7 +35,7 @@ VERDICTS = {
         "error",
         "at 2.769 s of 12.71 s: Max nr of reformations reached; no convergence at 2.921",
     ),
-    "killed": ("killed", "killed by signal 9, most often for want of memory, at 4.13 s of 12.71 s"),
+    "killed": ("killed", "killed by signal 9, most often for lack of memory, at 4.13 s of 12.71 s"),
 }
 WELL = "  version 4.11.0\n------- converged at time : 1\n------- converged at time : 2\n " + NORMAL + "\n"
 
@@ -68,7 +68,7 @@ def test_an_error_is_one_whatever_the_exit_code():
     [
         (WELL, 0, "normal", ""),
         (WELL.replace("time : 2", "time : 1.5"), 0, "partial", "stopped early, at 1.5 s of 2 s"),
-        (WELL.replace(NORMAL, ""), 0, "crashed", "without saying how"),
+        (WELL.replace(NORMAL, ""), 0, "crashed", "without a verdict"),
         (WELL.replace(NORMAL, ERROR), 0, "error", "though it left with exit code 0"),
         (WELL.replace(NORMAL, ""), -11, "killed", "signal 11"),
         (WELL.replace(NORMAL, ""), 139, "killed", "signal 11"),
@@ -182,7 +182,7 @@ def test_of_very_many_words_the_last_count(tmp_path):
     run = run_febio(program(tmp_path, body), tmp_path, 0.0, "forces.txt")
     assert run.verdict.version == "4.11.0"
     assert run.verdict.kind == "no output"  # ended well, without a table
-    assert "ended well" in run.verdict.reason
+    assert "ended normally" in run.verdict.reason
 
 
 def test_threads_and_folder(tmp_path):
@@ -204,7 +204,7 @@ def test_where_febio_is_looked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("FEBIO_CMD", str(other))
     assert find_febio() == other
     assert find_febio(file) == file
-    with pytest.raises(InputError, match=r"febio\.program.*no program that can be run"):
+    with pytest.raises(InputError, match=r"febio\.program.*not a program that can be run"):
         find_febio(tmp_path / "nowhere")
 
 

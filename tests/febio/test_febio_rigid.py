@@ -100,7 +100,7 @@ REFUSED = {
     ),
     "pushed": (
         CUBE.replace("<Rx_dof>1</Rx_dof>", "").replace("</Rigid>", FORCE),
-        "neither fixed nor displaced in Rx; limbfit solves for no rigid body that carries tissue",
+        "neither fixed nor displaced in Rx; limbfit solves only for bodies that carry no tissue",
     ),
     "joined": (CUBE.replace("</Rigid>", LOCK), "<rigid_connector>: 'rigid lock' is not supported"),
     "held elsewhere": (

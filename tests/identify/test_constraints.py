@@ -110,7 +110,7 @@ def test_forces_weigh_less_against_priors_where_their_error_is_larger():
 def test_priors_that_make_no_sense_are_bad_input():
     with pytest.raises(ProblemError, match="median > 0 and factor > 1"):
         Prior("skin.m", 3.0, 1.0)
-    with pytest.raises(ProblemError, match=r"'skin\.k', which is no parameter"):
+    with pytest.raises(ProblemError, match=r"'skin\.k', which is not a parameter"):
         replace(PAPER, priors=(Prior("skin.k", 3.0, 2.0),))
     known = replace(PAPER, priors=(Prior("skin.m", 3.0, 2.0),))
     with pytest.raises(ProblemError, match="no place for priors"):

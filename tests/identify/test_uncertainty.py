@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, records, simulate, three_tissues
+from scipy.linalg import block_diag
 
 from limbfit.identify import (
     DETERMINED,
@@ -99,6 +100,31 @@ def test_the_error_of_the_mesh_is_in_the_intervals():
     told = [u.residual_model.to_dict()["sites"]["s0"]["mesh_share"] for u in (without, counted)]
     assert told[0] is None
     assert 0.005 < told[1] < 0.03
+
+
+def test_records_of_a_site_share_the_error_of_its_mesh():
+    """A second record of every site says nothing more of what its mesh lacks."""
+    mesh = [0.03 * record.force_N for record in records()]
+    twice = [replace(d, name=f"{d.name}-2", site=d.name) for d in records()]
+    noisy = [replace(d, force_N=d.force_N + n) for d, n in zip([*records(), *twice], 2 * scatter(0.01))]
+    responses = 2 * simulate(TRUTH)
+    one = estimate_uncertainty(TRUTH, responses[:4], noisy[:4], PAPER, mesh_N=mesh)
+    both = estimate_uncertainty(TRUTH, responses, noisy, PAPER, mesh_N=2 * mesh)
+    apart = estimate_uncertainty(
+        TRUTH, responses, [replace(d, site="") for d in noisy], PAPER, mesh_N=2 * mesh
+    )
+    stiffness = np.eye(8)[0] + np.eye(8)[4]  # both moduli, which the mesh moves
+
+    def sd(found):
+        return float(np.sqrt(stiffness @ found.covariance @ stiffness))
+
+    assert sd(both) > 0.9 * sd(one)
+    assert sd(apart) < 0.8 * sd(one)
+    model = both.residual_model
+    rows = [np.cos(np.arange(60.0))[:, None] + i for i in range(8)]
+    E = np.concatenate(model.shared)
+    whole = block_diag(*(model.own(i) for i in range(8))) + E @ E.T
+    assert np.concatenate(model.solve(rows)) == pytest.approx(np.linalg.solve(whole, np.concatenate(rows)))
 
 
 def scatter(sd):

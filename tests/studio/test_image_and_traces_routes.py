@@ -87,7 +87,7 @@ def test_labels_painted_on_others_are_refused(limb):
     with lock(limb / "results"):
         answer = client.post("/api/image/labels", headers=SENT, json=asked)
         assert answer.status_code == 409
-        assert "a run of this study goes on" in answer.json()["error"]
+        assert "a run of this study is in progress" in answer.json()["error"]
     assert client.post("/api/image/labels", headers=SENT, json=asked).status_code == 200
     second = client.post("/api/image/labels", headers=SENT, json=asked)
     assert second.status_code == 409

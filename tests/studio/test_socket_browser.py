@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from stored_fields import block
 
 from browsing import serious_findings, until
+from limbfit import load_study
 from limbfit.mesh import write_vtu
 
 
@@ -61,3 +63,64 @@ def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, op
     page.get_by_role("combobox", name="run").select_option("design")
     slider.fill("1")
     until(lambda: words.inner_text().startswith("stance; contact pressure at most 20.0 kPa"))
+
+
+@pytest.mark.slow
+def test_two_runs_stand_beside_each_other_on_one_scale_and_turn_together(study, serve, open_page):
+    results = study / "results"
+    designs = [
+        {"name": name, "simulation": write_run(results, "socket_design", name, factor)}
+        for name, factor in (("control", 5.0), ("design", 2.0))
+    ]
+    (results / "socket_design" / "socket_design.json").write_text(json.dumps({"designs": designs}))
+    (results / "socket_design" / "stage.json").write_text("{}")
+    page = open_page(serve(study) + "#/socket")
+    words, canvas = page.locator(".view.socket .player-words"), page.locator(".view.socket .lf-canvas")
+    until(lambda: words.inner_text().startswith("donning"))
+    page.get_by_role("combobox", name="beside it").select_option("design")
+    page.get_by_label("step", exact=True).fill("1")
+    until(lambda: "control: stance" in words.inner_text() and "| design: stance" in words.inner_text())
+    page.get_by_role("cell", name="−60", exact=True).wait_for()  # peak of 20 instead of 50 kPa
+    bars = page.locator(".view.socket .lf-bar")
+    assert canvas.count() == bars.count() == 2
+    assert bars.nth(0).inner_text() == bars.nth(1).inner_text()
+    still = canvas.nth(1).screenshot()
+    canvas.nth(0).press("ArrowLeft")
+    until(lambda: canvas.nth(1).screenshot() != still)
+    assert serious_findings(page) == []
+    page.get_by_role("combobox", name="beside it").select_option("nothing")
+    until(lambda: canvas.count() == 1)
+
+
+@pytest.mark.slow
+def test_areas_are_placed_by_a_click_written_and_drawn_and_a_run_says_what_is_wrong(study, serve, open_page):
+    file = study / "study.toml"
+    file.write_text(file.read_text() + "[socket]\ntrim_mm = 40.0  # of the brim\n")
+    page = open_page(serve(study) + "#/socket")
+    page.get_by_role("combobox", name="view").select_option("its shape")
+    words, canvas = page.locator(".socket-shape-words"), page.locator(".view.socket .lf-canvas")
+    until(lambda: "cm³" in words.inner_text())
+    until(lambda: "offset (mm)" in page.locator(".view.socket .lf-bar").inner_text())
+    plain = canvas.screenshot()
+    page.get_by_role("button", name="Add an area").click()
+    box = canvas.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    until(lambda: "mm (LPS)" in page.locator(".view.socket .site-form").inner_text())
+    page.get_by_label("depth (mm)").fill("5")
+    page.get_by_role("button", name="Save").click()
+    (area,) = until(lambda: load_study(study).socket.areas)
+    assert (area.name, area.radius_mm, area.depth_mm) == ("area 1", 25.0, 5.0)
+    assert area.position[1] < -25.0  # the anterior side is seen first
+    assert np.hypot(*area.position[:2]) < 43.0
+    assert "# of the brim" in file.read_text()
+    until(lambda: canvas.screenshot() != plain)
+    assert serious_findings(page) == []
+    page.get_by_role("button", name="area 1").click()
+    page.get_by_label("radius (mm)").fill("5")
+    page.get_by_role("button", name="Save").click()
+    until(lambda: "steeper than 45 degrees" in words.inner_text())
+    page.get_by_role("button", name="Run the socket").click()
+    until(lambda: "steeper than 45 degrees" in page.locator(".view.socket .side [role=status]").inner_text())
+    page.get_by_role("button", name="area 1").click()
+    page.get_by_role("button", name="Remove").click()
+    until(lambda: not load_study(study).socket.areas)

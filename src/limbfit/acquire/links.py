@@ -115,7 +115,7 @@ class SerialLink:
 def _why(error: Exception, baud: int) -> str:
     """Why a port does not open: pyserial wraps the system's reason in words of its own."""
     if isinstance(error, ValueError):
-        return f"it does not do {baud} baud; give another after @"
+        return f"it does not support {baud} baud; give another after @"
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return "another program uses it; end that first"

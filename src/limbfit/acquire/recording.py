@@ -195,7 +195,7 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
     if found.is_damaged or (not found.content and len(data) == FOLLOWED_BYTES):
         remedy = "limbfit recording says what can be read of it"
         place = f"byte {before.end + found.end}"
-        raise TraceError("what stands here is damaged", file=path, place=place, remedy=remedy)
+        raise TraceError("this part is damaged", file=path, place=place, remedy=remedy)
     content = found.content if offset else first.content + found.content
     _, events, rows = _sorted_lines(content, path)
     head, _, _ = _sorted_lines(first.content, path)
@@ -280,7 +280,7 @@ def _sorted_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dic
         for event in events:
             event["at_us"], event["event"] = int(event["at_us"]), str(event["event"])
     except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-        raise TraceError("a line of it is not what a record holds", file=path) from None
+        raise TraceError("it has a line that no record holds", file=path) from None
     if not isinstance(head, dict):
         raise TraceError("its head is not a table", file=path)
     return head, tuple(events), rows

@@ -147,7 +147,7 @@ class ClampWatch:
         for pin in self.pins:
             now, then = sample.force_mN[pin - 1], past[0].force_mN[pin - 1]
             if now < LOST_CLAMP_MN:
-                return Violation("limb", pin, f"the limb has moved: pin {pin} has lost it")
+                return Violation("limb", pin, f"the limb has moved: pin {pin} has lost contact")
             if abs(now - then) > CLAMP_JUMP_MN:
                 text = f"the limb has moved: the force of pin {pin} jumped by {(now - then) / 1000:+.1f} N"
                 return Violation("limb", pin, text)

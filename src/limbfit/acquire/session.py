@@ -36,7 +36,7 @@ DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making
 
 # What the words of a device mean; it may have others.
 _MEANINGS = {
-    "watchdog": "it heard from limbfit too late: see what else runs here, and the wire",
+    "watchdog": "it heard from limbfit too late: check the wire, and what else runs on this machine",
     "stuck": "a driven pin does not move",
     "power": "the actuators have no power",
     "button": "its emergency stop was pressed",
@@ -347,7 +347,7 @@ def _loop(session: Session, operator: SimpleQueue[Event]) -> None:
                 now = max(now, max(times) - origin)
             session.reports(reports, now)
         elif paced and wall - heard > PACED_SILENCE_S:
-            session.lost(f"the device has said nothing for {PACED_SILENCE_S:g} s", now)
+            session.lost(f"the device has been silent for {PACED_SILENCE_S:g} s", now)
             return
         with suppress(Empty):
             while True:

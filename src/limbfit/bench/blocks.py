@@ -5,18 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
 from ..indentation import SiteModel
 from ..mesh import Mesh, boundary_faces, to_tet10, write_vtu
+from ..mesh.boxes import HEX, SIX_TETS, boxes, upright
 from ..study import SolverTable
 
-Array = NDArray[np.float64]
-# Kuhn's six tetrahedra of a box whose corners are numbered 4 i + 2 j + k.
-SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
-HEX = np.array([0, 4, 6, 2, 1, 5, 7, 3])
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)
 HALF, DEPTH, LAYER = 30.0, 30.0, 3.0  # mm
 INDENTATION, SPEED = 6.0, 0.96  # mm, mm/s
@@ -96,20 +92,3 @@ def divisions_for(element: str, unknowns: int) -> int:
     while 3 * (order * divisions + 1) ** 2 * order * sum(_through(divisions)) < unknowns:
         divisions += 1
     return divisions
-
-
-def boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Grid points (n, 3) and the corners (m, 8) of each box, numbered 4 i + 2 j + k."""
-    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
-    index = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
-    low, high = slice(None, -1), slice(1, None)
-    corners = [index[i, j, k].ravel() for i in (low, high) for j in (low, high) for k in (low, high)]
-    return grid.reshape(-1, 3), np.stack(corners, axis=1)
-
-
-def upright(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The tetrahedra (m, 4) with those turned over that are inside out."""
-    edges = points[tets[:, 1:]] - points[tets[:, :1]]
-    flip = np.linalg.det(edges) < 0.0
-    tets[flip] = tets[flip][:, [0, 2, 1, 3]]
-    return tets

@@ -22,8 +22,9 @@ from ..febio import Log, read_log, run_feb
 
 Array = NDArray[np.float64]
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
-STICKS = "FEBio's points that stick slip on in time, limbfit's keep their anchor"
-AREA, PENALTY = "penalty and area", "the way until it slips depends on the penalty"
+NORMALS = "FEBio's contact acts along the skin's normal, limbfit's along the body's"
+STICKS = "FEBio anchors a point where the first iteration of a step puts it"
+BRIM = "where the skin leaves the wall FEBio measures the gap along the skin's normal"
 NEVER = math.inf
 
 
@@ -53,20 +54,18 @@ SOCKET = (
         "slide",
         (
             Part("pressing", FORCES, ((0.0, 1.0),), 1.0, note=STICKS),
-            Part(
-                "sticking to slipping", FORCES, ((1.0, 1.5), (3.0, 3.5)), 3.0, note="depends on the penalty"
-            ),
-            Part("slipping", FORCES, ((1.5, 3.0), (3.5, NEVER)), 1.0, note=AREA),
+            Part("sticking to slipping", FORCES, ((1.0, 1.5), (3.0, 3.5)), 3.0, note=NORMALS),
+            Part("slipping", FORCES, ((1.5, 3.0), (3.5, NEVER)), 1.0, note=NORMALS),
         ),
     ),
     SocketCase(
         "cone",
         (
-            Part("pushed on, axial", ("Fz",), ((0.0, 2.5),), 1.0, note=AREA),
-            Part("pushed on, radial", ("Fx", "Fy"), ((0.0, 2.5),), 1.0, note=AREA),
+            Part("pushed on, axial", ("Fz",), ((0.0, 2.5),), 1.0, note=NORMALS),
+            Part("pushed on, radial", ("Fx", "Fy"), ((0.0, 2.5),), 1.0, note=NORMALS),
             Part("held, axial", ("Fz",), ((2.5, NEVER),), 3.0, note=STICKS),
             Part("held, radial", ("Fx", "Fy"), ((2.5, NEVER),), 3.0, note=STICKS),
-            Part("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", AREA),
+            Part("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", BRIM),
             Part("meridian, held", PLACES, ((2.5, NEVER),), 3.0, "cone-line", STICKS),
         ),
     ),

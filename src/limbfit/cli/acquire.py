@@ -45,7 +45,9 @@ def acquire(
             "(default: the site's depth) or acquire.search_force_N; for scripts and virtual devices",
         ),
     ] = False,
-    again: Annotated[bool, typer.Option("--again", help="also where a record exists, which is kept")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="record again where a record exists, and keep the old one")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Record indentations on a device: clamp, find the depth, ramp, release.
@@ -144,7 +146,7 @@ def recording(
     file: Annotated[Path, typer.Argument(help="record.csv of a session", show_default=False)],
     as_json: AsJson = False,
 ) -> None:
-    """Look at a session's record, also one that a crash cut short, and judge it."""
+    """Judge the record of a session, even one that a crash cut short."""
     found = limbfit.judge_recording(file)
     if as_json:
         print_json(found)
@@ -157,7 +159,7 @@ def recording(
 
 def virtual_fitsocket(
     study: StudyPath,
-    seed: Annotated[int, typer.Option(help="of the limb's place and the sensors' noise", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="seed of the limb's place and the sensors' noise", min=0)] = 0,
     faults: Annotated[Path | None, typer.Option(help="TOML file of faults (docs/acquire.md)")] = None,
     host: Annotated[
         str, typer.Option(help="address to listen at; whoever reaches it can move the pins")
@@ -167,11 +169,11 @@ def virtual_fitsocket(
     speed: Annotated[
         float,
         typer.Option(
-            help="above 1, up to 1000: an accelerated clock, which waits for limbfit; at most so much faster"
+            help="how many times faster than real time the clock may run, 1 to 1000; it waits for limbfit"
         ),
     ] = 1.0,
 ) -> None:
-    """A FitSocket that is a program, with the study's simulated limb in it; Ctrl-C ends it."""
+    """Run a virtual FitSocket around the study's simulated limb; Ctrl-C ends it."""
     if not 1 <= speed <= MOST_SPEED:
         remedy = f"1 is the wall's clock, up to {MOST_SPEED} an accelerated one"
         raise InputError(f"{speed:g} is no speed of the clock", place="--speed", remedy=remedy)

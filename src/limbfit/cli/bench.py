@@ -22,7 +22,7 @@ Reference = Annotated[
     Path | None,
     typer.Option(help="folder of FEBio's results; default: shared/reference, here or above"),
 ]
-Threads = Annotated[int, typer.Option(min=1, help="of the linear algebra; default: all cores")]
+Threads = Annotated[int, typer.Option(min=1, help="threads of the linear algebra; default: all cores")]
 CORES = usable_cores()
 UNKNOWNS, LARGE = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
 
@@ -99,7 +99,7 @@ def meshing(
     shared: Annotated[
         Path | None, typer.Option(help="folder with the real limbs; default: shared, here or above")
     ] = None,
-    sites: Annotated[int, typer.Option(min=1, help="of each of the five limbs")] = 20,
+    sites: Annotated[int, typer.Option(min=1, help="sites on each of the five limbs")] = 20,
     engine: Annotated[str, typer.Option(help="name of the mesher")] = "mmg",
     as_json: AsJson = False,
 ) -> None:
@@ -123,7 +123,7 @@ def calibrate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Identify a study afresh, in a copy, and time it beside FEBio's loop of finite differences."""
+    """Identify a copy of a study from scratch, and time it beside FEBio's loop of finite differences."""
     with listening() as listener:
         found = limbfit.bench_calibrate(study, listener=listener)
     if as_json:

@@ -49,8 +49,8 @@ def demo(
     show_summary(summary, as_json)
     if not as_json:
         STDOUT.print(
-            f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} asks "
-            f"what the records determine; {folder / 'study.toml'} is what a study of your own looks like",
+            f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} finds "
+            f"what the records determine; {folder / 'study.toml'} is an example of a study file",
             soft_wrap=True,
         )
 
@@ -66,6 +66,9 @@ def phantom(
         bool, typer.Option("--tendon", help="also a patellar tendon, a tissue of its own in the muscle")
     ] = False,
     socket: Annotated[bool, typer.Option("--socket", help="also a rectified socket for it")] = False,
+    ultrasound: Annotated[
+        bool, typer.Option("--ultrasound", help="also what ultrasound sees under the indenter")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
@@ -76,6 +79,7 @@ def phantom(
             seed=seed,
             fat=fat,
             socket=socket,
+            ultrasound=ultrasound,
             tendon=tendon,
             listener=listener,
         )
@@ -103,7 +107,7 @@ def series(
 
 
 def check(study: StudyPath, as_json: AsJson = False) -> None:
-    """Read every input of a study and say what is wrong with it, before anything runs."""
+    """Read every input of a study and report what is wrong, before anything runs."""
     with listening() as listener:
         findings = limbfit.check_study(limbfit.load_study(study), listener=listener)
     if as_json:
@@ -122,17 +126,17 @@ def run(
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option("--from", help="do this stage and all after it anew", autocompletion=stage_names),
+        typer.Option("--from", help="redo this stage and all after it", autocompletion=stage_names),
     ] = None,
     force: Annotated[
         list[str] | None,
         typer.Option(
-            help="do this stage anew, repeatable; kept simulations count", autocompletion=stage_names
+            help="redo this stage, repeatable; kept simulations are used", autocompletion=stage_names
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Do every stage that is missing or stale; a stopped run goes on where it stopped."""
+    """Run every stage that is missing or stale; a stopped run continues where it stopped."""
     began = perf_counter()
     with listening() as listener:
         summary = limbfit.run_study(
@@ -147,7 +151,7 @@ def run(
 
 
 def status(study: StudyPath, as_json: AsJson = False) -> None:
-    """Say which stages are done, begun, stale (and why) or missing."""
+    """List the stages that are done, begun, stale (and why) or missing."""
     states = limbfit.study_status(limbfit.load_study(study))
     if as_json:
         print_json({"stages": states})
@@ -210,7 +214,7 @@ def simulate(
 
 
 def report(study: StudyPath, as_json: AsJson = False) -> None:
-    """Make the report anew from what is stored; nothing is solved."""
+    """Make the report again from stored results; nothing is solved."""
     with listening() as listener:
         summary = limbfit.report_study(limbfit.load_study(study), listener=listener)
     show_summary(summary, as_json)

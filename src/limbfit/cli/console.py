@@ -29,7 +29,7 @@ import limbfit
 
 from ..laws import split_key
 
-INTERRUPTED = "interrupted; run the same command again to go on"
+INTERRUPTED = "interrupted; run the same command again to continue"
 _PATIENCE_S = 3.0  # for an interrupt to be heard
 _CLEARING_S = 15.0  # for what heard it to end its workers and files
 STDOUT = Console(highlight=False, markup=False)

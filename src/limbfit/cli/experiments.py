@@ -32,7 +32,7 @@ def cube(
         Path | None,
         typer.Argument(help="study.toml or its folder; without: published tissues only", show_default=False),
     ] = None,
-    compression: Annotated[float, typer.Option(help="percent of the side of the cube")] = 20.0,
+    compression: Annotated[float, typer.Option(help="compression in percent of the cube's side")] = 20.0,
     output: Annotated[Path | None, typer.Option(help="without a study: the folder to write to")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -73,7 +73,7 @@ def regions(
     ] = Sites.all,
     as_json: AsJson = False,
 ) -> None:
-    """Identify each region of the limb by itself, beside the model of the whole limb: the paper's table 3."""
+    """Identify each region separately, beside the model of the whole limb (the paper's table 3)."""
     run_verb(study, "regions", show_regions, as_json=as_json, sites=sites.value)
 
 
@@ -98,7 +98,7 @@ def show_regions(found: dict[str, Any]) -> None:
 
 
 def uncertainty(study: StudyPath, as_json: AsJson = False) -> None:
-    """Find what the records determine, what else would change it, and how far predictions can be trusted."""
+    """Find what the records determine, what else changes the answer, and how far to trust predictions."""
     run_verb(study, "uncertainty", show_uncertainty, as_json=as_json)
 
 
@@ -131,7 +131,7 @@ def sensitivity(
     ] = None,
     site: Annotated[
         list[str] | None,
-        typer.Option(help="where, repeatable; default: where tissue over bone is thinnest and thickest"),
+        typer.Option(help="site, repeatable; default: where tissue over bone is thinnest and thickest"),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -184,13 +184,13 @@ def show_sensitivity(name: str, found: dict[str, Any]) -> None:
 
 def experiment(
     study: StudyPath,
-    name: Annotated[str, typer.Argument(help="of an experiment, such as one of the study's own files")],
+    name: Annotated[str, typer.Argument(help="name of an experiment, such as one that the study registers")],
     option: Annotated[
         list[str] | None, typer.Option(help="NAME=VALUE, the value in JSON or plain text, repeatable")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run an experiment that has no verb of its own."""
+    """Run an experiment that has no command of its own."""
     run_verb(study, name, print_json, as_json=as_json, **parse_options(option or ()))
 
 

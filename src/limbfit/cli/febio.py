@@ -31,7 +31,7 @@ def febio(
     output: Annotated[
         Path | None, typer.Option(help="folder for what the input asks to be written; default: beside it")
     ] = None,
-    threads: Annotated[int, typer.Option(min=1, help="of assembly and linear algebra")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="threads of assembly and linear algebra")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Solve a FEBio input with limbfit's solver, and write the log-file tables that it asks for."""

@@ -14,22 +14,22 @@ from .console import STDOUT, AsJson, listening, print_json
 
 
 def segment(study: StudyPath, as_json: AsJson = False) -> None:
-    """Run until the label map: tissues with their volumes."""
+    """Run up to the label map; list tissues and volumes."""
     show(study, "segment", show_labels, as_json)
 
 
 def surfaces(study: StudyPath, as_json: AsJson = False) -> None:
-    """Run until the surfaces: closed bodies, volumes, and the thinnest tissue over each bone."""
+    """Run up to the surfaces; list closed bodies, volumes and the thinnest tissue over each bone."""
     show(study, "surfaces", show_surfaces, as_json)
 
 
 def sites(study: StudyPath, as_json: AsJson = False) -> None:
-    """Run until the sites: where they are on the skin, and the markers that say so."""
+    """Run up to the sites; list their places on the skin and the markers found there."""
     show(study, "sites", show_sites, as_json)
 
 
 def mesh(study: StudyPath, as_json: AsJson = False) -> None:
-    """Run until the meshes: counts, angles, and what was trimmed."""
+    """Run up to the meshes; list their size, angles and what was trimmed."""
     show(study, "mesh", show_meshes, as_json)
 
 

@@ -53,7 +53,7 @@ def where(verb: Callable[..., None]) -> Callable[..., None]:
 def batch(
     studies: Annotated[list[Path], typer.Argument(help="study files or their folders", show_default=False)],
     until: Annotated[
-        str | None, typer.Option(help="stop each after this stage", autocompletion=stage_names)
+        str | None, typer.Option(help="stop each study after this stage", autocompletion=stage_names)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -85,7 +85,8 @@ def reproduce(
     ],
     folder: Annotated[Path, typer.Argument(help="a new folder to run it in", show_default=False)],
     tolerance: Annotated[
-        float, typer.Option(help="relative, of parameters and of forces over a site's largest", min=0.0)
+        float,
+        typer.Option(help="relative tolerance of parameters, and of forces over a site's largest", min=0.0),
     ] = 1e-6,
     as_json: AsJson = False,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
@@ -10,13 +11,14 @@ from rich.table import Table
 import limbfit
 
 from ..errors import InputError
+from ..laws import split_key
 from .commands import StudyPath, parse_parameters
 from .console import STDOUT, AsJson, listening, tell_stored
 from .groups import WithDefault
 from .runs import where
 
 app = typer.Typer(
-    help="Put a socket on the limb and load it (fit, also without that word), or design one.",
+    help="Put a socket on the limb and load it (fit, the default), or design one.",
     cls=WithDefault,
     rich_markup_mode=None,
 )
@@ -25,7 +27,7 @@ OfTissues = Annotated[
     typer.Option(help="the law's parameters of each tissue; default: identified, or those of people"),
 ]
 OfPeople = Annotated[
-    bool, typer.Option("--literature", help="tissues of people, although some were identified")
+    bool, typer.Option("--literature", help="tissues of people, even where some were identified")
 ]
 
 
@@ -50,25 +52,44 @@ def fit(
 
 def show_socket(found: dict[str, Any]) -> None:
     """A table for donning and each load."""
+    for note in found["socket"]["notes"]:
+        STDOUT.print(f"socket: {note}", soft_wrap=True)
     for name, held in (("donning", found["donning"]), *((one["name"], one) for one in found["loads"])):
-        settled = f", settled by {held['settling_mm']:.1f} mm" if "settling_mm" in held else ""
+        settled = f", settled by {held['settling_mm']:.1f} mm{_known(held)}" if "settling_mm" in held else ""
         STDOUT.print(
             f"{name}: {held['peak_kPa']:.0f} kPa at most, in touch over "
             f"{held['contact_area_mm2'] / 100:.0f} cm2{settled}",
             soft_wrap=True,
         )
-        table = Table("region", "mean (kPa)", "95 % (kPa)", "peak (kPa)", "shear (kPa)", box=None)
+        heads = ("region", "mean (kPa)", "95 % (kPa)", "mostly from", "peak (kPa)", "shear (kPa)")
+        table = Table(*heads, box=None)
         for row in held["regions"]:
             known = row["interval_kPa"]
             interval = "" if known is None else f"{known[0]:.1f} to {known[1]:.1f}"
             numbers = [f"{row[key]:.1f}" for key in ("mean_kPa", "peak_kPa", "shear_kPa")]
-            table.add_row(row["region"], numbers[0], interval, *numbers[1:])
+            table.add_row(row["region"], numbers[0], interval, _mostly(row["interval_from"]), *numbers[1:])
         STDOUT.print(table)
     STDOUT.print(
         f"tissues: {found['parameters_from']}; contact balances the loads within "
         f"{found['balance_percent']:.2g} %; not a medical device",
         soft_wrap=True,
     )
+
+
+def _mostly(shares: Mapping[str, float] | None) -> str:
+    """The parameter that most of an interval comes from: ``muscle c 84 %``."""
+    if not shares:
+        return ""
+    name, percent = next(iter(shares.items()))
+    tissue, _, key = name.partition(".")
+    return f"{tissue} {split_key(key)[0]} {percent:.0f} %"
+
+
+def _known(load: Mapping[str, Any]) -> str:
+    known = load["settling_interval_mm"]
+    if known is None:
+        return ""
+    return f" (95 %: {known[0]:.1f} to {known[1]:.1f}, mostly from {_mostly(load['settling_interval_from'])})"
 
 
 def design(
@@ -78,7 +99,7 @@ def design(
         typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
     ] = "",
     simulations: Annotated[
-        int, typer.Option(help="with --optimise: at most so many beside those of the two designs", min=1)
+        int, typer.Option(help="with --optimise: how many at most, beside those of the two designs", min=1)
     ] = 6,
     parameters: OfTissues = None,
     literature: OfPeople = False,

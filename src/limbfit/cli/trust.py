@@ -65,7 +65,7 @@ def design(
     protocol: Annotated[
         bool, typer.Option("--protocol", help="choose the records of a whole session instead")
     ] = False,
-    minutes: Annotated[float, typer.Option(help="with --protocol: of the session, min", min=1)] = 25.0,
+    minutes: Annotated[float, typer.Option(help="with --protocol: length of the session, min", min=1)] = 25.0,
     speeds: Annotated[
         str | None,
         typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
@@ -75,7 +75,11 @@ def design(
         str | None, typer.Option(help="with --protocol: parameters such as muscle.c_kPa; default: all")
     ] = None,
     criterion: Annotated[Literal["D", "A"], typer.Option(help="with --protocol: D or A")] = "D",
-    draws: Annotated[int, typer.Option(help="with --protocol: tissues to judge by", min=1, max=64)] = 3,
+    draws: Annotated[int, typer.Option(help="with --protocol: how many tissues", min=1, max=64)] = 3,
+    ultrasound: Annotated[
+        float | None,
+        typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.
@@ -99,6 +103,7 @@ def design(
                 determine=determine.split(",") if determine else (),
                 criterion=criterion,
                 draws=draws,
+                ultrasound_sd_mm=ultrasound,
                 parameters=used,
                 listener=listener,
             )

@@ -23,6 +23,7 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 from __future__ import annotations
 
 from ..shapes import RigidSurface
+from .activation import Activation
 from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
 from .contact.smooth_surface import SmoothSurface
@@ -31,6 +32,7 @@ from .kernel.elements import ELEMENTS
 from .materials import (
     ORDER_IN_TIME,
     VOLUMETRIC_LAWS,
+    Contractile,
     Fibred,
     Material,
     MooneyRivlin,
@@ -54,6 +56,8 @@ __all__ = [
     "ELEMENTS",
     "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
+    "Activation",
+    "Contractile",
     "Doubt",
     "Fibred",
     "History",

@@ -116,8 +116,8 @@ def unsettled(displacement: Array, found: Sequence[tuple[float, float]]) -> tupl
         return ()
     worst = max(residual for _, residual in found)
     text = (
-        f"the friction of {len(found)} steps is that of a normal force up to {worst:.2g} of the reactions "
-        f"off, first at {found[0][0]:.3g} mm: use more steps"
+        f"the friction of {len(found)} steps belongs to a normal force that is off by up to {worst:.2g} of "
+        f"the reactions, first at {found[0][0]:.3g} mm: use more steps"
     )
     return _doubt("unsettled", text, len(found), found[0][0], displacement)
 

@@ -68,7 +68,7 @@ LAW = np.dtype(
     [
         ("response", "i8", _L),
         ("rates", "i8", _L),
-        ("fibre", "f8", (2, _L)),  # k1, k2
+        ("fibre", "f8", (3, _L)),  # k1, k2, active stress over the scale
         ("along", "f8", (3, _L)),  # the fibre at rest, of length one
         ("energy", "f8", _L),
         ("beta", "f8", (3, _L)),

@@ -178,7 +178,7 @@ class RigidBody:
     shape : what it is and where it starts.
     faces : (f, k) outward boundary faces that it may touch.
     motion : what drives it.
-    friction : as in `Problem`.
+    friction, sticking : as in `Problem`.
     hardness : stiffness that holds a point along the body until it slips by Coulomb's law, over that of the
         contact; where not given 0.05 for shapes that grow, 1 for others.  The softer, the wider is what
         sticking goes over into slipping in, the coefficient times the penetration over the hardness, and the
@@ -194,6 +194,7 @@ class RigidBody:
     pivot: Sequence[float] | Array | None = None
     name: str = ""
     hardness: float | None = None
+    sticking: str = "anchored"
 
     def __post_init__(self) -> None:
         if self.hardness is not None and not 0.0 < self.hardness <= 1.0:

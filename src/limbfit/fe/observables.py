@@ -41,7 +41,8 @@ def element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     points, law, numbers, _, _, element, *_ = workspace(0, system.weights.shape[1], laws.numbers.shape[1])
     records = points, law, numbers, element
     mean, every = system.element.mean_dilatation, slice(0, len(system.cells))
-    _fields(system.elements(every), mean, laws.tables, history, state.u, records, out)
+    tables = laws.acting(state.activation, np.ones(len(laws.prony)))
+    _fields(system.elements(every), mean, tables, history, state.u, records, out)
     return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
 
 
@@ -53,7 +54,7 @@ def nodal_forces(system: System, laws: Laws, state: State) -> Array:
     """
     increment = Increment(
         state.time, state.displacement, np.ones(len(laws.prony)), _relaxing(system, laws, state),
-        state.penalty * laws.modulus, state.drives, state.grips,
+        state.penalty * laws.modulus, state.drives, state.grips, activation=state.activation,
     )  # fmt: skip
     found = system.evaluate(state.rows, laws, increment, tangent=False)
     return found.residual[: system.nodes]

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ProblemError
 from ..mesh import Mesh
 from ..phases import Phase, boundaries, find_phases, loading_end
+from .activation import Activation
+from .contact.friction import LAWS_OF_STICKING
 from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element, reference_gradients
 from .materials import Material
@@ -152,10 +154,14 @@ class Problem:
     contact_rule : where contact is enforced: ``nodes`` of the faces or their ``gauss`` points.
     friction : ``frictionless``, ``sticky`` (what touches does not slip along the indenter) or Coulomb's
         coefficient.
+    sticking : how Coulomb's law sticks: ``anchored`` where a point first touched, or has slipped to, for as
+        long as it does not slip; or ``stepwise``, as FEBio's ``sliding-elastic`` does, where it was at the
+        end of the last step.
     bodies : further rigid bodies, each driven by its own motion.
     pressures : on boundary faces, normal to them as they move.
     fibres : direction of the fibres at rest, one (3,) or one for each cell (m, 3), of any length; where a
         material is `Fibred`.
+    activation : how much of the active stress of `Contractile` materials acts, over time.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     """
 
@@ -170,9 +176,11 @@ class Problem:
     start: str = "touching"
     contact_rule: str = "gauss"
     friction: str | float = "frictionless"
+    sticking: str = "anchored"
     bodies: tuple[RigidBody, ...] = ()
     pressures: tuple[Pressure, ...] = ()
     fibres: ArrayLike | None = None
+    activation: Activation | None = None
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
@@ -185,7 +193,9 @@ class Problem:
         if self.indenter is None:
             return self.bodies
         motion = self.history.motion
-        indenter = RigidBody(self.indenter, self.contact_faces, motion, self.friction, name="indenter")
+        indenter = RigidBody(
+            self.indenter, self.contact_faces, motion, self.friction, name="indenter", sticking=self.sticking
+        )
         return indenter, *self.bodies
 
     def drives(self, t: float) -> Drives:
@@ -202,13 +212,20 @@ class Problem:
         return replace(self, bodies=bodies)
 
     def travel(self, t: float) -> float:
-        """What grows evenly while the indenter moves, or what drives the further bodies changes."""
-        return self.history.travel(t) + sum(body.motion.moving_s(t) for body in self.bodies)
+        """What grows evenly while the indenter moves, or what drives bodies or activates tissue changes."""
+        contracting = 0.0 if self.activation is None else self.activation.moving_s(t)
+        return contracting + self.history.travel(t) + sum(b.motion.moving_s(t) for b in self.bodies)
+
+    def activated(self, t: float) -> float:
+        """Share of the active stress at time ``t``, s."""
+        return 0.0 if self.activation is None else self.activation.at(t)
 
     @property
     def turns(self) -> NDArray[np.float64]:
-        """Times where what drives a further body, or a pressure, turns, s."""
+        """Times where what drives a further body, a pressure or the activation turns, s."""
         knots = [np.asarray(one.times)[1:-1] for one in self.pressures]
+        if self.activation is not None:
+            knots.append(np.asarray(self.activation.times)[1:])
         return np.unique(np.concatenate([np.zeros(0), *(body.motion.turns for body in self.bodies), *knots]))
 
     @property
@@ -277,7 +294,7 @@ def _check_choices(problem: Problem) -> None:
         raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
 
 
-def _check_friction(friction: str | float) -> None:
+def _check_friction(friction: str | float, sticking: str) -> None:
     if isinstance(friction, str):
         known = friction in ("frictionless", "sticky")
     else:
@@ -285,6 +302,10 @@ def _check_friction(friction: str | float) -> None:
     if not known:
         raise ProblemError(
             f"unknown friction {friction!r}", remedy="use 'frictionless', 'sticky' or a coefficient from 0 on"
+        )
+    if sticking not in LAWS_OF_STICKING:
+        raise ProblemError(
+            f"unknown law of sticking {sticking!r}", remedy=f"use {' or '.join(map(repr, LAWS_OF_STICKING))}"
         )
 
 
@@ -309,9 +330,14 @@ def _check_cells(problem: Problem) -> None:
 
 
 def _check_fibres(problem: Problem) -> None:
+    for region in problem.mesh.region_names:
+        if problem.activation is None and problem.materials[region].table().active > 0.0:
+            raise ProblemError(
+                f"the active stress of {region!r} acts at no stated time", remedy="state Problem.activation"
+            )
     if problem.fibres is None:
         for region in problem.mesh.region_names:
-            if problem.materials[region].table().fibre[0] > 0.0:
+            if problem.materials[region].table().has_fibres:
                 raise ProblemError(
                     f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
                 )
@@ -331,7 +357,7 @@ def _check_bodies(problem: Problem) -> None:
         faces, of = np.asarray(body.faces), f" of {body.name or f'body {i}'}" if len(bodies) > 1 else ""
         if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
             raise ProblemError(f"contact faces{of} have shape {faces.shape}, not (f, {width}) with f > 0")
-        _check_friction(body.friction)
+        _check_friction(body.friction, body.sticking)
         if body.motion.grows and not body.shape.grows:
             raise ProblemError(
                 f"the shape{of or ' of the body'} does not grow",

@@ -39,6 +39,7 @@ class State:
     bodies: Array | None = None
     drives: Drives = field(default_factory=Drives.none)
     grips: tuple[Grip | None, ...] = ()
+    activation: float = 0.0
 
     @property
     def rows(self) -> Array:

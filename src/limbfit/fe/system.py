@@ -40,6 +40,7 @@ class Increment:
     (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grips`` hold points along the bodies;
     points deeper than ``flat_from`` (mm) have the tangent of a flat body; the ``drives`` move the
     rigid bodies.  The ``pressures (k,)`` in MPa act, with ``rims (n, 3)`` as `Pressures.rims` gave them.
+    ``activation``: share of the active stress.
     """
 
     time: float
@@ -52,6 +53,7 @@ class Increment:
     flat_from: float = np.inf
     pressures: tuple[float, ...] = ()
     rims: Array | float = 0.0
+    activation: float = 0.0
 
     @property
     def lags(self) -> bool:
@@ -196,12 +198,12 @@ class System:
         if laws.fibred and not len(self.fibres):
             raise ProblemError("the fibres of a material have no direction", remedy="state Problem.fibres")
         size = len(self.indices) if tangent else 0
-        mean = self.element.mean_dilatation
+        mean, tables = self.element.mean_dilatation, laws.acting(increment.activation, increment.scale)
 
         def part(cells: slice) -> tuple[float, Array, Array]:
             residual, data = np.zeros_like(u), np.zeros(size)
             energy = assemble(
-                self.elements(cells), mean, laws.tables, increment.scale, increment.history[cells], u,
+                self.elements(cells), mean, tables, increment.scale, increment.history[cells], u,
                 tangent, self.cell_positions[cells], residual, data,
             )  # fmt: skip
             return energy, residual, data
@@ -211,10 +213,11 @@ class System:
             energy += more[0]
             residual += more[1]
             data += more[2]
-        load_norm = 0.0
+        load_norm = self._contracting(laws, increment.activation)
         if increment.pressures:
-            pressing, pressed, load_norm = self.pressures.evaluate(u, increment.pressures, increment.rims)
+            pressing, pressed, pressure_norm = self.pressures.evaluate(u, increment.pressures, increment.rims)
             energy, residual = energy + pressing, residual + pressed
+            load_norm = max(load_norm, pressure_norm)
             if tangent:
                 self.pressures.tangent(u, increment.pressures, data)
         if not np.isfinite(energy) or self.bodies is None:
@@ -230,6 +233,13 @@ class System:
             float(np.linalg.norm(found.residual[: self.nodes])), found.touch, found.reactions,
             max(loads.norm, load_norm),
         )  # fmt: skip
+
+    def _contracting(self, laws: Laws, share: float) -> float:
+        """The size of active forces, N: their stress on a section of the tissue that contracts."""
+        if share == 0.0 or not laws.fibre[:, 2].any():
+            return 0.0
+        volumes = np.bincount(self.regions, self.weights.sum(axis=1), len(laws.kappa))
+        return share * float((laws.fibre[:, 2] * volumes ** (2.0 / 3.0)).max())
 
     def _contact(self, u: Array, increment: Increment, tangent: bool = False) -> Contacts:
         assert self.bodies is not None

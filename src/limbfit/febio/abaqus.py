@@ -61,7 +61,7 @@ def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSet
 
 def _check_material(name: str, material: Material, program: str) -> None:
     table = material.table()
-    if table.fibre[0] > 0.0:
+    if table.has_fibres:
         raise ProblemError(f"tissue {name!r} has fibres, which are written for FEBio only")
     if program == "calculix" and any(g != 0.0 for g, _ in table.prony):
         raise ProblemError(

@@ -87,7 +87,8 @@ def rigid_body(
     forced = np.asarray(motion.forced)[:, np.abs(turn).argmax(axis=1)]
     moved = Motion(motion.times, motion.values @ turn.T, forced)
     friction = contacts[0].friction or "frictionless"
-    return RigidBody(shape, faces, moved, friction, model.rigid[name].centre, name)
+    sticking = contacts[0].sticking
+    return RigidBody(shape, faces, moved, friction, model.rigid[name].centre, name, sticking=sticking)
 
 
 def _of_part(model: FebModel, name: str, error: ProblemError) -> ProblemError:

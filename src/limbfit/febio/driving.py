@@ -158,7 +158,7 @@ def _motions(model: FebModel) -> dict[str, Motion]:
             raise ProblemError(
                 f"the rigid body {name!r} is neither fixed nor displaced in {names_of_free(motion)}",
                 place=place,
-                remedy="limbfit solves for no rigid body that carries tissue: fix it there with rigid_fixed",
+                remedy="limbfit solves only for bodies that carry no tissue: fix it there with rigid_fixed",
             )
         lines = [c.line for c in model.conditions if c.body == name and c.kind != "fixed" and c.curve]
         if name in model.carried and turns_of(motion):
@@ -211,7 +211,7 @@ def _multiple(course: _Course, times: Array, base: Array) -> float:
     scale = float(values @ base / (base @ base))
     if np.abs(values - scale * base).max() > 1e-9 * np.abs(values).max():
         raise ProblemError(
-            f"{course.words} is no multiple of that of the other motions",
+            f"{course.words} is not a multiple of that of the other motions",
             place=f"line {course.line}",
             remedy="limbfit moves nodes, and bodies that carry tissue, by one history",
         )

@@ -21,7 +21,7 @@ def directions(problem: Problem) -> dict[str, Array]:
     """The directions of the fibres of each region that has some: (1, 3), or one for each of its cells."""
     mesh, found = problem.mesh, {}
     for r, name in enumerate(mesh.region_names):
-        if problem.materials[name].table().fibre[0] > 0.0 and problem.fibres is not None:
+        if problem.materials[name].table().has_fibres and problem.fibres is not None:
             given = np.broadcast_to(np.asarray(problem.fibres, dtype=float), (len(mesh.cells), 3))
             own = given[mesh.regions == r]
             found[name] = own[:1] if (own == own[0]).all() else own

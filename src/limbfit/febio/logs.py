@@ -51,7 +51,9 @@ def read_log(path: str | Path) -> Log:
             elif line.strip() and not line.startswith("*"):
                 steps[-1].append([float(value) for value in line.split(",")[1:]])
         except (ValueError, IndexError) as error:
-            raise ProblemError(f"{line!r} is no line of a FEBio log", file=path, place=str(number)) from error
+            raise ProblemError(
+                f"{line!r} is not a line of a FEBio log", file=path, place=str(number)
+            ) from error
     items = len(steps[0]) if steps else 0
     whole = [[len(row) for row in step] == [len(names)] * items for step in steps]
     count = whole.index(False) if False in whole else len(whole)

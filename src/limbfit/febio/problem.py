@@ -69,6 +69,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         supports=supports,
         start="as-given",
         friction=friction or "frictionless",
+        sticking="anchored" if placed is None else touching[name][0].sticking,
         bodies=tuple(
             rigid_body(model, name, touching[name], motion, tissue) for name, motion in driven.motions.items()
         ),
@@ -112,7 +113,7 @@ def _pressures(model: FebModel, tissue: Tissue) -> tuple[Pressure, ...]:
     for load in model.pressures:
         faces = tissue.number[model.geometry.surfaces[load.surface]]
         if (faces < 0).any():
-            what = f"the surface {load.surface!r} of a pressure lies not on tissue"
+            what = f"the surface {load.surface!r} of a pressure does not lie on tissue"
             raise ProblemError(what, place=f"line {load.line}")
         curve = model.curves[load.curve]
         times = knots([curve], step_times(model.phases, model.curves), 0.0, end)

@@ -49,7 +49,7 @@ def find_febio(program: str | Path | None = None) -> Path:
         if given:
             found = shutil.which(str(given))
             if found is None:
-                raise InputError("is no program that can be run", file=given, place=name, remedy=GET_IT)
+                raise InputError("is not a program that can be run", file=given, place=name, remedy=GET_IT)
             return Path(found)
     for candidate in NAMES:
         found = shutil.which(candidate)
@@ -90,7 +90,7 @@ def run_febio(
     except ProblemError as error:
         log = None
         if verdict.completed:
-            verdict = replace(verdict, kind="no output", reason=f"FEBio ended well, but {error}")
+            verdict = replace(verdict, kind="no output", reason=f"FEBio ended normally, but {error}")
     return FebioRun(verdict, log, seconds, folder)
 
 

@@ -65,14 +65,14 @@ def _kind(
     if ERROR in messages:
         return "error", "stopped with an error" + ("" if exit_code else ", though it left with exit code 0")
     if 0 < signal < 65:
-        memory = ", most often for want of memory" if signal == 9 else ""
+        memory = ", most often for lack of memory" if signal == 9 else ""
         return "killed", f"was killed by signal {signal}{memory},"
     if exit_code != 0:
-        return "crashed", f"left with exit code {exit_code} without a word,"
+        return "crashed", f"left with exit code {exit_code} without a message,"
     if not messages.strip():
         return "no output", "wrote nothing"
     if NORMAL not in messages:
-        return "crashed", "ended without saying how,"
+        return "crashed", "ended without a verdict,"
     if reached < end_s * (1.0 - SLACK):
         return "partial", "ended, but stopped early,"
     return "normal", ""

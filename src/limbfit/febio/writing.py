@@ -120,6 +120,11 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     lines = [contact, "indenter: facets, without the side walls", "time: FEBio's own steps"]
     if not automatic:
         lines.append("force: within 2 % of the peak of limbfit's, as far as these go")
+    if any(_slides(body.friction) and body.sticking == "anchored" for body in problem.rigid_bodies):
+        lines.append(
+            "sticking: FEBio anchors what sticks anew in every step, so that it slips on in time; "
+            'limbfit does so with sticking = "stepwise"'
+        )
     shapes = [body.shape for body in problem.rigid_bodies]
     if not all(blunt(shape) for shape in shapes if isinstance(shape, Indenter)):
         lines.append(
@@ -261,9 +266,11 @@ def material_lines(number: int, name: str, material: Material, axis: str = "") -
     Raises
     ------
     ProblemError
-        For more terms than FEBio takes.
+        For more terms than FEBio takes, and for tissue that contracts.
     """
     table = material.table()
+    if table.active > 0.0:
+        raise ProblemError(f"tissue {name!r} contracts, which is not written for other programs")
     prony = [(g, tau) for g, tau in table.prony if g != 0.0]
     if max(len(prony), len(table.terms)) > MOST_TERMS:
         raise ProblemError(f"tissue {name!r} has more than {MOST_TERMS} terms, which FEBio does not take")

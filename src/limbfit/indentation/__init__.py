@@ -1,13 +1,14 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
 from ..laws import Parameters, flat_names, to_parameters, to_vector
+from .fibres import Direction, fibre_field
+from .layers import compressions, layers_under
 from .neighbourhood import Extension, neighbourhood
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
 from .sites import (
     Array,
     SiteModel,
     build_problem,
-    fibre_field,
     materials,
     read_indenter,
     steps_of,
@@ -15,16 +16,19 @@ from .sites import (
 
 __all__ = [
     "Array",
+    "Direction",
     "Extension",
     "Parameters",
     "Simulation",
     "SimulationJob",
     "SiteModel",
     "build_problem",
+    "compressions",
     "fibre_field",
     "first_steps",
     "flat_names",
     "job_fields",
+    "layers_under",
     "materials",
     "neighbourhood",
     "read_indenter",

@@ -29,11 +29,13 @@ _TRUSTED = 0.6  # share of the radius within which the part's displacements are 
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """A part of a mesh: its ``nodes`` (k,) there; ``cut`` (j,): nodes of the part where it was cut off."""
+    """A part of a mesh: its ``nodes`` (k,) and which of the ``cells`` (m,) there are its own; ``cut`` (j,):
+    nodes of the part where it was cut off."""
 
     mesh: Mesh
     nodes: Ints
     cut: Ints
+    cells: NDArray[np.bool_]
 
 
 def neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
@@ -71,7 +73,7 @@ def neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
         node_sets={name: number[nodes[inside[nodes]]] for name, nodes in mesh.node_sets.items()},
         face_sets={name: number[faces[inside[faces].all(axis=1)]] for name, faces in mesh.face_sets.items()},
     )
-    return Neighbourhood(part, np.flatnonzero(inside), number[inside & outside])
+    return Neighbourhood(part, np.flatnonzero(inside), number[inside & outside], kept)
 
 
 def held_cut(part: Neighbourhood, centre: Array, axis: Array) -> Ints:

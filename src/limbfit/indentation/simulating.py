@@ -19,6 +19,7 @@ from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
 from ..mesh import read_vtu
+from .layers import compressions
 from .neighbourhood import Extension, neighbourhood
 from .sites import (
     Parameters,
@@ -70,6 +71,8 @@ class Simulation:
     Where a force drives the indenter, ``force_N`` is what answers to it: the displacement, mm.
 
     Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
+    ``compression_mm`` (t, n) is what each of the model's layers has lost of its thickness,
+    ``compression_jacobian`` (t, n, p) its derivatives.
     """
 
     site: str
@@ -80,6 +83,8 @@ class Simulation:
     penetration_mm: float
     facts: dict[str, Any]
     doubts: tuple[Doubt, ...] = ()
+    compression_mm: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    compression_jacobian: Array | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -184,11 +189,15 @@ def _solve_from_rest(
     kept = known.rested.get(sensitivities)
     if kept is None or kept[0] != parameters:
         values = to_parameters(np.array(parameters), tissues, model.law)
-        store = "all" if sensitivities else "peak"
-        found = _solve(model, values, sensitivities=sensitivities, store=store)
+        found = _solve(model, values, sensitivities=sensitivities, store=_kept_of(model, sensitivities))
         kept = parameters, replace(found, states=tuple(map(_lightened, found.states)))
         known.rested[sensitivities] = kept
     return kept[1]
+
+
+def _kept_of(model: SiteModel, sensitivities: bool) -> str:
+    """Which states are kept: all, where they give first guesses or layers are read from them."""
+    return "all" if sensitivities or model.layers else "peak"
 
 
 def _lightened(state: State) -> State:
@@ -207,7 +216,7 @@ def _result(job: SimulationJob) -> Result:
         return known.link[1]
     if known.latest is None or known.latest[0] != wanted:
         values, with_slopes = to_parameters(np.array(job.parameters), tissues, model.law), job.sensitivities
-        store, warm = "all" if with_slopes else "peak", _guesses(job, known)
+        store, warm = _kept_of(model, with_slopes), _guesses(job, known)
         found = _solve(model, values, sensitivities=with_slopes, warm_start=warm, store=store)
         known.latest = wanted, replace(found, states=tuple(map(_lightened, found.states)))
     return known.latest[1]
@@ -242,15 +251,20 @@ def simulate(job: SimulationJob) -> Simulation:
     """
     model, result = job.model, _result(job)
     times = np.array(job.times_s)
+    thinner, slopes = compressions(result, model, times) if model.layers else (np.zeros((0, 0)), None)
     return Simulation(
         site=model.name,
         force_N=result.response_at(times),
-        jacobian=_in_user_units(result, job, times) if job.sensitivities else None,
+        jacobian=_in_user_units(result, job, result.response_sensitivity_at(times))
+        if job.sensitivities
+        else None,
         completed=result.completed,
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
         facts=dict(result.statistics),
         doubts=result.doubts,
+        compression_mm=thinner,
+        compression_jacobian=None if slopes is None else _in_user_units(result, job, slopes),
     )
 
 
@@ -282,17 +296,16 @@ def _write_deepest(result: Result, file: Path) -> None:
         write_fields(result.system, result.problem, result.deepest, file)
 
 
-def _in_user_units(result: Result, job: SimulationJob, times: Array) -> Array:
-    """Sensitivities in flat order, per kPa where the parameter is a modulus.
+def _in_user_units(result: Result, job: SimulationJob, slopes: Array) -> Array:
+    """Derivatives (..., p) of the solver in flat order, per kPa where the parameter is a modulus.
 
-    A tissue that does not reach the site is no region of its mesh: the force does not depend on it.
+    A tissue that does not reach the site is no region of its mesh: nothing depends on it.
     """
     order = {name: i for i, name in enumerate(result.parameter_names)}
-    found = result.response_sensitivity_at(times)
     wanted = [(tissue, p) for tissue in job.tissues for p in LAWS[job.model.law].parameters]
-    columns = np.zeros((len(times), len(wanted)))
+    columns = np.zeros((*slopes.shape[:-1], len(wanted)))
     for i, (tissue, parameter) in enumerate(wanted):
         j = order.get((tissue, parameter.name))
         if j is not None:
-            columns[:, i] = found[:, j] * parameter.scale
+            columns[..., i] = slopes[..., j] * parameter.scale
     return columns

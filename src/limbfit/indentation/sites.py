@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
 from ..study import IndenterTable, SolverTable, Vector
+from .fibres import Direction, fibre_field
 from .neighbourhood import held_cut, neighbourhood
 
 Array = NDArray[np.float64]
@@ -54,11 +55,12 @@ class SiteModel:
     element: str = ""  # row of the element table; by default that of the mesh's cell type
     within_mm: float | None = None  # no more of the mesh than this far from the site
     law: str = OGDEN  # of all tissues
-    fibres: tuple[tuple[str, Vector], ...] = ()  # direction in each tissue that has some
+    fibres: tuple[tuple[str, Direction], ...] = ()  # direction in each tissue that has some
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     extensions_digest: str = ""
     site: str = ""
     knots_N: tuple[float, ...] = ()
+    layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
 
     @property
     def forced(self) -> bool:
@@ -95,16 +97,6 @@ def materials(
     return found
 
 
-def fibre_field(fibres: Iterable[tuple[str, Vector]], mesh: Mesh) -> Array | None:
-    """The fibres' direction in each cell (m, 3); any where a tissue has none, None where all have none."""
-    found = None
-    for tissue, direction in fibres:
-        if tissue in mesh.region_names:
-            found = np.tile([1.0, 0.0, 0.0], (len(mesh.cells), 1)) if found is None else found
-            found[mesh.regions == mesh.region_names.index(tissue)] = direction
-    return found
-
-
 def materials_of(model: SiteModel, parameters: Parameters) -> dict[str, Material]:
     """The tissues of a site for the solver, whose law may be the study's own."""
     load_extensions(model.extensions)
@@ -118,11 +110,12 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     model goes no farther than ``within_mm``, so is the cut below the indenter.
     """
     load_extensions(model.extensions)
-    cut = np.empty(0, dtype=np.int64)
+    cut, fibres = np.empty(0, dtype=np.int64), fibre_field(model.fibres, mesh)
     if model.within_mm is not None:
         centre, axis = np.array(model.position), np.array(model.axis)
         part = neighbourhood(mesh, centre, model.within_mm)
         mesh, cut = part.mesh, held_cut(part, centre, axis)
+        fibres = None if fibres is None else fibres[part.cells]
         if not len(cut) and not len(mesh.held):  # nothing else carries it
             cut = part.cut
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
@@ -138,7 +131,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         history=model.history,
         friction=model.indenter.friction,
         element=model.element,
-        fibres=fibre_field(model.fibres, mesh),
+        fibres=fibres,
     )
 
 

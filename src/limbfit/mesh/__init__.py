@@ -1,6 +1,7 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
+from .gauges import Gauge, gauges_along
 from .measures import MeshQuality, dihedral_angles, quality
 from .volume import (
     Mesh,
@@ -18,12 +19,14 @@ __all__ = [
     "TET_FACES",
     "TRI6_EDGES",
     "CellType",
+    "Gauge",
     "Mesh",
     "MeshQuality",
     "boundary_faces",
     "cell_volumes",
     "check",
     "dihedral_angles",
+    "gauges_along",
     "node_jacobians",
     "quality",
     "read_grid",

@@ -76,7 +76,7 @@ class Mesh:
         regions: ArrayLike | None = None,
         names: Mapping[int, str] | None = None,
     ) -> Mesh:
-        """A mesh of one's own: points (n, 3) in mm, cells (m, 4), (m, 10) or (m, 8) in VTK's order.
+        """A mesh from arrays: points (n, 3) in mm, cells (m, 4), (m, 10) or (m, 8) in VTK's order.
 
         Points of no cell are dropped, and cells whose corners run the other way round are turned.
 

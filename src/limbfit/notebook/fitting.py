@@ -1,4 +1,4 @@
-"""Tissue parameters from measured curves of one's own problems, with what the curves cannot tell of them."""
+"""Tissue parameters from measured curves of your own problems, with what the curves leave open."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from .forces import DISCRETISATIONS, ForceJob, MeshJob, TrueForce, site_force, s
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
-from .record import Ramp, record
+from .record import Ramp, record, write_ultrasound
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
 from .socket import STUDY as SOCKET_STUDY
 from .socket import write_socket
@@ -80,6 +80,7 @@ def make_phantom(
     sites: Sequence[str] | None = None,
     fat: bool = False,
     socket: bool = False,
+    ultrasound: bool = False,
     tendon: bool = False,
     mapping: Mapping = map,
     progress: Listener | None = None,
@@ -94,6 +95,7 @@ def make_phantom(
     sites : names of the sites to indent, of ``01`` to ``18``; the image shows all 18 markers anyway.
     fat : three tissues, skin of 2 mm over fat of 4 mm over muscle, instead of two.
     socket : also a rectified socket for the limb with a liner, as a file that the study names.
+    ultrasound : beside each record what ultrasound through the indenter saw, to 0.1 mm at 20 Hz.
     tendon : also a patellar tendon, a stiffer region of the muscle, in a label map that the study names.
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
@@ -120,8 +122,10 @@ def make_phantom(
     with _appearing(folder) as work:
         _write_images(work, limb, everywhere, detail, seed, tell)
         truth = _truth(limb, everywhere, detail, seed, parameters)
-        truth["sites"] = _write_traces(work, limb, indented, detail, seed, parameters, mapping, tell)
-        text = study_text(indented, detail, seed, limb)
+        truth["sites"] = _write_traces(
+            work, limb, indented, detail, seed, parameters, mapping, tell, ultrasound
+        )
+        text = study_text(indented, detail, seed, limb, ultrasound)
         if socket:
             truth["socket"] = write_socket(work, limb)
             text += SOCKET_STUDY
@@ -177,6 +181,7 @@ def _write_traces(
     parameters: Parameters,
     mapping: Mapping,
     tell: Listener,
+    ultrasound: bool,
 ) -> list[dict[str, Any]]:
     """Simulate and record every site; what is true of each, for ``truth.json``."""
     truth, traces = work / "truth", work / "traces"
@@ -191,7 +196,7 @@ def _write_traces(
     tell("meshes", 0, len(wanted))
     for (name, at, axis), site, mesh in zip(places, indented, mapping(site_mesh, wanted), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters))
+        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters, ultrasound))
         tell("meshes", len(jobs), len(wanted))
     tell("forces", 0, len(jobs))
     told = []
@@ -205,6 +210,16 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
     random = np.random.default_rng([seed, 8, int(site.name)])
     made = record(_ramp(site), lambda t: np.interp(t, found.times, found.force), random)
     made.write(traces / f"site-{site.name}.csv")
+    if found.layers:
+        write_ultrasound(
+            traces / f"site-{site.name}-layers.csv",
+            made,
+            {
+                tissue: (thickness, lambda t, lost=lost: np.interp(t, found.times, lost))  # type: ignore[misc]
+                for tissue, (thickness, lost) in found.layers.items()
+            },
+            np.random.default_rng([seed, 11, int(site.name)]),
+        )
     return {
         **_site_facts(site),
         "depth_mm": site.depth,

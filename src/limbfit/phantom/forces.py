@@ -8,7 +8,7 @@ mean dilatation each: with the pressure as it comes, forces of such meshes are 5
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,8 +19,8 @@ from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_si
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
-from ..indentation import Parameters, SiteModel, build_problem, neighbourhood
-from ..mesh import Mesh
+from ..indentation import Parameters, SiteModel, build_problem, compressions, neighbourhood
+from ..mesh import Mesh, gauges_along
 from ..study import IndenterTable
 from .record import Ramp
 from .sites import INDENTER_EDGE_MM, INDENTER_MM
@@ -93,16 +93,22 @@ class ForceJob:
     ramp: Ramp
     steps: StepControl
     parameters: Parameters
+    ultrasound: bool = False
 
 
 @dataclass(frozen=True)
 class TrueForce:
-    """What came back: force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``."""
+    """What came back: force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``.
+
+    ``layers``: of each tissue on the axis its thickness at rest, mm, and its compression (n,) mm, where
+    ultrasound was wanted.
+    """
 
     site: str
     times: NDArray[np.float64]
     force: NDArray[np.float64]
     facts: dict[str, float | int | str]
+    layers: dict[str, tuple[float, NDArray[np.float64]]] = field(default_factory=dict)
 
 
 @lru_cache(maxsize=1)
@@ -140,7 +146,7 @@ def site_force(job: ForceJob) -> TrueForce:
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
     problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
-    result = solve(problem, steps=job.steps)
+    result = solve(problem, steps=job.steps, store="all" if job.ultrasound else "peak")
     if not result.completed:
         raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
     times = np.linspace(0.0, knots_s[-1], 401)
@@ -151,4 +157,9 @@ def site_force(job: ForceJob) -> TrueForce:
         "steps": int(result.statistics["steps"]),
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
-    return TrueForce(job.site, times, result.force_at(times), facts)
+    layers = {}
+    if job.ultrasound:
+        gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis))
+        lost, _ = compressions(result, replace(model, layers=tuple(g.region for g in gauges)), times)
+        layers = {one.region: (one.thickness_mm, row) for one, row in zip(gauges, lost, strict=True)}
+    return TrueForce(job.site, times, result.force_at(times), facts, layers)

@@ -6,7 +6,7 @@ and records a little longer. Its displacement counts from the start, not from to
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ RATE_HZ = 500.0
 AFTER_S = 0.4
 CLEARANCE_MM = (0.3, 0.6)
 FORCE_NOISE_N = (0.03, 0.05)
+ULTRASOUND_HZ, ULTRASOUND_NOISE_MM = 20.0, 0.1
 DISPLACEMENT_NOISE_MM = 0.005
 HEADER = "time_s,displacement_mm,force_N"
 
@@ -93,3 +94,25 @@ def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Genera
         touch_s=touch,
         force_noise=sd,
     )
+
+
+def write_ultrasound(
+    path: Path,
+    made: Record,
+    layers: Mapping[str, tuple[float, Callable[[Array], Array]]],
+    random: np.random.Generator,
+) -> None:
+    """Write what ultrasound through the indenter saw of a record: thickness of tissues, mm, at 20 Hz.
+
+    Parameters
+    ----------
+    layers : by tissue its thickness at rest, mm, and its compression, mm, at times (n,) from touch-down.
+    """
+    time = np.arange(0.0, made.time[-1], 1 / ULTRASOUND_HZ)
+    since = time - made.touch_s
+    columns = [time]
+    for thickness, compression in layers.values():
+        clean = thickness - np.where(since > 0.0, compression(np.maximum(since, 0.0)), 0.0)
+        columns.append(clean + ULTRASOUND_NOISE_MM * random.standard_normal(time.size))
+    header = ",".join(["time_s", *(f"{tissue}_mm" for tissue in layers)])
+    np.savetxt(path, np.column_stack(columns), fmt="%.3f", delimiter=",", header=header, comments="")

@@ -73,9 +73,14 @@ fitted = {fitted}
 trace = "traces/site-{name}.csv"
 near = [{x:.1f}, {y:.1f}, {z:.1f}]
 """
+_ULTRASOUND = """\
+ultrasound = "traces/site-{name}-layers.csv"   # thickness of the tissues under the indenter meanwhile
+"""
 
 
-def study_text(sites: Sequence[TrueSite], detail: str, seed: int, limb: Limb) -> str:
+def study_text(
+    sites: Sequence[TrueSite], detail: str, seed: int, limb: Limb, ultrasound: bool = False
+) -> str:
     """The content of ``study.toml`` for some sites of a limb."""
     head = _HEAD.format(
         seed=seed,
@@ -94,6 +99,8 @@ def study_text(sites: Sequence[TrueSite], detail: str, seed: int, limb: Limb) ->
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
+        if ultrasound:
+            parts.append(_ULTRASOUND.format(name=site.name))
     return "".join(parts)
 
 

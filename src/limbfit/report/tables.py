@@ -89,8 +89,8 @@ def correlation_table(store: Results) -> Table | None:
     )
     return Table(
         name="correlation",
-        caption="Correlation of the identified parameters. Near ±1 a pair cannot be told apart: "
-        "the data determine only a combination of the two.",
+        caption="Correlation of the identified parameters. Near ±1 the data determine only a "
+        "combination of the two.",
         head=("", *short),
         rows=rows,
     )

@@ -1,6 +1,6 @@
 """Indenter shapes by name: what a study may ask for in ``indenter.shape``.
 
-One class says everything of a shape.  One of one's own is registered by `register_shape`; see
+One class says everything of a shape.  Your own is registered by `register_shape`; see
 docs/extending.md.
 """
 

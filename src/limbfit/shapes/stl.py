@@ -1,4 +1,4 @@
-"""A closed triangle surface of one's own."""
+"""A closed triangle surface of your own."""
 
 from __future__ import annotations
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.surfacefiles import read_surface
-from ..anatomy.surfaces.surfaces import signed_distance
 from ..anatomy.surfaces.triangles import (
     Surface,
     bodies,
@@ -22,9 +21,10 @@ from ..anatomy.surfaces.triangles import (
     self_intersections,
 )
 from ..errors import SurfaceError
+from .bones import refuse_bones
 from .clearance import cleared
 from .rays import Rays, hits_of, profile
-from .shape import Socket, closed_by_fans
+from .shape import Socket
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -34,7 +34,6 @@ SMALLEST, LARGEST = 0.25, 3.0  # of the limb's length, end to end: otherwise ano
 LOOSE_SHARE = 0.01  # of the faces: pieces that hold less are left out
 DECIDED = 0.5  # mean cosine between normals and rays from which a side is certain
 WALL_SHARE = 0.15  # of the faces that another face hides, from which a closed surface is a wall
-INTO_BONE_MM = 0.5  # by which a bone may reach through the face: roughness
 
 
 def read_socket(
@@ -97,7 +96,14 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
             f"the socket crosses itself ({len(crossing)} pairs of faces)",
             remedy="remesh, smooth or repair it",
         )
-    _check_bones(face, brim, {name: frame.to_limb(bone.points) for name, bone in bones.items()})
+    refuse_bones(
+        frame.to_patient(face.points),
+        face.faces,
+        brim,
+        frame,
+        bones,
+        remedy="check its unit and its place on the limb; a socket is larger than the bones in it",
+    )
     clear = frame.to_patient(cleared(face.points, face.faces, limb, outer, frame))
     return Socket(frame.to_patient(face.points), face.faces, clear, brim, open_distal, tuple(notes))
 
@@ -213,18 +219,3 @@ def _without_ears(surface: Surface) -> Surface:
         if not (alone >= 2).any():
             return bodies(compacted(Surface(surface.points, faces)))[0]
         faces = faces[alone < 2]
-
-
-def _check_bones(face: Surface, brim: Ints, bones: Mapping[str, Array]) -> None:
-    closed = closed_by_fans(face.flipped)
-    lowest = float(face.points[brim, 2].min())
-    for name, points in bones.items():
-        below = points[points[:, 2] < lowest - INTO_BONE_MM]
-        if not len(below):
-            continue
-        out = float(signed_distance(closed, below).max())
-        if out > INTO_BONE_MM:
-            raise SurfaceError(
-                f"the socket cuts {out:.1f} mm into the bone {name}",
-                remedy="check its unit and its place on the limb; a socket is larger than the bones in it",
-            )

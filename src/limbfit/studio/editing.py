@@ -20,6 +20,7 @@ from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import AoT
 
 from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..errors import StudyError
@@ -122,6 +123,51 @@ def set_key(file: Path, table: str, key: str, value: Any) -> Study:
         _assign(document[table], {key: value})
 
     return edit_study(file, change)
+
+
+def set_area(file: Path, name: str, values: Mapping[str, Any]) -> Study:
+    """Change an area of ``[[socket.areas]]``, or add one of that name; None removes a key."""
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        rows = _areas(document)
+        known = next((row for row in rows if str(row.get("name")) == name), None)
+        if known is None:
+            known = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
+            _assign(known, {"name": name, **values})
+            rows.append(known)
+        else:
+            _assign(known, values)
+
+    return edit_study(file, change)
+
+
+def remove_area(file: Path, name: str) -> Study:
+    """Take an area out of the study file.
+
+    Raises
+    ------
+    StudyError
+        Where there is none of that name.
+    """
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        rows = _areas(document)
+        names = [str(row.get("name")) for row in rows]
+        if name not in names:
+            raise StudyError(f"no area is named {name!r}", file=file, place="socket.areas")
+        del rows[names.index(name)]
+
+    return edit_study(file, change)
+
+
+def _areas(document: tomlkit.TOMLDocument) -> Any:
+    """The list of areas, made where there is none."""
+    if "socket" not in document:
+        document["socket"] = tomlkit.table()
+    table: Any = document["socket"]
+    if "areas" not in table:
+        table["areas"] = tomlkit.aot()
+    return table["areas"]
 
 
 def _table_of(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:

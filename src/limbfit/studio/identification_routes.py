@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
 from ..pipeline.shared.simulations import newest_simulations
-from ..pipeline.stages.traces import read_curves
+from ..pipeline.shared.tabular import read_curves
 from ..study import Record
 from .folder import StudyFolder
 from .processes import running, start_run, starting, stop_run
@@ -38,7 +38,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
     """Stages, those of them that a run does, that run or the last one, iterates of the search, its answer."""
     study = folder.load()
     stages = stages_of_folder(folder)
-    logs = sorted((folder.results / "log").glob("*.jsonl"))
+    logs = _logs(folder)
     done = _answer(folder)
     run = running(folder)
     state = next(row for row in stages if row["stage"] == "calibrate")
@@ -47,7 +47,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "chain": [row["stage"] for row in stages if row["stage"] in STAGE_NAMES],
         "run": run,
         "starting": starting(folder) if run is None else None,
-        "last": _last(logs[-1], run is not None) if logs else None,
+        "last": last_run(folder, run is not None),
         "iterates": _iterates(folder, logs, state["state"], done),
         "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
@@ -129,13 +129,20 @@ def _iterates(
     return {"of": "answer" if done else "nothing", "rows": done.pop("iterates") if done else []}
 
 
-def _last(log: Path, is_running: bool) -> dict[str, Any]:
-    """The newest log: what it is of, how it ended, its newest progress and lines."""
-    events = _events(log)
+def _logs(folder: StudyFolder) -> list[Path]:
+    return sorted((folder.results / "log").glob("*.jsonl"))
+
+
+def last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
+    """The newest log, if any: what it is of, how it ended, its newest progress and lines."""
+    logs = _logs(folder)
+    if not logs:
+        return None
+    events = _events(logs[-1])
     progress = [row for row in events if row["event"] in ("progress", "fit")]
     end = _ENDS.get(events[-1]["event"]) if events else None
     if end is None:
-        end = "running" if is_running else "ended without a word: it was killed, or memory ran out"
+        end = "running" if is_running else "ended without a message: it was killed, or memory ran out"
     keys = ("stage", "done", "total", "text")
     return {
         "what": events[0].get("what") if events else None,

@@ -86,9 +86,11 @@ def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
     if shown is None:
         raise FileNotFoundError(LABELS)
     if running(folder) is not None:
-        raise RunError("a run of this study goes on; stop it or wait for it before labels are saved")
+        raise RunError("a run of this study is in progress; stop it or wait for it before labels are saved")
     if shown.digest != painting.base:
-        raise RunError("the labels have changed since they were opened here; open them anew and paint again")
+        raise RunError(
+            "the labels have changed since they were opened here; open them again and repeat the changes"
+        )
     labels = labels_of(shown)
     painted = paint(labels, painting.runs)
     changed = int((painted.array != labels.array).sum())

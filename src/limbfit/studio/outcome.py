@@ -12,7 +12,7 @@ from typing import Any
 from ..errors import InputError, RunError
 from ..pipeline import export_study
 from ..pipeline.shared.store import write_json
-from ..pipeline.stages.traces import read_curves
+from ..pipeline.shared.tabular import read_curves
 from ..study import Record
 from .folder import StudyFolder, stored
 from .study_routes import stages_of_folder

@@ -1,7 +1,7 @@
 """Runs of the study as processes of their own: started, found again after a restart, and stopped.
 
-A run is ``limbfit run STUDY``. Whether one runs is what the study's lock says, whoever started it; what it
-does is what its log says.
+A run is ``limbfit run STUDY``, or one of ``limbfit socket``. Whether one runs is what the study's lock says,
+whoever started it; what it does is what its log says.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ..study import load_study
 from .commands import PROGRAM, find_command, interrupt, start_command
 from .folder import StudyFolder
 
+VERBS = (("run",), ("socket", "fit"), ("socket", "design"))  # that are started here
 _HOLDER = re.compile(r"process (\d+) \(since ([^)]*)\)")
 
 
@@ -33,12 +34,12 @@ def running(folder: StudyFolder) -> dict[str, Any] | None:
 
 def starting(folder: StudyFolder) -> int | None:
     """The process that was started here for a run and does not hold the study yet; None where none is."""
-    found = find_command(_command(folder))
-    return None if found is None else found[0]
+    found = (find_command(_command(folder, *verb)) for verb in VERBS)
+    return next((one[0] for one in found if one is not None), None)
 
 
-def _command(folder: StudyFolder) -> list[str]:
-    return [*PROGRAM, "run", str(folder.file.resolve())]
+def _command(folder: StudyFolder, *verb: str) -> list[str]:
+    return [*PROGRAM, *verb, str(folder.file.resolve())]
 
 
 def start_run(
@@ -53,17 +54,29 @@ def start_run(
     RunError
         Where a run holds the study.
     """
-    load_study(folder.file)
-    holder = running(folder)
-    busy = starting(folder) if holder is None else holder["process"]
-    if busy is not None:
-        raise RunError(f"process {busy} is running this study; stop it first, or wait for it")
+    _refuse_busy(folder)
     for name in (until, start, *force):
         if name is not None and name not in STAGE_NAMES:
             raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
     options = [*(["--until", until] if until else []), *(["--from", start] if start else [])]
     options += [word for name in force for word in ("--force", name)]
-    return {"process": start_command([*_command(folder), *options], folder.folder)}
+    return {"process": start_command([*_command(folder, "run"), *options], folder.folder)}
+
+
+def start_socket(folder: StudyFolder, *, design: bool) -> dict[str, Any]:
+    """Start ``limbfit socket fit`` or ``limbfit socket design`` on the study; the errors of `start_run`."""
+    _refuse_busy(folder)
+    return {
+        "process": start_command(_command(folder, "socket", "design" if design else "fit"), folder.folder)
+    }
+
+
+def _refuse_busy(folder: StudyFolder) -> None:
+    load_study(folder.file)
+    holder = running(folder)
+    busy = starting(folder) if holder is None else holder["process"]
+    if busy is not None:
+        raise RunError(f"process {busy} is running this study; stop it first, or wait for it")
 
 
 def stop_run(folder: StudyFolder) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
     """
     found = simulating(folder)
     if found is None:
-        raise RunError("no simulation goes on: there is nothing to stop")
+        raise RunError("no simulation is running: there is nothing to stop")
     with suppress(psutil.NoSuchProcess):  # it has ended meanwhile
         interrupt(found["process"])
     return found

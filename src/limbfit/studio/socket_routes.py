@@ -1,27 +1,59 @@
-"""The routes of the view Socket: stored runs of ``limbfit socket`` and its designs, step by step."""
+"""The routes of the view Socket: the shape with its areas, and stored runs and designs, step by step."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import igl
 import numpy as np
 from fastapi import APIRouter, Response
+from pydantic import BaseModel, ConfigDict, Field
 
 from ..errors import InputError
 from ..mesh import read_vtu
-from ..pipeline.shared.socket_shape import regions_of
+from ..pipeline.shared.socket_shape import regions_of, socket_of
+from ..pipeline.shared.store import digest
+from ..socket import Socket
+from ..study import Study
 from ..web.arrays import pack
 from ..web.shapes import patient_frame, volume_of
+from .editing import remove_area, set_area
 from .folder import StudyFolder, fingerprint, stored
+from .identification_routes import last_run
+from .model_routes import Place, Text
 from .playback import arrays_of
-from .scene import anatomy_of
+from .processes import running, start_socket, starting
+from .scene import anatomy_of, on_skin
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/socket")
 SOCKET = "socket"  # the run of `limbfit socket`; others are designs, by their names
+NONE_YET = "there is no limb yet to draw a socket around: run the stages until surfaces"
 _FIELDS = {"pressure": "pressure_kPa", "shear": "shear_kPa"}
+Length = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class AreaOfPage(_Strict):
+    """An area of the page: at a ``position`` that was clicked, or at the middle of a ``region``."""
+
+    name: Text
+    position: Place | None = None
+    region: Text | None = None
+    radius_mm: Length
+    depth_mm: Length
+
+
+class WantedRun(_Strict):
+    """Which command to run: that of the socket, or its design."""
+
+    design: bool = False
 
 
 def runs_of(folder: StudyFolder) -> list[dict[str, Any]]:
@@ -94,3 +126,120 @@ def get_step(folder: Folder, run: str, step: int, field: str) -> Response:
 
 def _block(arrays: dict[str, Any], facts: dict[str, Any]) -> Response:
     return Response(pack(arrays, facts), media_type="application/octet-stream")
+
+
+def shape_of(folder: StudyFolder) -> dict[str, Any]:
+    """What ``[socket]`` says of the shape, and whether such a face can be drawn around the bare skin.
+
+    ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one,
+    ``mark``, which another face changes, ``problem`` in words or None, ``volume_cm3``.
+    """
+    study = folder.load()
+    table, anatomy = study.socket, anatomy_of(folder, study)
+    regions = {} if anatomy is None else regions_of(study, anatomy)
+    mark = _mark(folder, study)
+    found = _drawn(folder, mark)
+    drawn = isinstance(found, Socket)
+    return {
+        "file": None if table.file is None else table.file.name,
+        "reduction_percent": table.reduction_percent,
+        "areas": [
+            {
+                "name": area.name,
+                "position_mm": _place(area.position, area.region, regions),
+                "region": area.region,
+                "radius_mm": area.radius_mm,
+                "depth_mm": area.depth_mm,
+            }
+            for area in table.areas
+        ],
+        "regions": list(regions),
+        "mark": mark,
+        "problem": None if drawn else found,
+        "volume_cm3": found.volume_mm3 / 1000.0 if isinstance(found, Socket) else None,
+    }
+
+
+def _place(position: Any, region: str | None, regions: Mapping[str, Any]) -> list[float] | None:
+    if position is not None:
+        return [float(x) for x in position]
+    return [float(x) for x in regions[region].position] if region and region in regions else None
+
+
+def face_block(folder: StudyFolder) -> bytes:
+    """The face as a block of arrays: ``points`` (n, 3), ``faces`` (m, 3), ``values`` (n,): offset, mm.
+
+    Offsets are from the bare skin, negative where the face is pressed in.
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    study = folder.load()
+    found, anatomy = _drawn(folder, _mark(folder, study)), anatomy_of(folder, study)
+    if not isinstance(found, Socket) or anatomy is None:
+        raise InputError(found if isinstance(found, str) else NONE_YET)
+    arrays = {
+        "points": found.points.astype(np.float32),
+        "faces": found.faces.astype(np.uint32),
+        "values": (-found.offset(anatomy.skin)).astype(np.float32),
+    }
+    return pack(arrays, {})
+
+
+def _mark(folder: StudyFolder, study: Study) -> str:
+    """Changes with the limb's surfaces, the socket's file and what the table says of the shape."""
+    table, given = study.socket, study.surfaces
+    files = [folder.results / "surfaces" / "surfaces.json"]
+    files += [study.path(path) for path in (() if given is None else (given.skin, *given.bones.values()))]
+    files += [] if table.file is None else [study.path(table.file)]
+    return f"{fingerprint(files)} {digest(table.model_dump(mode='json', exclude={'design', 'loads'}))}"
+
+
+@lru_cache(maxsize=2)
+def _drawn(folder: StudyFolder, mark: str) -> Socket | str:
+    """The face around the bare skin, or why there is none; the last ones are kept, by their ``mark``."""
+    study = folder.load()
+    try:
+        anatomy = anatomy_of(folder, study)
+        return NONE_YET if anatomy is None else socket_of(study, anatomy, anatomy.skin)
+    except InputError as error:
+        return f"{error.what}; {error.remedy}" if error.remedy else error.what
+
+
+@router.get("/shape")
+def get_shape(folder: Folder) -> dict[str, Any]:
+    """What the study says of the shape, whether it can be drawn, and the run that goes on or begins."""
+    run = running(folder)
+    more = {"run": run, "starting": starting(folder), "last": last_run(folder, run is not None)}
+    return shape_of(folder) | more
+
+
+@router.get("/face")
+def get_face(folder: Folder) -> Response:
+    """The face with its offset from the bare skin; see `face_block`."""
+    return Response(face_block(folder), media_type="application/octet-stream")
+
+
+@router.post("/areas")
+def post_area(folder: Folder, area: AreaOfPage) -> dict[str, Any]:
+    """Add an area to the study file, or change the one of that name; the shape as it is afterwards."""
+    values = area.model_dump(exclude={"name"})
+    if area.position is not None:
+        values["position"] = on_skin(folder, area.position)
+    set_area(folder.file, area.name, values)
+    return shape_of(folder)
+
+
+@router.post("/areas/{name}/remove")
+def post_removal(folder: Folder, name: str) -> dict[str, Any]:
+    """Take an area out of the study file."""
+    remove_area(folder.file, name)
+    return shape_of(folder)
+
+
+@router.post("/start")
+def post_start(folder: Folder, wanted: WantedRun) -> dict[str, Any]:
+    """Start ``limbfit socket`` or ``limbfit socket design``, as a process of its own."""
+    return start_socket(folder, design=wanted.design)

@@ -27,7 +27,7 @@ class MaterialTable(TomlTable):
     """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
 
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).  ``fibres``: their direction in the tissues
-    that have some, a vector or that of the limb's axis.
+    that have some: a vector, that of the limb's axis, or a flow from the proximal cut to the bone's end.
     """
 
     law: str = OGDEN
@@ -36,7 +36,7 @@ class MaterialTable(TomlTable):
     lower: dict[str, Positive] = Field(default={})
     upper: dict[str, Positive] = Field(default={})
     tissues: dict[str, TissueRange] = Field(default={})
-    fibres: dict[str, Literal["axis"] | Vector] = Field(default={})
+    fibres: dict[str, Literal["axis", "flow"] | Vector] = Field(default={})
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -67,8 +67,8 @@ class MaterialTable(TomlTable):
     @classmethod
     def _directed(cls, fibres: dict[str, Any]) -> dict[str, Any]:
         for tissue, direction in fibres.items():
-            if direction != "axis" and not any(direction):
-                raise ValueError(f'{tissue}: a direction of no length; give [x, y, z] or "axis"')
+            if not any(direction):
+                raise ValueError(f'{tissue}: a direction of no length; give [x, y, z], "axis" or "flow"')
         return fibres
 
     @field_validator("kappa_ratio")

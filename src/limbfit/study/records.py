@@ -19,7 +19,8 @@ class _Stated(TomlTable):
 
     ``touch_down_s`` and ``peak_s`` are times of the record, where it is not to be left to limbfit to find
     them. ``indenter`` is a name in ``[indenters]``; None: the one of ``[indenter]``. ``control`` is what was
-    stated to the machine, and drives the model; the other is compared.
+    stated to the machine, and drives the model; the other is compared. ``ultrasound`` is a file of what
+    ultrasound through the indenter saw meanwhile: the thickness of tissues, read to ``ultrasound_sd_mm``.
     """
 
     name: str = Field(pattern=_NAME)
@@ -28,6 +29,8 @@ class _Stated(TomlTable):
     peak_s: float | None = None
     indenter: str | None = None
     control: Control = "displacement"
+    ultrasound: Path | None = None
+    ultrasound_sd_mm: Positive = 0.1
 
     @model_validator(mode="after")
     def _in_order(self) -> _Stated:
@@ -59,9 +62,9 @@ class Site(_Stated):
     def _one_place(self) -> Site:
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
-        for key in ("touch_down_s", "peak_s"):
+        for key in ("touch_down_s", "peak_s", "ultrasound"):
             if self.trace is None and getattr(self, key) is not None:
-                raise ValueError(f"{key} is a time of a record, and the site has no trace")
+                raise ValueError(f"{key} belongs to a record, and the site has no trace")
         return self
 
 
@@ -105,6 +108,13 @@ class Record:
     depth_mm: float | None = None  # how it is to be made
     speed_mm_s: float | None = None
     hold_s: float | None = None
+    ultrasound: Path | None = None
+    ultrasound_sd_mm: float = 0.1
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What was recorded: the trace, and what ultrasound saw meanwhile."""
+        return (self.trace,) if self.ultrasound is None else (self.trace, self.ultrasound)
 
     @property
     def forced(self) -> bool:
@@ -155,6 +165,8 @@ def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...
                 one.indenter,
                 one.control,
                 len(stated),
+                ultrasound=one.ultrasound,
+                ultrasound_sd_mm=one.ultrasound_sd_mm,
             )
             if isinstance(one, RecordTable):
                 depth, speed, hold = one.depth_mm, one.speed_mm_s, one.hold_s

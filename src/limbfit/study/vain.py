@@ -128,8 +128,8 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("calibration.force_error_percent",),
-        lambda s: not s.priors,
-        "it sets forces against priors, and there is none",
+        lambda s: not s.priors and not any(record.ultrasound for record in s.recorded),
+        "it sets forces against priors and ultrasound, and there is neither",
     ),
     Vain(
         ("calibration.prior_tissues",),
@@ -213,6 +213,7 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
         "the record says how fast the indenter was",
     ),
     VainOfSite("control", lambda s, site: site.trace is None, "it is of the site's trace, and there is none"),
+    VainOfSite("ultrasound_sd_mm", lambda s, site: site.ultrasound is None, "the site has no ultrasound"),
     VainOfSite(
         "indenter",
         lambda s, site: site.trace is None and bool(s.records_at(site)),

@@ -116,7 +116,7 @@ class Study(TomlTable):
         return LAWS[self.material.law]
 
     @property
-    def fibres(self) -> dict[str, Literal["axis"] | Vector]:
+    def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:
         """Direction of the fibres in the tissues that have some: the limb's axis in the core by default."""
         if self.material.law != FIBRED:
             return {}
@@ -209,6 +209,7 @@ class Study(TomlTable):
             **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
             **{f"{record.key}.trace": record.trace for record in self.recorded},
+            **{f"{record.key}.ultrasound": record.ultrasound for record in self.recorded},
         }
         if self.image is not None:
             named |= {"image.path": self.image.path, "image.markers": self.image.marked}
@@ -293,12 +294,15 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _forces_beside_depths(self) -> Study:
-        forced = [record.name for record in self.recorded if record.forced]
-        if forced and self.calibration.objective == "paper":
-            raise ValueError(
-                f'{forced[0]}: control = "force" compares depths, and objective = "paper" adds squares of '
-                'forces; use "pointwise"'
-            )
+        if self.calibration.objective != "paper":
+            return self
+        for record in self.recorded:
+            why = 'control = "force"' if record.forced else "ultrasound" if record.ultrasound else ""
+            if why:
+                raise ValueError(
+                    f'{record.name}: {why} compares depths, and objective = "paper" adds squares of '
+                    'forces; use "pointwise"'
+                )
         return self
 
     @model_validator(mode="after")
@@ -369,7 +373,7 @@ class Study(TomlTable):
     @model_validator(mode="after")
     def _one_door(self) -> Study:
         if (self.image is None) == (self.surfaces is None):
-            raise ValueError("give either [image] or [surfaces]: geometry enters by one door")
+            raise ValueError("give either [image] or [surfaces], not both")
         if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
             raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
         labelled = [one.name for one in self.geometry.regions if one.label is not None]

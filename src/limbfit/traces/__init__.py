@@ -5,12 +5,14 @@ order, at any rates and in several cycles (see `phases`). ``read_trace`` checks 
 or refuses it, ``find_touch_down`` tells where the skin was met, and ``regularise`` gives curves counted from
 there: piecewise straight for the displacement, a cubic smoothing spline for the force, each phase by itself
 so that the peak is not smoothed away (paper, section 2.1 and figure 3). Under a stated force it is the other
-way round (``regularise_creep``).
+way round (``regularise_creep``). Where ultrasound looked through the indenter, ``thinnings`` tell how the
+tissues under it gave way.
 
 Units: s, mm, N; force positive when pushing, displacement positive into the limb.
 """
 
 from .creep import Creep, regularise_creep
+from .layers import Layers, Thinning, read_layers, thinnings
 from .reading import read_trace
 from .record import COLUMNS, Trace, check_trace
 from .regularise import Regularised, regularise
@@ -20,16 +22,20 @@ from .understanding import Remark, Understood, understand
 __all__ = [
     "COLUMNS",
     "Creep",
+    "Layers",
     "Regularised",
     "Remark",
+    "Thinning",
     "TouchDown",
     "Trace",
     "Understood",
     "check_trace",
     "find_touch_down",
+    "read_layers",
     "read_trace",
     "regularise",
     "regularise_creep",
+    "thinnings",
     "touch_down_at",
     "understand",
 ]

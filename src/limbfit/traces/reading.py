@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +29,38 @@ def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Tra
         With the file, the row or column, and the remedy.
     """
     file = Path(path)
-    if not file.is_file():
-        raise TraceError("no such file", file=file)
-    read = _read_mat if file.suffix.lower() == ".mat" else _read_table
-    time, displacement, force = (np.asarray(c, dtype=np.float64) for c in read(file, columns))
-    trace = Trace(time, displacement, force)
+    found = read_columns(file, columns)
+    trace = Trace(*(found[name] for name in columns))
     check_trace(trace, columns=columns, file=file)
     return trace
 
 
-def _read_table(file: Path, columns: tuple[str, str, str]) -> list[Array]:
+def read_columns(
+    file: Path, columns: Sequence[str], wanted: Callable[[str], bool] = lambda name: False
+) -> dict[str, Array]:
+    """The named columns of a file that `read_trace` could read, and all others that are ``wanted``.
+
+    Raises
+    ------
+    TraceError
+        With the file, the row or column, and the remedy.
+    """
+    if not file.is_file():
+        raise TraceError("no such file", file=file)
+    read = _read_mat if file.suffix.lower() == ".mat" else _read_table
+    return {name: np.asarray(c, dtype=np.float64) for name, c in read(file, columns, wanted).items()}
+
+
+def _chosen(
+    known: Sequence[str], columns: Sequence[str], wanted: Callable[[str], bool], file: Path
+) -> list[str]:
+    """The columns to be read; those that are named must be there."""
+    for name in columns:
+        _column(known, name, file)
+    return [*columns, *(name for name in known if wanted(name) and name not in columns)]
+
+
+def _read_table(file: Path, columns: Sequence[str], wanted: Callable[[str], bool]) -> dict[str, Array]:
     with file.open("rb") as stream:
         if b"\0" in stream.read(4096):
             raise TraceError("not a text table", file=file, remedy="give CSV with one header line, or MAT")
@@ -51,16 +74,16 @@ def _read_table(file: Path, columns: tuple[str, str, str]) -> list[Array]:
     header = numbered[0][1]
     delimiter = max("\t;,", key=header.count)
     names = [name.strip().strip('"') for name in header.split(delimiter)]
-    places = [_column(names, name, file) for name in columns]
     cells = [(i, line.split(delimiter)) for i, line in numbered[1:]]
     if delimiter != ",":
         cells = [(i, [cell.replace(",", ".") for cell in row]) for i, row in cells]
-    return [_numbers(cells, place, names[place], file) for place in places]
+    chosen = _chosen(names, columns, wanted, file)
+    return {name: _numbers(cells, names.index(name), name, file) for name in chosen}
 
 
-def _column(names: list[str], name: str, file: Path) -> int:
+def _column(names: Sequence[str], name: str, file: Path) -> None:
     if name in names:
-        return names.index(name)
+        return
     shown = ", ".join(repr(n[:40]) for n in names[:8])
     raise TraceError(
         f"no column {name!r}; it has {shown}",
@@ -88,8 +111,8 @@ def _cell(row: list[str], place: int, file: Path, where: str) -> None:
         raise TraceError(f"{row[place].strip()[:40]!r} is not a number", file=file, place=where) from None
 
 
-def _read_mat(file: Path, columns: tuple[str, str, str]) -> list[Array]:
-    """Three variables, or three fields of one struct."""
+def _read_mat(file: Path, columns: Sequence[str], wanted: Callable[[str], bool]) -> dict[str, Array]:
+    """Variables, or fields of one struct."""
     try:
         sizes = {name: int(np.prod(shape)) for name, shape, _ in whosmat(file)}
         if sum(sizes.values()) > MAX_SAMPLES:
@@ -104,9 +127,8 @@ def _read_mat(file: Path, columns: tuple[str, str, str]) -> list[Array]:
     structs = [v for v in content.values() if isinstance(v, np.ndarray) and v.dtype.names and v.shape == ()]
     if columns[0] not in content and len(structs) == 1:
         content = {name: structs[0][name].item() for name in structs[0].dtype.names}
-    for name in columns:
-        _column(list(content), name, file)
-    return [_mat_vector(content[name], name, file) for name in columns]
+    chosen = _chosen(list(content), columns, wanted, file)
+    return {name: _mat_vector(content[name], name, file) for name in chosen}
 
 
 def _mat_vector(value: object, name: str, file: Path) -> Array:

@@ -1,6 +1,6 @@
 """Image files by their suffix: how each format is read, and what it must say of its place in the patient.
 
-A format of one's own is registered by `register_image_format`; see docs/extending.md.
+Your own format is registered by `register_image_format`; see docs/extending.md.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def _one_piece(labels: LabelMap, name: str) -> tuple[LabelMap, list[str]]:
         )
     stray = mask & (parts != int(np.argmax(sizes)) + 1)
     array = np.where(stray, labels.soft_value, labels.array)
-    said = f"{_pieces_text(len(sizes) - 1, stray, labels)} of {name!r} apart from the bone made soft tissue"
+    said = f"{_pieces_text(len(sizes) - 1, stray, labels)} of {name!r} apart from the bone became soft tissue"
     return labels.with_array(array), [said]
 
 

@@ -28,7 +28,7 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     offset = _offset(labels, like)
     if offset is None:
         raise LabelError(
-            "the label map is on another grid than the image",
+            "the label map is on a different grid from the image",
             file=path,
             remedy=f"image {_shape(like)}, labels {_shape(given)}: export it with the image as reference"
             " geometry",
@@ -36,7 +36,7 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     last = offset + np.array(labels.size)
     if np.any(offset < 0) or np.any(last > np.array(like.size)):
         raise LabelError(
-            "the label map is on another grid than the image: labelled voxels lie outside the image",
+            "the label map is on a different grid from the image: labelled voxels lie outside the image",
             file=path,
             remedy="give the image that was labelled, or export the labels with it as reference geometry",
         )

@@ -222,12 +222,12 @@ def _meshed(
 
 
 def _adapted(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
-    """The core, graded; a mesher that fails does so, as a rule, where what it was given is flattest."""
+    """The core, graded; a mesher that fails does so, as a rule, where its input is flattest."""
     try:
         return ENGINES[settings.engine](task, settings.time_limit_s)
     except MesherError as error:
         where = narrowest(task.points, task.tets, fields)
-        raise MeshingError(f"{error}; what it was given is flattest {where}") from None
+        raise MeshingError(f"{error}; its input is flattest {where}") from None
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:

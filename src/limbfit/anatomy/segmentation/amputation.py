@@ -123,7 +123,7 @@ def _check_direction(labels: LabelMap, normal: Array) -> None:
     if angle > 180 - _MOST_OBLIQUE_DEG:
         raise LabelError(
             "the normal of the amputation plane points distally",
-            remedy="turn it round: it points to what is kept",
+            remedy="reverse it: it points to the part that is kept",
         )
     if angle > _MOST_OBLIQUE_DEG:
         raise LabelError(

@@ -55,7 +55,7 @@ def limb_axis(volume: Volume) -> int:
     """The grid axis (0, 1, 2 for i, j, k) along which the limb is longest."""
     tissue = _largest(volume.array > _otsu(volume.array))
     if tissue.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
-        raise ImageError("no limb is to be seen in the image", remedy="check the series and its contrast")
+        raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
     return longest_axis(tissue, volume)
 
 
@@ -70,7 +70,7 @@ def limb_mask(volume: Volume, smooth: Field) -> Mask:
     rough = _largest(smooth > _TISSUE * tissue)
     rough = _largest(without_supports(_solid(rough, volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
-        raise ImageError("no limb is to be seen in the image", remedy="check the series and its contrast")
+        raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
     size = 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 1
     half = 0.5 * grey_dilation(smooth, size=tuple(size))
     core = binary_erosion(rough, ball(_RIM_MM, volume.spacing), border_value=1)

@@ -100,7 +100,7 @@ def _sample(image: Volume, limb: NDArray[np.bool_]) -> Array:
     border = _BORDER_MM / image.spacing
     inside = ((voxels > border) & (voxels < np.array(image.size) - 1 - border)).all(axis=1)
     if not inside.any():
-        raise ImageError("no limb is to be seen in the image", remedy="check the series and its contrast")
+        raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
     voxels = voxels[inside]
     chosen = voxels[random.choice(len(voxels), min(_SAMPLES, len(voxels)), replace=False)]
     return chosen + random.uniform(-0.5, 0.5, chosen.shape)

@@ -9,13 +9,14 @@ by ``hardness`` times the penalty of the contact, so the width in which sticking
 
 A point is anchored where it is at the end of the step in which it first touched; the anchor of one that slips
 follows it at the distance of the bound (return mapping, Wriggers 2006, chapter 5.2).  So what sticks does not
-creep, however many steps it is held for.
+creep, however many steps it is held for.  `StepwiseCoulomb` is the other law, that of FEBio's
+``sliding-elastic``: slip counts from the start of the step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Coulomb(Grip):
     lags: ClassVar[bool] = True
 
     @classmethod
-    def none(cls, mu: float, surface: ContactSurface, parameters: int = 0, hardness: float = 1.0) -> Coulomb:
+    def none(cls, mu: float, surface: ContactSurface, parameters: int = 0, hardness: float = 1.0) -> Self:
         shape = surface.areas.shape
         nothing, vectors = np.zeros(shape), np.zeros((*shape, 3))
         return cls(nothing > 0.0, vectors, vectors, nothing, np.zeros((*shape, 3, parameters)), mu, hardness)
@@ -46,7 +47,7 @@ class Coulomb(Grip):
         """Planes and bounds as they are where the tool is."""
         return self._at(Distances.of(tool, self.held))
 
-    def _at(self, near: Distances) -> Coulomb:
+    def _at(self, near: Distances) -> Self:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
         normals.reshape(-1, 3)[near.points] = near.normals
         bounds.ravel()[near.points] = self.mu / self.hardness * np.maximum(-near.gaps, 0.0) * near.steepness
@@ -93,6 +94,32 @@ class Coulomb(Grip):
         yielding += slip.share * (turned - slip.unit[..., None] * along)
         found = np.where(slip.stuck[..., None, None], turned, yielding)
         return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)
+
+
+@dataclass(frozen=True)
+class StepwiseCoulomb(Coulomb):
+    """`Coulomb` with every point anchored where it was at the end of the last step, in touch or not.
+
+    Friction is that of the slip in one step: what sticks slips on by a little in every step, as the force
+    that held it is not carried along, and a point rubs in the step in which it first touches.  So forces
+    depend on the steps.  This is the law of FEBio's ``sliding-elastic`` with ``laugon`` PENALTY (FEBio 4,
+    ``FESlidingElasticInterface``).
+    """
+
+    def begun(self, tool: Tool) -> StepwiseCoulomb:
+        """Every point where it is at rest."""
+        return self.after(tool, None)
+
+    def after(self, tool: Tool, du: Array | None) -> StepwiseCoulomb:
+        """Every point where it is at the end of a step."""
+        places, d_places = tool.local, self.d_places if du is None else tool.moved(du)
+        return replace(self, held=np.ones_like(self.held), places=places, d_places=d_places)._at(
+            Distances.of(tool, np.ones_like(self.held))
+        )
+
+
+# How long a point that sticks keeps its anchor: until it slips, or for one step.
+LAWS_OF_STICKING: dict[str, type[Coulomb]] = {"anchored": Coulomb, "stepwise": StepwiseCoulomb}
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,10 @@ class Grip(ABC):
         """The grip without derivatives, to be kept."""
         return replace(self, d_places=np.zeros((*self.held.shape, 3, 0)))
 
+    def begun(self, tool: Tool) -> Grip:
+        """The grip before the first step, with the tool where it starts."""
+        return self
+
     @abstractmethod
     def renewed(self, tool: Tool) -> Grip:
         """The grip that an equilibrium with the tool where it is asks for; itself where it holds."""

@@ -3,8 +3,9 @@
 The energy is that of `materials.fibred` with ``I = J^(-2/3) |F a|^2`` of the fibre along ``a``.  With
 ``T = dW/de`` and ``T' = dT/de`` of ``e = ln(I)/2``, and the fibre's present direction ``m``, its Kirchhoff
 stress is ``T D`` with ``D = m m - 1/3``, its moduli are ``T' D D - 2 T m m m m + 2/3 T`` times the symmetric
-identity.  The parts along the identity are taken into the principal stresses, from which `response` makes
-stress and moduli; with ``F^-1 m`` in the place of ``m`` the same are the material ones.
+identity.  An active stress is added to ``T`` (`materials.contractile`).  The parts along the identity are
+taken into the principal stresses, from which `response` makes stress and moduli; with ``F^-1 m`` in the place
+of ``m`` the same are the material ones.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ..lanes import COMPILED, LANES, exponential
+from ..lanes import COMPILED, LANES, exponential, logarithm
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 
@@ -37,7 +38,9 @@ def pull(p, law):  # type: ignore[no-untyped-def]
         grown = exponential(s)
         more = 2.0 * isochoric * longer * grown
         p.energy[l] += 0.5 * k1 * ((grown - 1.0) / k2 if s > 1e-8 else longer * longer * (1.0 + 0.5 * s))
-        p.pull[l] = k1 * more
+        active = law.fibre[2, l]
+        p.energy[l] += active * 0.5 * logarithm(isochoric)
+        p.pull[l] = k1 * more + active
         slope = 4.0 * k1 * isochoric * grown * (longer + isochoric * (1.0 + 2.0 * s))
         p.pull_slope[l] = slope if longer > 0.0 else 0.0
         p.pull_rates[0, l], p.pull_rates[1, l] = more, k1 * more * longer * longer

@@ -19,7 +19,8 @@ class Laws:
     """Materials of all regions as padded arrays; see `LawTable`; ``moduli (r,)`` are instantaneous, MPa.
 
     ``elastic (r, 2)``: addresses of each region's elastic law in this process.  ``parameter_index (r, p)``
-    says which global parameter each region's p-th one is (-1: none).
+    says which global parameter each region's p-th one is (-1: none).  ``fibre (r, 3)``: k1 and active stress
+    (MPa) and, between them, k2; ``d_fibre (r, p, 3)``.
     """
 
     numbers: Array
@@ -38,13 +39,22 @@ class Laws:
 
     @property
     def tables(self) -> Tables:
-        """``numbers (r, k), kappa (r,), law (r,), elastic (r, 2), fibre (r, 2)``, as kernels take them."""
-        return self.numbers, self.kappa, self.law, self.elastic, self.fibre
+        """``numbers (r, k), kappa (r,), law (r,), elastic (r, 2), fibre (r, 3)``, as kernels take them: of
+        the elastic stress alone, with no active stress in the last column of ``fibre``."""
+        return self.acting(0.0, np.ones(len(self.kappa)))
+
+    def acting(self, share: float, scale: Array) -> Tables:
+        """`tables` with a ``share`` of the active stress, which kernels multiply by ``scale (r,)``, as all
+        that is elastic."""
+        active = share * self.fibre[:, 2]
+        active = np.divide(active, scale, out=np.zeros_like(active), where=active != 0.0)
+        fibre = np.column_stack([self.fibre[:, :2], active])
+        return self.numbers, self.kappa, self.law, self.elastic, fibre
 
     @property
     def fibred(self) -> bool:
         """Whether a region has fibres."""
-        return bool((self.fibre[:, 0] > 0.0).any())
+        return bool((self.fibre[:, ::2] > 0.0).any())
 
     @property
     def modulus(self) -> float:
@@ -66,13 +76,13 @@ class Laws:
         # What is left over is an Ogden term, or a relaxation, of no size.
         numbers, prony = np.tile([0.0, 1.0], (R, K))[:, :K], np.tile([0.0, 1.0], (R, L, 1))
         d_numbers, d_prony, d_kappa = np.zeros((R, P, K)), np.zeros((R, P, L, 2)), np.zeros((R, P))
-        d_fibre = np.zeros((R, P, 2))
+        d_fibre = np.zeros((R, P, 3))
         index, at = np.full((R, P), -1), 0
         for r, (table, slope) in enumerate(zip(tables, slopes)):
             numbers[r, : len(table.numbers)], prony[r, : len(table.prony)] = table.numbers, table.prony
             for p, d in enumerate(slope):
                 d_numbers[r, p, : len(d.numbers)], d_prony[r, p, : len(d.prony)] = d.numbers, d.prony
-                d_kappa[r, p], d_fibre[r, p] = d.kappa, d.fibre
+                d_kappa[r, p], d_fibre[r, p] = d.kappa, (*d.fibre, d.active)
                 index[r, p] = at
                 at += 1
         moduli = np.array([m.instantaneous_modulus for m in materials])
@@ -82,5 +92,5 @@ class Laws:
         elastic = np.array([t.elastic.addresses for t in tables], dtype=np.int64)
         return cls(
             np.ascontiguousarray(numbers), kappa, law, elastic, prony, d_numbers, d_kappa, d_prony, index,
-            moduli, gradient, np.array([t.fibre for t in tables], dtype=float), d_fibre,
+            moduli, gradient, np.array([(*t.fibre, t.active) for t in tables]), d_fibre,
         )  # fmt: skip

@@ -35,7 +35,7 @@ def elastic_response(elements, start, tables, u, points, law, numbers):  # type:
         if len(fibres):
             for i in range(3):
                 law.along[i, l] = fibres[el, i]
-            law.fibre[0, l], law.fibre[1, l] = fibre[region, 0], fibre[region, 1]
+                law.fibre[i, l] = fibre[region, i]
         for q in range(points.shape[0]):
             deform(points[q], l, cells[el], grads[el, q], u)
     for q in range(points.shape[0]):

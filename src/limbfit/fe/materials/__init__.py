@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .contractile import Contractile
 from .elastic import ElasticLaw, lane_function, mean_exponential
 from .fibred import Fibred
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenQLV
@@ -12,6 +13,7 @@ from .volumetric import VOLUMETRIC_LAWS
 __all__ = [
     "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
+    "Contractile",
     "ElasticLaw",
     "Fibred",
     "LawTable",

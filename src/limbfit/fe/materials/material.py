@@ -32,7 +32,7 @@ class LawTable:
 
     ``numbers (k,)``: what the ``elastic`` law is given; ``kappa``: bulk modulus (MPa);
     ``prony (l, 2)``: amplitudes and relaxation times (s); ``volumetric``: code of the law; ``fibre``: k1
-    (MPa) and k2 of its fibres, k1 = 0 without.
+    (MPa) and k2 of its fibres, k1 = 0 without; ``active``: their stress at full activation (MPa).
     """
 
     numbers: Array
@@ -41,6 +41,12 @@ class LawTable:
     volumetric: int = 0
     elastic: ElasticLaw = OGDEN
     fibre: tuple[float, float] = (0.0, 1.0)
+    active: float = 0.0
+
+    @property
+    def has_fibres(self) -> bool:
+        """Whether the direction of its fibres matters."""
+        return self.fibre[0] > 0.0 or self.active > 0.0
 
     @property
     def has_terms(self) -> bool:
@@ -58,7 +64,7 @@ class LawTable:
         """
         if not self.has_terms:
             raise ProblemError(
-                "the tissue's law is no sum of Ogden terms, and other programs know none else",
+                "the tissue's law is not a sum of Ogden terms, and other programs know no other",
                 remedy="use one of Ogden terms there",
             )
         return self.numbers.reshape(-1, 2)

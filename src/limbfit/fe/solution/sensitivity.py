@@ -71,7 +71,8 @@ class MemoryDerivative:
         """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
         bends = laws.d_numbers.any(axis=2)  # parameters of the elastic law
         by_kappa = laws.d_kappa / laws.kappa[:, None]
-        derivatives = laws.d_numbers, bends, by_kappa, laws.parameter_index, laws.d_fibre
+        d_fibre = laws.d_fibre * [1.0, 1.0, increment.activation]
+        derivatives = laws.d_numbers, bends, by_kappa, laws.parameter_index, d_fibre
         coefficients = _step_coefficients(laws, dt, memory.duration)
         past = memory.elastic if memory.before is None else memory.before
         elastic, stress = np.zeros_like(self.elastic), np.empty_like(memory.elastic)
@@ -247,8 +248,9 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
                         rate += d_fibre[region, j, 1] * at.pull_rates[1, l]
                         for t in range(6):
                             x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
-                            dyad = at.fibre_at_rest[x, l] * at.fibre_at_rest[y, l]
-                            part[t] += rate * (dyad - inverse[t] / 3.0)
+                            along = at.fibre_at_rest[x, l] * at.fibre_at_rest[y, l] - inverse[t] / 3.0
+                            part[t] += rate * along
+                            S[t, p] += d_fibre[region, j, 2] * along
                     d_JU = d_kappa[region, j] * at.pressure[l]
                     for t in range(6):
                         total = scale[region] * part[t] + d_JU * inverse[t]

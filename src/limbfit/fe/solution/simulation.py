@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact.friction import Coulomb
+from ..contact.friction import LAWS_OF_STICKING
 from ..contact.grip import Grip
 from ..contact.sticky import Anchors
 from ..history import Memory, elastic_stresses
@@ -90,7 +90,8 @@ class Simulation:
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
         self.rest = self._coordinates(rest, drives)
         start = problem.history.displacement_at(0.0)
-        self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives)]
+        self.grips = _begun(self.system, self.grips, rest, drives)
+        self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
         self.reason = ""
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
@@ -147,6 +148,7 @@ class Simulation:
             )
             increment = replace(
                 increment, grips=self.grips, flat_from=STEEP_PRESSURE / stiffness, pressures=pressures,
+                activation=self.problem.activated(t),
                 rims=self.system.pressures.rims(self.states[-1].rows, pressures) if pressures else 0.0,
             )  # fmt: skip
             control = replace(
@@ -275,7 +277,9 @@ class Simulation:
         if self.problem.history.forced:
             displacement = float(coordinates[0, 2])
             deepening = None if du is None else du[self.system.nodes, 2]
-        state = self._state(increment.time, displacement, u, stiffness, du, after.turned(), increment.drives)
+        state = self._state(
+            increment.time, displacement, u, stiffness, du, after.turned(), increment.drives, increment.grips
+        )
         self.states = [*self.states[-2:], state]
         if found.residual > self.control.tolerance:
             self.unbalanced.append((displacement, found.residual))
@@ -296,12 +300,15 @@ class Simulation:
 
     def _state(
         self, time: float, displacement: float, u: Array, stiffness: float, du: Array | None,
-        memory: Memory | None, drives: Drives,
+        memory: Memory | None, drives: Drives, holding: Sequence[Grip | None],
     ) -> State:  # fmt: skip
         n = self.system.nodes
         slopes = (None, None) if du is None else (du[:n], du[n:])
-        grips = tuple(grip and grip.bare() for grip in self.grips)
-        return State(time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives, grips)
+        grips = tuple(grip and grip.bare() for grip in holding)
+        return State(
+            time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives, grips,
+            self.problem.activated(time),
+        )  # fmt: skip
 
     def _turns(self, t: float, force: float) -> bool:
         """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
@@ -373,8 +380,15 @@ def _grips(system: System, parameters: int) -> tuple[Grip | None, ...]:
         elif isinstance(friction, str):
             found.append(Anchors.none(body.surface, parameters))
         else:
-            found.append(Coulomb.none(float(friction), body.surface, parameters, body.stated.holding))
+            law = LAWS_OF_STICKING[body.stated.sticking]
+            found.append(law.none(float(friction), body.surface, parameters, body.stated.holding))
     return tuple(found)
+
+
+def _begun(system: System, grips: Sequence[Grip | None], u: Array, drives: Drives) -> tuple[Grip | None, ...]:
+    """The grips with which a run begins, its bodies at rest where they start."""
+    tools = [] if system.bodies is None else system.bodies.tools(u, drives)
+    return tuple(grip and grip.begun(tool) for grip, tool in zip(grips, tools, strict=True))
 
 
 def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:

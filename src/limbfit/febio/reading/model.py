@@ -69,6 +69,11 @@ class Contact:
         """Whether it has a penalty of FEBio's; augmented and nodal contact are limbfit's own."""
         return not self.augmented and self.rule != "sliding-node-on-facet"
 
+    @property
+    def sticking(self) -> str:
+        """The law by which it sticks, as in `limbfit.Problem`."""
+        return "stepwise" if self.rule == "sliding-elastic" else "anchored"
+
     def acts_as(self, other: Contact) -> bool:
         """Whether both have one law, wherever they act."""
         return replace(self, surfaces=other.surfaces, line=other.line) == other
@@ -125,7 +130,7 @@ def read_feb(path: str | Path) -> FebModel:
     try:
         version = root.attributes.get("version", "")
         if root.tag != "febio_spec" or version.partition(".")[0] not in ("3", "4"):
-            raise root.refuse("is no input of FEBio 3 or 4", "save it anew with FEBio Studio 2")
+            raise root.refuse("is not an input of FEBio 3 or 4", "save it again with FEBio Studio 2")
         return _model(root)
     except ProblemError as error:
         raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None

@@ -46,12 +46,12 @@ class NoiseModel:
         if not (self.sensor_N >= 0 and self.misfit >= 0 and 0 <= self.correlation < 1):
             raise CalibrationError("a noise model has standard deviations >= 0 and a correlation below 1")
         if self.sensor_N == 0 and self.misfit == 0:
-            raise CalibrationError("a design needs some noise: without any, one site tells everything")
+            raise CalibrationError("a design needs some noise: without any, one site determines everything")
 
     def row(self, force_N: Array) -> Array:
         """First row (n,) of the covariance (Toeplitz) of a record."""
         n = len(force_N)
-        drift = (self.misfit * float(force_N.max())) ** 2 * self.correlation ** np.arange(n)
+        drift = (self.misfit * float(np.abs(force_N).max())) ** 2 * self.correlation ** np.arange(n)
         drift[0] += self.sensor_N**2
         return np.asarray(drift, dtype=np.float64)
 
@@ -77,9 +77,14 @@ def candidate(
     """
     if not response.completed:
         raise CalibrationError(f"{site}, {depth_mm:g} mm: {response.reason or 'simulation failed'}")
+    return Candidate(site, depth_mm, information_of(response, parameters, noise))
+
+
+def information_of(response: SiteResponse, parameters: Array, noise: NoiseModel) -> Array:
+    """Fisher information (p, p) on log(parameters) of a simulated response."""
     scaled = response.jacobian * parameters
     information = scaled.T @ solve_toeplitz(noise.row(response.force_N), scaled)
-    return Candidate(site, depth_mm, (information + information.T) / 2)
+    return np.asarray((information + information.T) / 2)
 
 
 def prior_information(unknowns: Unknowns) -> Array:

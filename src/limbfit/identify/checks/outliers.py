@@ -341,8 +341,8 @@ def flag_of(found: LeftOut, of: str = "N") -> Flag:
         "cooks_distance": found.cook,
     }
     what = (
-        f"predicted from the other sites it is off by {100 * found.error:.0f} % of its peak, "
-        f"{found.standardised:.1f} times what other sites are (measured {found.ratio:.2f} times predicted)"
+        f"predicted from the other sites, it is off by {100 * found.error:.0f} % of its peak, "
+        f"{found.standardised:.1f} times as much as they are (measured {found.ratio:.2f} times predicted)"
     )
     unit = unit_of(found.ratio) if of == "N" else ""
     if unit:

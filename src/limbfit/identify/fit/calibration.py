@@ -295,9 +295,7 @@ class _Run:
             (cost, failures), (now, failed) = track[-1 - _PATIENCE :][0], track[-1]
             # Small steps after failures tell of the failures, not of the data.
             if len(track) > _PATIENCE and now > least * cost and failed == failures:
-                return (
-                    f"{_PATIENCE} steps hardly lowered the error: the data do not tell these parameters apart"
-                )
+                return f"{_PATIENCE} steps hardly lowered the error: the data do not separate the parameters"
             return ""
 
         return stop

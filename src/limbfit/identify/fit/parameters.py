@@ -100,7 +100,7 @@ class Unknowns:
         for prior in self.priors:
             if prior.name not in self.names:
                 remedy = f"use {', '.join(self.names)}"
-                raise ProblemError(f"a prior of {prior.name!r}, which is no parameter", remedy=remedy)
+                raise ProblemError(f"a prior of {prior.name!r}, which is not a parameter", remedy=remedy)
         for name, low, start, high in zip(self.names, self.lower, self.start, self.upper, strict=True):
             if not 0 < low <= start <= high or low == high:
                 what = f"needs 0 < lower <= start <= upper, has {low:g}, {start:g}, {high:g}"

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 FIRST_RADIUS = 1.0
 NO_CHANGE = "the forces would hardly change"
-AT_THE_FLOOR = "the error falls by no more than the simulations can tell"
+AT_THE_FLOOR = "the error falls by no more than the noise of the simulations"
 _LARGEST_RADIUS = 2.0
 _MAX_REJECTED = 8
 # Directions that the data hardly see are not followed: relative to the residual, in units of z.

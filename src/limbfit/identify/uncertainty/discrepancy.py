@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky, eigh, solve_triangular
 from scipy.optimize import minimize
 
 from .noise import SiteNoise
@@ -35,11 +35,12 @@ def matern(times_s: Array, correlation: float) -> Array:
 
 @dataclass(frozen=True)
 class ResidualModel:
-    """Covariance of the residuals, site by site: noise of the record, error of the mesh, the model's misfit.
+    """Covariance of the residuals: noise of each record, its misfit of the model, and what records share.
 
-    ``mesh_N`` (n,) per site is one standard deviation of the mesh's error, none where it was not measured;
-    ``misfit`` (sites,) is the standard deviation of the misfit over the largest force ``peaks_N`` (sites,).
-    ``known_scale`` is the number of independent residuals on which the size of the misfit rests.
+    ``mesh_N`` (n,) per record is one standard deviation of the mesh's error, none where it was not measured:
+    the records of one of the ``sites`` (records,) have one mesh, whose error is one deviation of them all.
+    ``misfit`` (records,) is the standard deviation of the misfit over the largest force ``peaks_N``
+    (records,). ``known_scale`` is the number of independent residuals on which the size of the misfit rests.
     """
 
     noise: tuple[SiteNoise, ...]
@@ -49,11 +50,16 @@ class ResidualModel:
     known_scale: float
     criterion: float = field(default=0.0, repr=False)
     mesh_N: tuple[Array, ...] = ()
+    sites: tuple[str, ...] = ()
 
     @property
     def misfit_elsewhere(self) -> float:
-        """Misfit to expect at a site that was not fitted, over its largest force: root mean square."""
-        return float(np.sqrt(np.mean(self.misfit**2)))
+        """Misfit to expect at a site that was not fitted, over its largest force: root mean square.
+
+        Of records of forces, where there are any: depths may be small, and as much the larger is their share.
+        """
+        of_force = np.array([noise.unit == "N" for noise in self.noise])
+        return float(np.sqrt(np.mean(self.misfit[of_force if of_force.any() else ~of_force] ** 2)))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like values; forces in N (depths of a record under force in mm), misfits over the largest."""
@@ -81,18 +87,39 @@ class ResidualModel:
         """Root mean square of the mesh's error over the largest force of site i; None where not measured."""
         return float(np.sqrt(np.mean(self.mesh_N[i] ** 2)) / self.peaks_N[i]) if self.mesh_N else None
 
-    def known(self, i: int) -> Array:
-        """Covariance (n, n) of what is known beside the misfit of site i: noise, and error of the mesh."""
-        noise = self.noise[i].covariance
-        return noise + np.outer(self.mesh_N[i], self.mesh_N[i]) if self.mesh_N else noise
+    @property
+    def shared(self) -> tuple[Array, ...]:
+        """What records have in common, per record (n, q): one standard deviation of each of q deviations."""
+        of = self.sites or tuple(noise.name for noise in self.noise)
+        places = list(dict.fromkeys(of)) if self.mesh_N else []
+        found = [np.zeros((len(noise.times_s), len(places))) for noise in self.noise]
+        for mesh, site, columns in zip(self.mesh_N, of, found):
+            columns[:, places.index(site)] = mesh
+        return tuple(found)
+
+    def own(self, i: int) -> Array:
+        """Covariance (n, n) of what record i shares with no other: its noise and its misfit."""
+        return self.noise[i].covariance + self.discrepancy(i)
+
+    def solve(self, rows: Sequence[Array]) -> list[Array]:
+        """The inverse of the covariance of all records times ``rows`` (n, k) of each, record by record."""
+        factors = [cho_factor(self.own(i)) for i in range(len(self.noise))]
+        found = [cho_solve(factor, one) for factor, one in zip(factors, rows, strict=True)]
+        shared = self.shared
+        if not shared[0].shape[1]:
+            return found
+        known = [cho_solve(factor, one) for factor, one in zip(factors, shared)]
+        inner = np.eye(shared[0].shape[1]) + sum(E.T @ K for E, K in zip(shared, known))
+        amount = np.linalg.solve(inner, sum(E.T @ one for E, one in zip(shared, found)))
+        return [one - K @ amount for one, K in zip(found, known)]
 
     def discrepancy(self, i: int) -> Array:
-        """Covariance (n, n) of the misfit of site i."""
+        """Covariance (n, n) of the misfit of record i."""
         return (self.misfit[i] * self.peaks_N[i]) ** 2 * matern(self.noise[i].times_s, self.correlation)
 
     def covariance(self, i: int) -> Array:
-        """Covariance (n, n) of the residuals of site i."""
-        return self.known(i) + self.discrepancy(i)
+        """Covariance (n, n) of the residuals of record i."""
+        return self.own(i) + self.shared[i] @ self.shared[i].T
 
     def at(self, times_s: Array, peak_N: float) -> Array:
         """Covariance (n, n) of the misfit at another site."""
@@ -108,20 +135,21 @@ class ResidualModel:
         return total
 
     def spectra(self) -> tuple[Spectrum, ...]:
-        return tuple(Spectrum.of(self.known(i), self.discrepancy(i)) for i in range(len(self.noise)))
+        """Of each record, without what it shares with others."""
+        return tuple(Spectrum.of(noise.covariance, self.discrepancy(i)) for i, noise in enumerate(self.noise))
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A site's residuals in coordinates in which what is known has variance 1 and misfit ``values`` (n,)."""
+    """A record's residuals in coordinates in which noise has variance 1 and misfit ``values`` (n,)."""
 
     transform: Array
     values: Array
-    log_determinant: float  # of what is known
+    log_determinant: float  # of the noise
 
     @classmethod
-    def of(cls, known: Array, misfit: Array) -> Spectrum:
-        L = cholesky(known, lower=True)
+    def of(cls, noise: Array, misfit: Array) -> Spectrum:
+        L = cholesky(noise, lower=True)
         inner = solve_triangular(L, solve_triangular(L, misfit, lower=True).T, lower=True)
         values, vectors = eigh((inner + inner.T) / 2)
         transform = solve_triangular(L, vectors, lower=True, trans="T").T
@@ -135,16 +163,20 @@ def estimate_discrepancy(
     peaks_N: Array,
     precision: Array,
     mesh_N: Sequence[Array] = (),
+    sites: Sequence[str] = (),
 ) -> ResidualModel:
-    """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per site.
+    """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per record.
 
     Derivatives are with respect to the logarithms of the parameters, ``precision`` (p, p) is what is known of
-    them beforehand, ``mesh_N`` (n,) per site the error of the mesh. Misfits of sites are alike within a
-    factor of about two unless residuals say otherwise.
+    them beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one of the ``sites``
+    (by default each its own) have in common. Misfits are alike within a factor of about two unless residuals
+    say otherwise.
     """
     best: tuple[float, Array, float, _Rows] | None = None
     unit = np.ones(len(noise))
-    model = ResidualModel(tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0, mesh_N=tuple(mesh_N))
+    model = ResidualModel(
+        tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0, mesh_N=tuple(mesh_N), sites=tuple(sites)
+    )
     start = np.array([_first_guess(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
     for correlation in CORRELATIONS:
         rows = _Rows(residuals, jacobians, replace(model, correlation=correlation), precision)
@@ -170,7 +202,10 @@ def _first_guess(residual: Array, noise: SiteNoise, peak: float) -> float:
 
 
 class _Rows:
-    """All sites in coordinates in which ``unit``, with misfits of the largest forces, is diagonal."""
+    """All records in coordinates in which ``unit``, with misfits of the largest forces, is diagonal.
+
+    What records share counts as further unknowns, known beforehand to one standard deviation.
+    """
 
     def __init__(
         self, residuals: Sequence[Array], jacobians: Sequence[Array], unit: ResidualModel, precision: Array
@@ -179,8 +214,9 @@ class _Rows:
         self.site = np.concatenate([np.full(len(s.values), i) for i, s in enumerate(spectra)])
         self.values = np.concatenate([s.values for s in spectra])
         self.residual = np.concatenate([s.transform @ r for s, r in zip(spectra, residuals)])
-        self.jacobian = np.concatenate([s.transform @ J for s, J in zip(spectra, jacobians)])
-        self.precision = precision
+        both = [np.hstack([J, E]) for J, E in zip(jacobians, unit.shared, strict=True)]
+        self.jacobian = np.concatenate([s.transform @ J for s, J in zip(spectra, both)])
+        self.precision = block_diag(precision, np.eye(unit.shared[0].shape[1]))
 
     def variances(self, logs: Array) -> Array:
         return 1.0 + np.exp(2 * logs)[self.site] * self.values

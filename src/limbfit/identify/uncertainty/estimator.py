@@ -58,10 +58,14 @@ class Estimator:
     def hessian(self) -> Array:
         return self.force_hessian + self.prior_hessian
 
-    def by_covariance(self, covariances: Sequence[Array]) -> Array:
-        """Covariance (k, k) of the gradient where that of each site's record is (n, n) N^2."""
+    def by_covariance(self, covariances: Sequence[Array], shared: Sequence[Array] = ()) -> Array:
+        """Covariance (k, k) of the gradient where that of each record is (n, n) N^2.
+
+        ``shared`` (n, q) N of each record are deviations that all have in common.
+        """
         parts = [G @ C @ G.T for G, C in zip(self.by_record, covariances, strict=True)]
-        return np.asarray(np.sum(parts, axis=0))
+        common = np.sum([G @ E for G, E in zip(self.by_record, shared)], axis=0)
+        return np.asarray(np.sum(parts, axis=0)) + (common @ common.T if len(shared) else 0.0)
 
     @property
     def by_medians(self) -> Array:

@@ -117,7 +117,7 @@ def _words(
         strength = "strongly" if size > _STRONG else "moderately"
         by_fit = f"the fitted records support {names[fitted]} {strength}"
     else:
-        by_fit = f"the fitted records do not tell {first.name} from {second.name}"
+        by_fit = f"the fitted records do not distinguish {first.name} from {second.name}"
     if not heldout:
         by_test = "no site was held out"
     elif unseen:

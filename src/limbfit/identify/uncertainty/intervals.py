@@ -25,8 +25,8 @@ from .uncertainty import GIVEN, SAMPLED, Combination, Uncertainty, product_text,
 
 Array = NDArray[np.float64]
 
-FURTHER_SIMULATIONS = 10  # of single sites
-_MOST_EVALUATIONS = 2  # of all sites: further ones hardly changed an interval
+_FURTHER_SIMULATIONS = 10  # of single records
+_MOST_EVALUATIONS = 2  # of all records: further ones hardly changed an interval
 _NEAR, _NEAR_PERCENT = 4.0, 3.0  # runs are used whose error is at most so many times the least, plus this
 _MOST_RUNS = 24
 _STEPS = 1500  # of the sampler, where weighed draws do not do
@@ -71,6 +71,14 @@ class Kept:
         return Kept([self.points[i] for i in chosen], [self.responses[i] for i in chosen])
 
 
+def further_evaluations(records: int, spent: int) -> int:
+    """How many evaluations of all records may follow ``spent`` simulations: two where ten suffice, else one.
+
+    Without any the emulator may never have seen where noise and misfit say that the answer is.
+    """
+    return int(np.clip((_FURTHER_SIMULATIONS - spent) // records, 1, _MOST_EVALUATIONS))
+
+
 def sampled_uncertainty(
     known: Uncertainty,
     measured: Sequence[Measured],
@@ -78,7 +86,7 @@ def sampled_uncertainty(
     space: Space,
     kept: Kept,
     simulate: Simulate,
-    further: int = FURTHER_SIMULATIONS,
+    evaluations: int = _MOST_EVALUATIONS,
     seed: int = 0,
 ) -> Uncertainty:
     """``known`` with sampled intervals, combinations, verdicts and correlations.
@@ -89,7 +97,7 @@ def sampled_uncertainty(
         of the answer stays.
     space : of the calibration's last stage.
     kept : what the calibration simulated.
-    simulate : for ``further`` simulations of single sites; one that fails is tried again half-way.
+    simulate : for so many further ``evaluations``; one that fails is tried again half-way.
 
     Notes
     -----
@@ -106,7 +114,7 @@ def sampled_uncertainty(
         model, doubting = known.residual_model, emulator.forces_and_doubt
         return Likelihood(emulator, measured, model, unknowns, space, doubting)
 
-    for _ in range(min(_MOST_EVALUATIONS, further // len(measured))):
+    for _ in range(evaluations):
         now = likelihood()
         _learn(runs, simulate, _most_probable(now, _sample(now, runs, seed)))
     return both_readings(known, _sample(likelihood(), runs, seed, last=True), unknowns, space)

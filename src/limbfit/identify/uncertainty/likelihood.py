@@ -82,6 +82,7 @@ class Likelihood:
         unit = model.misfit * model.peaks_N if doubting is not None else np.ones(len(spectra))
         self._per_N2 = self._misfit / unit[self._site] ** 2
         self._constant = sum(s.log_determinant for s in spectra) + sizes[-1] * np.log(2 * np.pi)
+        self._shared = self._whiten(np.concatenate(model.shared))
         self._target = self._whiten(np.concatenate([site.force_N for site in measured]))
         self._rows, self._known = unknowns.prior_rows()
 
@@ -111,9 +112,10 @@ class Likelihood:
             forces, doubt = self.doubting(p)
         residual = self._whiten(forces.T).T - self._target
         variances = 1.0 + np.atleast_1d(factor)[:, None] ** 2 * self._misfit
-        variances = variances + doubt[:, self._site] ** 2 * self._per_N2
         beliefs = np.log(p) @ self._rows.T - self._known
-        found = np.sum(residual**2 / variances + np.log(variances), axis=1) + np.sum(beliefs**2, axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):  # far from all runs: not finite, so infinite
+            variances = variances + doubt[:, self._site] ** 2 * self._per_N2
+            found = self._told(residual, variances) + np.sum(beliefs**2, axis=1)
         found = np.where(np.isfinite(found), found, np.inf) + self._constant
         outside = np.any((z < self.space.lower - 1e-9) | (z > self.space.upper + 1e-9), axis=1)
         return np.where(outside, np.inf, found)
@@ -124,20 +126,42 @@ class Likelihood:
         residual = self._whiten(forces) - self._target
         variances = 1.0 + self._misfit
         beliefs = self._rows @ np.log(parameters) - self._known
-        return float(np.sum(residual**2 / variances + np.log(variances)) + beliefs @ beliefs + self._constant)
+        return float(self._told(residual[None], variances[None])[0] + beliefs @ beliefs + self._constant)
+
+    def _told(self, residual: Array, variances: Array) -> Array:
+        """Minus twice the logarithm of the likelihood (m,) of whitened residuals (m, N), but for a constant.
+
+        What records share is integrated out (Woodbury).
+        """
+        found = np.sum(residual**2 / variances + np.log(variances), axis=1)
+        E = self._shared
+        if not E.shape[1]:
+            return np.asarray(found)
+        amount = (residual / variances) @ E
+        inner = np.eye(E.shape[1]) + np.einsum("ni,mn,nj->mij", E, 1.0 / variances, E, optimize=True)
+        explained = np.einsum("mi,mi->m", amount, np.linalg.solve(inner, amount[..., None])[..., 0])
+        return np.asarray(found - explained + np.linalg.slogdet(inner)[1])
 
     def point(self, z: Array, factor: float = 1.0) -> Point | None:
         """Residuals of unit variance and their derivatives at z (k,), for least squares."""
         parameters = self.parameters(z)[0]
         responses = self.emulator(parameters)
         sd = np.sqrt(1.0 + factor**2 * self._misfit)
+        axes, sizes, _ = np.linalg.svd(self._shared / sd[:, None], full_matrices=False)
+        shrunk = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)  # of what records share: (I + F F')^(-1/2)
+
+        def scaled(rows: Array) -> Array:
+            """Rows (N, ...) where all residuals together have variance 1."""
+            rows = (rows.T / sd).T
+            return np.asarray(rows - (axes * shrunk) @ (axes.T @ rows))
+
         forces = np.concatenate([response.force_N for response in responses])
         slopes = np.concatenate([self.space.pull_back(r.jacobian, parameters) for r in responses])
         if not (np.isfinite(forces).all() and np.isfinite(slopes).all()):
             return None
-        residual = (self._whiten(forces) - self._target) / sd
+        residual = scaled(self._whiten(forces) - self._target)
         beliefs = self._rows @ np.log(parameters) - self._known
-        jacobian = np.concatenate([self._whiten(slopes) / sd[:, None], self._rows @ self.space.tie])
+        jacobian = np.concatenate([scaled(self._whiten(slopes)), self._rows @ self.space.tie])
         return Point(z, np.concatenate([residual, beliefs]), jacobian)
 
     def optimum(self, start: Array, held: int | None = None, factor: float = 1.0) -> Optimum:

@@ -36,7 +36,7 @@ class Gain:
     ) -> Gain:
         """Of the fit whose answer is ``parameters`` (p,)."""
         scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
-        weighted = [np.linalg.solve(model.covariance(i), J) for i, J in enumerate(scaled)]
+        weighted = model.solve(scaled)
         A = Beliefs.of(unknowns, space).precision + sum(J.T @ W for J, W in zip(scaled, weighted))
         return cls(tuple(-space.tie @ np.linalg.solve(A, W.T) for W in weighted))
 

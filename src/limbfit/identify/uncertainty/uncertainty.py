@@ -149,7 +149,8 @@ def estimate_uncertainty(
     z = space.reduce(np.log(parameters))
     prior = Beliefs.of(unknowns, space)
     peaks = np.array([site.force_N.max() for site in measured])
-    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N)
+    sites = [site.where for site in measured]
+    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N, sites)
     estimator = Estimator.at(left, scaled, measured, prior.rows, settings or CalibrationSettings())
     linear = _Linear.at(left, scaled, estimator, model, prior, space, z)
     return _told(np.asarray(parameters), linear, model, unknowns, space, prior)
@@ -185,10 +186,10 @@ class _Linear:
         z: Array,
     ) -> _Linear:
         """From residuals (n,), derivatives (n, k) of every site and the calibration's estimator there."""
-        total = [model.covariance(i) for i in range(len(left))]
-        best, centre = _most_probable(left, scaled, total, prior, z)
+        best, centre = _most_probable(left, scaled, model, prior, z)
         centre = np.clip(centre, space.lower, space.upper)
-        M, H = estimator.by_covariance(total), estimator.force_hessian
+        own = [model.own(i) for i in range(len(left))]
+        M, H = estimator.by_covariance(own, model.shared), estimator.force_hessian
         # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
         spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
         inverse = np.linalg.inv(estimator.hessian / spread + prior.bounds) / spread
@@ -224,12 +225,11 @@ class _Linear:
 
 
 def _most_probable(
-    left: Sequence[Array], scaled: Sequence[Array], covariances: Sequence[Array], prior: Beliefs, z: Array
+    left: Sequence[Array], scaled: Sequence[Array], model: ResidualModel, prior: Beliefs, z: Array
 ) -> tuple[Array, Array]:
     """Of generalised least squares: the covariance (k, k), the least of any weights, and the answer (k,)."""
     A, g = prior.precision.copy(), prior.rows.T @ (prior.rows @ z - prior.target)
-    for r, J, C in zip(left, scaled, covariances):
-        weighted = np.linalg.solve(C, J)
+    for r, J, weighted in zip(left, scaled, model.solve(scaled)):
         A += J.T @ weighted
         g += weighted.T @ r
     best = np.asarray(np.linalg.inv(A), dtype=np.float64)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import report
-from ...bench.blocks import HEX, boxes
 from ...errors import InputError, RunError
 from ...fe import History, Material, Problem, StepControl, Support, System, iterate
 from ...fe.kernel.laws import Laws
@@ -23,6 +22,7 @@ from ...fe.observables import element_fields
 from ...indentation import materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
+from ...mesh.boxes import HEX, boxes
 from ..shared.context import Context
 from ..shared.store import read_json, write_json
 from .published import PUBLISHED

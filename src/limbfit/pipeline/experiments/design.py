@@ -47,7 +47,7 @@ def run_design(
         records = study.records_at(site)
         if len(records) > 1 or any(record.forced for record in records):
             raise InputError(
-                "of each site one indentation is chosen, under a stated displacement, and this has others",
+                "a design chooses one indentation per site, under a stated displacement; a site has others",
                 file=study.file,
                 place=f"sites.{site.name}",
                 remedy="leave one of that kind in a study for the design",
@@ -178,15 +178,15 @@ def _verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     if own is not None and len(own.chosen) == len(best.chosen):
         share = efficiency(own, best, "D")
         told = "the study's own choice is as good as the best" if share > 0.95 else (
-            f"the study's own choice tells as much as {100 * share:.0f} % of the data of the best"
+            f"the study's own choice is worth {100 * share:.0f} % of the data of the best"
         )  # fmt: skip
         words.append(told)
     wide = [name for name, factor in zip(names, best.factors_95) if factor > 2]
     open_too = [name for name, factor in zip(names, every.factors_95) if factor > 2]
     if wide:
-        words.append(f"even the best choice leaves open (by more than twofold): {', '.join(wide)}")
+        words.append(f"even the best choice does not determine within a factor of two: {', '.join(wide)}")
     if open_too:
-        words.append(f"and so do all sites together: {', '.join(open_too)}")
+        words.append(f"nor do all sites together: {', '.join(open_too)}")
     return "; ".join(words) or "the best choice determines every parameter within a factor of two"
 
 

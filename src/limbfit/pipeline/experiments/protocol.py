@@ -15,12 +15,12 @@ from scipy.stats import norm, qmc
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError
-from ...identify.checks.design import NoiseModel, candidate
+from ...identify.checks.design import NoiseModel, information_of
 from ...identify.checks.design import prior_information as bounds_information
 from ...identify.checks.protocol import Budget, Option, Wanted, factors_95, plan, seconds_of
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...indentation import Parameters, SiteModel
+from ...indentation import Parameters, Simulation, SiteModel, layers_under
 from ...study import Site
 from ..shared.context import Context
 from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
@@ -32,7 +32,7 @@ from .design import DEEPEST_SHARE
 Array = NDArray[np.float64]
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
-DESIGNED, PLAIN = "designed", "one ramp at each site"
+DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "without ultrasound"
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,12 @@ def run_protocol(
     parameters: Parameters,
     parameters_from: str,
     noise: dict[str, float],
+    ultrasound_sd_mm: float | None,
 ) -> dict[str, Any]:
-    """Simulate every possible record at every draw, with derivatives, and choose within the time."""
+    """Simulate every possible record at every draw, with derivatives, and choose within the time.
+
+    ``ultrasound_sd_mm``: how well ultrasound through the indenter reads a thickness; None: there is none.
+    """
     study = context.study
     known = unknowns(study)
     strange = [name for name in determine if name not in known.names]
@@ -91,14 +95,20 @@ def run_protocol(
         )
     centre = study.vector(parameters)
     tissues = drawn(known, centre, draws, seed)
-    planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm)
-    found, options, peaks = _options(context, folder, planned, tissues, NoiseModel(**noise), rest_s, left_out)
+    planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, ultrasound_sd_mm is not None)
+    noises = Noises(NoiseModel(**noise), _of_ultrasound(noise, ultrasound_sd_mm))
+    found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     budget = Budget(60.0 * minutes, setup_s)
     which = tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
     wanted = Wanted(bounds_information(known), which, "A" if criterion == "A" else "D")
     plans = _plans(found, options, budget, wanted)
+    told_by = dict.fromkeys(plans, options)
+    if ultrasound_sd_mm is not None and DESIGNED in plans:
+        unseen = _plans(found, blind, budget, wanted)
+        plans[UNSEEN] = unseen[DESIGNED]
+        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
     if DESIGNED not in plans:
         least = min(seconds_of(options, [i], budget) for i in range(len(options)))
         raise InputError(
@@ -107,7 +117,7 @@ def run_protocol(
             remedy="allow more time",
         )
     rows = [
-        _row(name, chosen, options, budget, wanted, known.names, len(tissues))
+        _row(name, chosen, told_by[name], budget, wanted, known.names, len(tissues))
         for name, chosen in plans.items()
     ]
     content = {
@@ -125,10 +135,11 @@ def run_protocol(
         "parameters": parameters,
         "parameters_from": parameters_from,
         "noise": noise,
+        "ultrasound_sd_mm": ultrasound_sd_mm,
     }
     write_json(folder / "protocol.json", content)
     _write_tables(folder, content)
-    _write_records(folder / "records.toml", content["records"])
+    _write_records(folder / "records.toml", content["records"], ultrasound_sd_mm)
     return {}
 
 
@@ -146,8 +157,25 @@ def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
     return np.vstack([centre, np.exp(np.clip(scattered, np.log(known.lower), np.log(known.upper)))])
 
 
+@dataclass(frozen=True)
+class Noises:
+    """Of a record's force, and of the compressions that ultrasound sees; None where there is none."""
+
+    force: NoiseModel
+    layers: NoiseModel | None
+
+
+def _of_ultrasound(noise: Mapping[str, float], sd_mm: float | None) -> NoiseModel | None:
+    """One reading at each point of comparison; the model errs by the same share as of the force."""
+    return None if sd_mm is None else NoiseModel(**{**noise, "sensor_N": sd_mm})
+
+
 def _planned(
-    context: Context, speeds_mm_s: Sequence[float], holds_s: Sequence[float], depth_mm: float | None
+    context: Context,
+    speeds_mm_s: Sequence[float],
+    holds_s: Sequence[float],
+    depth_mm: float | None,
+    ultrasound: bool,
 ) -> tuple[list[Planned], list[str]]:
     """Every site with every indenter, speed and hold, as deep as it was recorded, planned or asked for."""
     study, found, left_out = context.study, [], []
@@ -160,6 +188,8 @@ def _planned(
         wanted = depth_mm or deepest[site.name]
         for name in study.all_indenters:
             model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, wanted), searched=True)
+            if ultrasound:
+                model = replace(model, layers=layers_under(model))
             thickness = tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
             depth = min(wanted, DEEPEST_SHARE * thickness)
             if depth < wanted:
@@ -190,18 +220,19 @@ def _options(
     folder: Path,
     planned: Sequence[Planned],
     tissues: Array,
-    noise: NoiseModel,
+    noise: Noises,
     rest_s: float,
     left_out: list[str],
-) -> tuple[list[Planned], list[Option], list[float]]:
-    """What each record would tell at each draw: nothing where its simulation does not come to its end.
+) -> tuple[list[Planned], list[Option], list[Option], list[float]]:
+    """What each record would tell at each draw, and without ultrasound: nothing where its simulation does
+    not come to its end.
 
     Records that press harder than the device may at the first draw are left out.
     """
     study, cache = context.study, experiment_cache(context, folder)
     limit = study.acquire.force_limit_N
     jobs = [curve_job(one.model, study.tissues, tissue) for one in planned for tissue in tissues]
-    infos: list[list[Array]] = [[] for _ in planned]
+    infos = np.zeros((2, len(planned), *tissues.shape, tissues.shape[1]))
     peaks, failed = np.zeros(len(planned)), [0] * len(planned)
     for i, (job, simulation) in enumerate(zip(jobs, cache.run(jobs, context.executor))):
         k, draw = divmod(i, len(tissues))
@@ -210,13 +241,9 @@ def _options(
         if draw == 0:
             peaks[k] = simulation.force_N.max()
         if simulation.completed:
-            response = SiteResponse(simulation.force_N, simulation.jacobian)
-            at = np.array(job.parameters)
-            told = candidate(planned[k].site, planned[k].depth_mm, response, at, noise)
-            infos[k].append(told.information)
+            infos[:, k, draw] = _told_by(simulation, np.array(job.parameters), noise)
         else:
             failed[k] += 1
-            infos[k].append(np.zeros((tissues.shape[1],) * 2))
     kept = []
     for k, one in enumerate(planned):
         if peaks[k] > limit:
@@ -227,12 +254,23 @@ def _options(
             kept.append(k)
             if failed[k]:
                 where = f"at {failed[k]} of {len(tissues)} draws"
-                left_out.append(f"{one.told}: not simulated to the end {where}, and counts for nothing there")
-    options = [
-        Option((planned[k].site, planned[k].tool), planned[k].seconds + rest_s, np.array(infos[k]))
-        for k in kept
-    ]
-    return [planned[k] for k in kept], options, [float(peaks[k]) for k in kept]
+                left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
+    places = [(planned[k].site, planned[k].tool) for k in kept]
+    seconds = [planned[k].seconds + rest_s for k in kept]
+    seeing, blind = (list(map(Option, places, seconds, info[kept])) for info in infos)
+    return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
+
+
+def _told_by(simulation: Simulation, parameters: Array, noise: Noises) -> tuple[Array, Array]:
+    """The information (p, p) of a record with what ultrasound sees, and of its force alone."""
+    assert simulation.jacobian is not None
+    force = information_of(SiteResponse(simulation.force_N, simulation.jacobian), parameters, noise.force)
+    every = force
+    if noise.layers is not None:
+        assert simulation.compression_jacobian is not None
+        for lost, slopes in zip(simulation.compression_mm, simulation.compression_jacobian, strict=True):
+            every = every + information_of(SiteResponse(lost, slopes), parameters, noise.layers)
+    return every, force
 
 
 def _plans(
@@ -318,7 +356,7 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     write_table(folder / "protocols.csv", heads, rows)
 
 
-def _write_records(file: Path, records: Sequence[Mapping[str, Any]]) -> None:
+def _write_records(file: Path, records: Sequence[Mapping[str, Any]], ultrasound_sd_mm: float | None) -> None:
     """The tables ``[[records]]`` of a study that makes them."""
     tables, number = tomlkit.aot(), dict.fromkeys((row["site"] for row in records), 0)
     for row in records:
@@ -328,6 +366,9 @@ def _write_records(file: Path, records: Sequence[Mapping[str, Any]]) -> None:
         table.update({"site": row["site"], "name": name, "trace": f"records/{row['site']}-{name}.csv"})
         if row["indenter"] != "indenter":
             table["indenter"] = row["indenter"]
+        if ultrasound_sd_mm is not None:
+            table["ultrasound"] = f"records/{row['site']}-{name}-layers.csv"
+            table["ultrasound_sd_mm"] = ultrasound_sd_mm
         table.update({key: round(row[key], 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
         tables.append(table)
     document = tomlkit.document()

@@ -64,13 +64,13 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
 def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
     """By region: the sites that it is fitted on, and all that have a record."""
     if sites not in CHOICES:
-        raise InputError(f"{sites!r} is no choice of sites", place="sites", remedy="use all or fitted")
+        raise InputError(f"{sites!r} is not a choice of sites", place="sites", remedy="use all or fitted")
     study = context.study
     recorded = [site for site in study.sites if study.records_at(site)]
     names = list(dict.fromkeys(site.region for site in recorded if site.region))
     if not names:
         raise StudyError(
-            "no site says in which region it lies",
+            "no site has a region",
             file=study.file,
             place="sites",
             remedy='give each a region, such as region = "tibia"',

@@ -11,6 +11,7 @@ from ...donning import Donned
 from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
+from ...socket.published import published
 from ..shared.context import Context
 from ..shared.socket_shape import socket_of
 from ..shared.store import write_json
@@ -46,6 +47,7 @@ def run_socket(
         "parameters_from": parameters_from,
         "socket": _shape(limb, socket),
         "mesh": facts,
+        "published": published(limb.faces(mesh, socket)),
     }
     write_json(folder / "socket.json", content)
     _write_fields(folder, mesh, found)
@@ -78,12 +80,20 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     """Regions and steps as CSV."""
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
     rows = [
-        [name, region["region"], *(region[key] for key in columns), *(region["interval_kPa"] or ("", ""))]
+        [name, region["region"], *(region[key] for key in columns), *_known(region)]
         for name, held in (("donning", content["donning"]), *((one["name"], one) for one in content["loads"]))
         for region in held["regions"]
     ]
-    write_table(folder / "regions.csv", ["load", "region", *columns, "low_kPa", "high_kPa"], rows)
+    heads = ["load", "region", *columns, "low_kPa", "high_kPa", "mostly_from"]
+    write_table(folder / "regions.csv", heads, rows)
     keys = ("time_s", "peak_kPa", "mean_kPa", "contact_area_mm2", "imbalance_percent")
     heads = [*keys, *(f"force_{axis}_N" for axis in "xyz"), "settling_mm"]
     lines = [[*(row[key] for key in keys), *row["force_N"], row["move_mm"][2]] for row in content["steps"]]
     write_table(folder / "steps.csv", heads, lines)
+
+
+def _known(region: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Interval of a region's mean, and the parameter that most of it comes from; empty where not known."""
+    if region["interval_kPa"] is None:
+        return "", "", ""
+    return *region["interval_kPa"], next(iter(region["interval_from"]))

@@ -18,18 +18,20 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...donning import SETTLING, Donned, Fit, Held, Load, Patch, Row, don, socket_problem
 from ...donning.model import OUTER
 from ...errors import RunError
+from ...fe import Doubt
 from ...fe.materials import Material
-from ...indentation import Parameters, fibre_field, materials
+from ...indentation import Direction, Parameters, fibre_field, materials
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
 from ...socket.regions import Region
-from ...study import Study, Vector
+from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import fibres_of
 from ..shared.socket_shape import load_of, regions_of
 from ..shared.store import read_json
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
+from .socket_intervals import Spread, spread_facts
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,7 +40,6 @@ Covariance = Sequence[Sequence[float]] | None
 LINER = "liner"
 BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
 FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those below, and how elements grow
-Z95 = 1.96
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class SocketLimb:
     outer: Anatomy
     depth: Array | None
     regions: Mapping[str, Region]
-    fibres: tuple[tuple[str, Vector], ...]
+    fibres: tuple[tuple[str, Direction], ...]
 
     @classmethod
     def of(cls, context: Context, name: str) -> SocketLimb:
@@ -168,21 +169,22 @@ class SocketLimb:
     def facts(self, found: Donned, socket: Socket, covariance_log: Covariance = None) -> dict[str, Any]:
         """What is stored of a simulation, with intervals where a covariance (p, p) is given."""
         fit = self.fit(socket)
-        names = [f"{region}.{name}" for region, name in found.result.parameter_names]
-        deviation = None
+        spread = None
         if covariance_log is not None:
-            deviation = _deviation(self.study, names, np.array(covariance_log))
+            spread = Spread.of(self.study, found.result.parameter_names, np.array(covariance_log))
         mesh = found.result.problem.mesh
         faces = self.faces(mesh, socket)
         held = {
-            name: _held(one, deviation) | {"inside": _inside(mesh, one, faces)}
+            name: _held(one, spread) | {"inside": _inside(mesh, one, faces)}
             for name, one in found.held.items()
         }
         donned, base = held.pop("donning"), found.held["donning"].row
         loads = []
         for load in fit.loads:
-            here = found.held[load.name].row
-            settled = {"settling_mm": float(here.move[2] - base.move[2])}
+            here = found.held[load.name]
+            depth = float(here.row.move[2] - base.move[2])
+            settled = {"settling_mm": depth}
+            settled |= spread_facts(spread, "settling_", "mm", depth, here.slopes.get(SETTLING))
             stated = {"name": load.name, "force_N": load.force, "moment_Nmm": load.moment}
             loads.append({**stated, **settled, **held[load.name]})
         statistics = found.result.statistics
@@ -195,7 +197,7 @@ class SocketLimb:
             "loads": loads,
             "steps": [_step(row, fit) for row in found.rows],
             # How far it sinks in is told by itself: the wall's stiffness is stated, and no study's.
-            "warnings": [doubt.text for doubt in found.result.doubts if doubt.kind != "sunk"],
+            "warnings": [warning(doubt) for doubt in found.result.doubts if doubt.kind != "sunk"],
             "statistics": {
                 key: statistics[key] for key in ("steps", "cuts", "newton_iterations", "unknowns")
             },
@@ -206,6 +208,16 @@ class SocketLimb:
         """What is stored of the liner."""
         table = self.study.socket.liner
         return {"thickness_mm": table.thickness_mm, "material": table.material} | table.parameters
+
+
+def warning(doubt: Doubt) -> str:
+    """A doubt about a simulation in the words of a socket: that of folded elements names an indenter."""
+    if doubt.kind != "folded":
+        return doubt.text
+    return (
+        f"{doubt.count} elements of the limb are inside out at a node, and pressures near them may be too "
+        "small: choose a smaller socket.edge_mm"
+    )
 
 
 def _stopped(found: Donned, fit: Fit) -> str:
@@ -227,35 +239,19 @@ def _stopped(found: Donned, fit: Fit) -> str:
     )
 
 
-def _deviation(study: Study, names: Sequence[str], covariance: Array) -> Callable[[Array], float]:
-    """Standard deviation of a value from its slopes (p,) by the parameters ``names`` of the solver."""
-    own = [f"{tissue}.{parameter.name}" for tissue in study.tissues for parameter in study.law.parameters]
-    known = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
-    order = [names.index(name) for name in own if name in names]
-    among = covariance[np.ix_(known, known)]
-    return lambda slopes: float(np.sqrt(slopes[order] @ among @ slopes[order]))
-
-
-def _held(one: Held, deviation: Callable[[Array], float] | None) -> dict[str, Any]:
-    def interval(name: str, value: float) -> list[float] | None:
-        if deviation is None:
-            return None
-        sd = deviation(one.slopes[name])
-        return [max(value - Z95 * sd, 0.0), value + Z95 * sd]
-
-    def told(name: str, patch: Patch) -> dict[str, Any]:
-        return {"region": name, **asdict(patch), "interval_kPa": interval(name, patch.mean_kPa)}
+def _held(one: Held, spread: Spread | None) -> dict[str, Any]:
+    def of(name: str, patch: Patch) -> dict[str, Any]:
+        known = spread_facts(spread, "", "kPa", patch.mean_kPa, one.slopes.get(name))
+        return {"region": name, **asdict(patch), **known}
 
     row = one.row
-    spread = None if deviation is None else Z95 * deviation(one.slopes[SETTLING])
     return {
         "time_s": row.time,
         "contact_area_mm2": row.contact_area_mm2,
         "peak_kPa": row.whole.peak_kPa,
         "mean_kPa": row.whole.mean_kPa,
         "shear_peak_kPa": row.whole.shear_peak_kPa,
-        "settling_interval_mm": None if spread is None else [-spread, spread],
-        "regions": [told(name, patch) for name, patch in row.regions.items()],
+        "regions": [of(name, patch) for name, patch in row.regions.items()],
     }
 
 

@@ -95,7 +95,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     found: list[Change] = []
     if table.sources:
         wanted = variants(context, folder, sites.searched, best)
-        found = changes(context, sites.cache, wanted)
+        found = changes(context, sites.cache, wanted, sites.records)
     result = Found(known, explored, evidence, gain, tuple(found), unknowns(study))
     write_results(folder, result, _predicted(context, sites))
     return {"runs": explored.rounds[-1].runs}

@@ -27,8 +27,8 @@ from ...identify.uncertainty.uncertainty import (
     verdict_of,
 )
 from ..shared.store import write_json
-from ..shared.tabular import write_table
-from ..stages.traces import SiteRecord, write_curves
+from ..shared.tabular import write_curves, write_table
+from ..stages.traces import SiteRecord
 from .emulator_file import EMULATOR, write_runs
 from .uncertainty_sources import Change
 
@@ -285,7 +285,7 @@ def _verdict(
             words.append(f"{word.capitalize()}: {', '.join(names)}.")
     told = [row for row in combinations if row["verdict"] == DETERMINED]
     words.append(
-        f"Determined are {len(told)} of {len(combinations)} independent combinations to within "
+        f"{len(told)} of {len(combinations)} independent combinations are determined to within "
         "-20 to +25 %" + (f"; the best is {told[0]['text']}." if told else ".")
     )
     beyond = [
@@ -318,7 +318,7 @@ def _verdict(
     words += [f"Site {row['record']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
     words += _of_profiles(found.explored)
     if not found.explored.good_enough:
-        words.append("The emulator is not as good as the records: raise uncertainty.runs.")
+        words.append("The emulator is less accurate than the records: raise uncertainty.runs.")
     if not found.explored.posterior.long_enough:
         words.append("The sampler's chain is short for its autocorrelation: intervals are rough.")
     return words

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -217,17 +218,20 @@ def mesh_share(study: Study) -> tuple[str, float]:
     order = MESH_ORDERS[study.mesh.element]
     how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
     if study.mesh.coarse is not None:
-        return f"what the fine mesh lacks, in every interval already: {how}", error_of_own_mesh(study.mesh)
-    what = f"what the mesh lacks, from edges {FINER:g} times as long: {how}"
+        return f"error of the fine mesh, in every interval already: {how}", error_of_own_mesh(study.mesh)
+    what = f"error of the mesh, from edges {FINER:g} times as long: {how}"
     return what, error_of_coarser(order, 1 / FINER)
 
 
-def changes(context: Context, cache: SimulationCache, wanted: Sequence[Variant]) -> list[Change]:
-    """Simulate the variants."""
+def changes(
+    context: Context, cache: SimulationCache, wanted: Sequence[Variant], records: Sequence[SiteRecord]
+) -> list[Change]:
+    """Simulate the variants of the ``records``."""
     jobs = [job for variant in wanted for job in (*variant.jobs, *variant.compared_with)]
     forces: list[Array | None] = []
-    for simulation in cache.run(jobs, context.executor):
-        forces.append(simulation.force_N if simulation.completed else None)
+    for record, simulation in zip(cycle(records), cache.run(jobs, context.executor)):
+        answer = simulation.force_N if record.seen is None else record.respond(simulation).force_N
+        forces.append(answer if simulation.completed else None)
         context.tell("uncertainty", len(forces), len(jobs), f"sources, site {simulation.site}")
     found, at = [], 0
     for variant in wanted:
@@ -238,8 +242,8 @@ def changes(context: Context, cache: SimulationCache, wanted: Sequence[Variant])
             job.model.name for job, (new, old) in zip(variant.jobs, pairs) if new is None or old is None
         ]
         difference = [
-            np.zeros(len(job.times_s)) if new is None or old is None else variant.scale * (new - old)
-            for job, (new, old) in zip(variant.jobs, pairs)
+            np.zeros(len(record.compared)) if new is None or old is None else variant.scale * (new - old)
+            for record, (new, old) in zip(records, pairs)
         ]
         found.append(Change(variant, tuple(difference), tuple(failed)))
     return found

@@ -16,7 +16,7 @@ from ...mesh import read_vtu
 from ...study import Indentation, Record, Site
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
-from ..stages.traces import write_curves
+from ..shared.tabular import write_curves
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
     driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
     if not driven or (names and len(driven) < len(chosen)):
         raise InputError(
-            'forces are compared, and a record with control = "force" has none of its own',
+            'this compares forces, and a record with control = "force" has none to compare',
             file=study.file,
             remedy="name records under a stated displacement",
         )

@@ -48,7 +48,7 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 def causes(before: Mapping[str, Mapping[str, str]] | None, now: Parts) -> list[str]:
     """What differs, in words; what is above a lower stage's change comes last."""
     if before is None:
-        return ["made by a version that did not keep what its key was made of"]
+        return ["made by an older version, which did not store what its key depends on"]
     found = []
     words = {
         "settings": "setting {} changed",
@@ -63,7 +63,7 @@ def causes(before: Mapping[str, Mapping[str, str]] | None, now: Parts) -> list[s
         found.append(f"limbfit was {then}, is {__version__}")
     elif code:
         found.append(f"code of {_few(code)} changed")
-    return found or ["what it can be run with changed"]
+    return found or ["its options changed"]
 
 
 def _few(names: list[str]) -> str:

@@ -74,7 +74,7 @@ def input_files(study: Study) -> dict[str, list[Path]]:
         files["calibrate"] = files_of_indenters
     if study.socket.file is not None:
         files["socket"] = [study.socket.file]
-    files["traces"] += [record.trace for record in study.recorded]
+    files["traces"] += [path for record in study.recorded for path in record.files]
     return files
 
 

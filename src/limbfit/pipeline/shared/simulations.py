@@ -13,8 +13,8 @@ import numpy as np
 from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
-from ...indentation import Simulation, SimulationJob, SiteModel, simulate
-from ...study import Indentation, Record, Site, Study, Vector
+from ...indentation import Direction, Simulation, SimulationJob, SiteModel, simulate
+from ...study import Indentation, Record, Site, Study
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
@@ -43,23 +43,21 @@ class SimulationCache:
     def run(
         self, jobs: Sequence[SimulationJob], executor: Executor, again: bool = False
     ) -> Iterator[Simulation]:
-        """The jobs' simulations, in order; those not found are done on the executor and kept.
+        """The jobs' simulations, in order; those not found are done on the executor, once each, and kept.
 
         ``again``: those that failed are tried once more.
         """
-        found = {i: kept for i, job in enumerate(jobs) if (kept := self._find(job)) is not None}
+        found = {job: kept for job in dict.fromkeys(jobs) if (kept := self._find(job)) is not None}
         if again:
-            found = {i: kept for i, kept in found.items() if kept.completed}
-        missing = [job for i, job in enumerate(jobs) if i not in found]
+            found = {job: kept for job, kept in found.items() if kept.completed}
+        missing = [job for job in dict.fromkeys(jobs) if job not in found]
         made = executor.map(self.work, missing, keys=[job.model.name for job in missing], lost=_lost)
-        for i, job in enumerate(jobs):
-            if i in found:
-                yield found[i]
-                continue
-            simulation = next(made)
-            if not simulation.facts.get("lost"):  # the machine's fault: another run tries it again
-                self._keep(job, simulation)
-            yield simulation
+        for job in jobs:
+            if job not in found:
+                simulation = found[job] = next(made)
+                if not simulation.facts.get("lost"):  # the machine's fault: another run tries it again
+                    self._keep(job, simulation)
+            yield found[job]
 
     def example(self) -> Simulation | None:
         """Any kept simulation, for what they all have in common; None where there is none."""
@@ -88,6 +86,10 @@ class SimulationCache:
             arrays = {"force_N": simulation.force_N}
             if simulation.jacobian is not None:
                 arrays["jacobian"] = simulation.jacobian
+            if simulation.compression_mm.size:
+                arrays["compression_mm"] = simulation.compression_mm
+            if simulation.compression_jacobian is not None:
+                arrays["compression_jacobian"] = simulation.compression_jacobian
             facts = {
                 "site": simulation.site,
                 "completed": simulation.completed,
@@ -104,7 +106,8 @@ def _lost(job: SimulationJob, reason: str) -> Simulation:
     n, site = len(job.times_s), job.model.name
     slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
     facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
-    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts)
+    nothing = np.zeros((len(job.model.layers), n))
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, compression_mm=nothing)
 
 
 def _load(file: Path) -> Simulation:
@@ -112,7 +115,14 @@ def _load(file: Path) -> Simulation:
         facts: dict[str, Any] = json.loads(str(stored["facts"]))
         jacobian = stored.get("jacobian")
         doubts = tuple(Doubt(**one) for one in facts.pop("doubts"))
-        return Simulation(force_N=stored["force_N"], jacobian=jacobian, doubts=doubts, **facts)
+        return Simulation(
+            force_N=stored["force_N"],
+            jacobian=jacobian,
+            doubts=doubts,
+            compression_mm=stored.get("compression_mm", np.zeros((0, 0))),
+            compression_jacobian=stored.get("compression_jacobian"),
+            **facts,
+        )
 
 
 def job_digest(job: SimulationJob) -> str:
@@ -132,10 +142,13 @@ def job_digest(job: SimulationJob) -> str:
     )
 
 
-def fibres_of(context: Context) -> tuple[tuple[str, Vector], ...]:
-    """The direction of the fibres in each tissue that has some, of length one."""
-    found = []
+def fibres_of(context: Context) -> tuple[tuple[str, Direction], ...]:
+    """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
+    found: list[tuple[str, Direction]] = []
     for tissue, stated in context.study.fibres.items():
+        if stated == "flow":
+            found.append((tissue, "flow"))
+            continue
         along = context.stored("surfaces", "surfaces.json")["cut_normal"] if stated == "axis" else stated
         x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
         found.append((tissue, (x, y, z)))
@@ -149,11 +162,12 @@ def site_model(
     knots_mm: Sequence[float],
     searched: bool = False,
     knots_N: Sequence[float] = (),
+    layers: Sequence[str] = (),
 ) -> SiteModel:
     """The stored mesh and place of an indentation's site with a history of displacement, or of force.
 
     ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
-    than ``calibration.search_radius_mm``.
+    than ``calibration.search_radius_mm``. ``layers``: tissues whose compression is wanted, too.
     """
     study: Study = context.study
     site = one.site if isinstance(one, Record) else one
@@ -182,6 +196,7 @@ def site_model(
         fibres=fibres_of(context),
         extensions=study.extensions,
         extensions_digest=extensions_digest(study.extensions),
+        layers=tuple(layers),
     )
 
 
@@ -189,7 +204,8 @@ def recorded_model(context: Context, record: Record, searched: bool = False) -> 
     """A site driven by one of its records, from touch-down; ``searched``: see `site_model`."""
     facts = context.stored("traces", "traces.json")["sites"][record.name]
     force = facts["knots_N"] if record.forced else ()
-    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force)
+    layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
+    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:

@@ -14,6 +14,7 @@ from ...anatomy.surfaces.surfaces import Anatomy
 from ...anatomy.surfaces.triangles import Surface
 from ...errors import StudyError, SurfaceError
 from ...socket import Area, Recipe, Socket, read_socket, rectified
+from ...socket.bones import refuse_bones
 from ...socket.landmarks import bone, directions, knee_centre
 from ...socket.loads import STANDARD_LOADS
 from ...socket.regions import Region, default_regions, stated_region
@@ -34,6 +35,7 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     ----------
     anatomy : of the limb.
     outer : the closed surface that the socket touches, skin or liner on skin; flat at the same proximal cut.
+        Around the bare skin, a rectified face may come nearer to the bones by the liner's thickness.
 
     Raises
     ------
@@ -48,7 +50,17 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
             )
         regions = regions_of(study, anatomy)
         areas = [_area(study, area, regions) for area in table.areas]
-        return rectified(outer, frame, replace(recipe_of(study, anatomy), areas=areas))
+        socket = rectified(outer, frame, replace(recipe_of(study, anatomy), areas=areas))
+        refuse_bones(
+            socket.points,
+            socket.faces,
+            socket.brim,
+            frame,
+            anatomy.bones,
+            remedy="lower reduction_percent, or the depths of the areas there",
+            spare_mm=table.liner.thickness_mm if outer is anatomy.skin else 0.0,
+        )
+        return socket
 
 
 def recipe_of(study: Study, anatomy: Anatomy) -> Recipe:

@@ -244,7 +244,7 @@ def lock(folder: Path) -> Iterator[None]:
             holder = holder_of(folder) or "another process"
             raise RunError(
                 f"{folder}: {holder} is running this study; wait for it or end it (kill PID): its lock "
-                "goes with it, and another run goes on where it stopped"
+                "ends with it, and the next run continues where it stopped"
             ) from None
     try:
         with disk_errors(folder):

@@ -58,9 +58,14 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         "corrections": [_round_record(one, found.sites, study) for one in rounds],
         "multistart": _multistart_record(tried, study) if table.starts > 1 else None,
         "warnings": laboratory.warnings,
-        "contact": contact_record(laboratory.latest, laboratory.penalties, answers, found.responses),
+        "contact": contact_record(
+            laboratory.latest,
+            laboratory.penalties,
+            laboratory.of_records(answers),
+            laboratory.of_records(found.responses),
+        ),
         "doubts": doubts_record(
-            laboratory.doubts, laboratory.latest, laboratory.evaluations * len(laboratory.records), found
+            laboratory.doubts, laboratory.latest, laboratory.evaluations * laboratory.simulated, found
         ),
     }
     write_json(folder / "calibration.json", content)

@@ -17,7 +17,7 @@ from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_correcte
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
-from ...identify.uncertainty.intervals import FURTHER_SIMULATIONS, Kept, sampled_uncertainty
+from ...identify.uncertainty.intervals import Kept, further_evaluations, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob
 from ...study import Record, Study
@@ -29,7 +29,7 @@ from .doubted import Doubted
 from .mesh import mesh_settings
 from .record_noise import site_noise
 from .remesh import meshed_models, scaled_edges
-from .traces import SiteRecord, as_searched, site_record
+from .traces import SiteRecord, all_compared, as_searched, site_record
 
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
@@ -37,7 +37,9 @@ COARSER = 1.3  # times the edges: another mesh that tells the error of the study
 # In logarithms of parameters: another simulation's states save work as first guesses as far as NEAR, and half
 # of it within CLOSE; one that is farther than that is the next one's start.
 NEAR, CLOSE, MOST_STARTS = 1.5, 0.35, 8
-ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too sure"
+ONLY_LINEARISED = (
+    "too few simulations completed near the answer: its intervals are linearised, and too narrow"
+)
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -67,7 +69,7 @@ class Laboratory:
         self, context: Context, cache: SimulationCache, records: Sequence[Record], title: str = "calibrate"
     ) -> None:
         self.context, self.cache, self.title = context, cache, title
-        self.records = [site_record(context, record) for record in records]
+        self.records = all_compared(context, [site_record(context, record) for record in records])
         self.searched = as_searched(context, self.records)
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
@@ -82,6 +84,16 @@ class Laboratory:
     def is_apart(self) -> bool:
         """Whether parameters are searched on something smaller than the sites' own meshes."""
         return self.searched is not self.records
+
+    @property
+    def simulated(self) -> int:
+        """How many simulations an evaluation takes: one of each record."""
+        return sum(record.seen is None for record in self.records)
+
+    def of_records(self, responses: Sequence[SiteResponse]) -> Responses:
+        """Those of the records themselves, without what ultrasound saw beside them."""
+        pairs = zip(self.records, responses, strict=True)
+        return [response for record, response in pairs if record.seen is None]
 
     @property
     def measured(self) -> list[Measured]:
@@ -154,8 +166,7 @@ class Laboratory:
         Where that cannot be, for simulations that fail, it is linearised and a line says so. ``meshes`` is a
         folder for the coarser meshes that tell the error of the study's own, where it has no others.
         """
-        study = self.context.study
-        further = FURTHER_SIMULATIONS
+        study, spent = self.context.study, 0
         anchored = Anchored(list(found.responses), list, ())
         if self.is_apart:
             anchored = self.anchored(found.parameters)
@@ -163,7 +174,7 @@ class Laboratory:
             searched = self.search(found.parameters) if self.is_apart else anchored.responses
             lacking = self._mesh_error(found.parameters, searched, self._coarser(meshes))
             anchored = replace(anchored, mesh_N=lacking)
-            further -= len(self.records)
+            spent = self.simulated
         known = linearised(study, self.records, found.parameters, anchored)
         kept = Kept()
         for point, run in zip(self.kept.points, self.kept.responses, strict=True):
@@ -175,7 +186,8 @@ class Laboratory:
 
         bounds = unknowns(study)
         space = search_space(bounds, grouping)
-        sampled = sampled_uncertainty(known, self.measured, bounds, space, kept, simulate, further)
+        evaluations = further_evaluations(self.simulated, spent)
+        sampled = sampled_uncertainty(known, self.measured, bounds, space, kept, simulate, evaluations)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
         return sampled
@@ -237,6 +249,8 @@ class Laboratory:
         done = self.cache.run(jobs, self.context.executor, again)
         for record, simulation in zip(self.records, done, strict=True):
             found.append(record.respond(simulation))
+            if record.seen is not None:  # of the simulation before
+                continue
             self.latest[simulation.site] = simulation
             if simulation.warnings:
                 self.warnings[simulation.site] = list(simulation.warnings)

@@ -102,6 +102,7 @@ def _driven_by(site: SiteRecord, other: SiteRecord, parameters: Array) -> Simula
         knots_N=driven.knots_N,
         indenter=driven.indenter,
         indenter_digest=driven.indenter_digest,
+        layers=(),
     )
     return replace(site, model=model, times_s=other.times_s).job(parameters)
 

@@ -14,7 +14,7 @@ from ...identify.checks.plausibility import Flag, RecordFacts, implausible
 from ...indentation import read_indenter
 from ...study import IndenterTable, Record, Study
 from ..shared.context import Context
-from .traces import read_curves
+from ..shared.tabular import read_curves
 
 Placed = Mapping[str, Mapping[str, Any]]
 

@@ -23,8 +23,9 @@ from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
 from ..shared.store import write_json
+from ..shared.tabular import write_curves
 from .outliers import outlier_record
-from .traces import SiteRecord, as_response, as_searched, site_record, write_curves
+from .traces import SiteRecord, all_compared, as_response, as_searched, site_record
 
 Array = NDArray[np.float64]
 _MISSING = {
@@ -54,6 +55,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         simulations.append(simulation)
         context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
     n = len(records)
+    near = simulations[n : 2 * n] if searched is not records else None
     ours = own = [as_response(simulation) for simulation in simulations[:n]]
     others = [as_response(simulation) for simulation in simulations[n:]]
     correction = None
@@ -69,6 +71,8 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     for site in sites:
         _write_curves(folder, site, best, known)
     rows = [_row(site) for site in sites]
+    for i, site in enumerate(sites):
+        rows[i]["layers"] = _layers(context, folder, site, None if near is None else near[i], best, known)
     doubts = outlier_record(context, cache, records, ours, best, one, searched, correction)
     write_json(folder / "predict.json", {"sites": rows, **_means(rows), **doubts})
     return {}
@@ -188,6 +192,40 @@ def _write_curves(folder: Path, site: SitePrediction, best: Array, known: Known)
         columns[f"{name}_low_{unit}"] = np.maximum(ours.force_N - half, 0.0)
         columns[f"{name}_high_{unit}"] = ours.force_N + half
     write_curves(folder / f"{record.name}.csv", **columns)
+
+
+def _layers(
+    context: Context, folder: Path, site: SitePrediction, near: Simulation | None, best: Array, known: Known
+) -> list[dict[str, Any]]:
+    """What ultrasound saw of each tissue beside its prediction, as a file and as a row.
+
+    ``near`` is the simulation with derivatives where that is another than the site's own.
+    """
+    rows = []
+    for one in all_compared(context, [site.record])[1:]:
+        assert one.seen is not None
+        ours = whole = one.respond(site.own)
+        if near is not None:
+            searched = one.respond(near)
+            ours = CoarseToFine([searched], [whole])([searched])[0]
+        columns = {"time_s": one.compared_at_s, "compression_measured_mm": one.compared}
+        if whole.completed:
+            columns["compression_simulated_mm"] = whole.force_N
+        if ours.completed:
+            peak = float(np.abs(ours.force_N).max())
+            half = known.half_width_95(ours.jacobian, best, peak, one.name, one.unit)
+            columns |= {"compression_low_mm": ours.force_N - half, "compression_high_mm": ours.force_N + half}
+        write_curves(folder / f"{one.name}.csv", **columns)
+        rows.append(
+            {
+                "tissue": one.seen.tissue,
+                "name": one.name,
+                "largest_mm": float(one.compared.max()),
+                "thickness_mm": one.seen.thickness_mm,
+                "error_percent": error_percent(whole.force_N, one.compared) if whole.completed else None,
+            }
+        )
+    return rows
 
 
 def _row(site: SitePrediction) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from ...study import Record, Site, Study
 from ...traces import (
     Creep,
     Regularised,
+    Thinning,
     TouchDown,
     Trace,
     read_trace,
@@ -28,6 +29,8 @@ from ...traces import (
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, recorded_model
 from ..shared.store import write_json
+from ..shared.tabular import read_curves, write_curves
+from .layers import load_thinnings, read_thinnings, store_thinnings, weight_of
 
 Array = NDArray[np.float64]
 SMOOTHING = "{}-smoothing.npy"  # of a record, as a matrix
@@ -82,7 +85,8 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
     facts = {}
     for i, record in enumerate(recorded):
         context.tell("traces", i, len(recorded), f"site {record.name}")
-        trace, smooth, facts[record.name] = read_record(context.study, record)
+        trace, smooth, told = read_record(context.study, record)
+        facts[record.name] = told
         write_curves(
             folder / f"{record.name}-raw.csv",
             time_s=trace.time_s,
@@ -97,20 +101,15 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
             force_N=even.force_N,
         )
         np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
+        if record.ultrasound is not None:
+            seen = read_thinnings(context.study, record, told["touch_down_s"], smooth)
+            told["layers"] = store_thinnings(folder, record, seen)
+            for one in seen:
+                if not one.is_seen:
+                    words = f"ultrasound of {record.name}: {one.tissue} hardly gives way, and is not compared"
+                    context.tell("traces", i, len(recorded), words)
     write_json(folder / "traces.json", {"sites": facts})
     return {}
-
-
-def write_curves(file: Path, **columns: Array) -> None:
-    """A CSV with named columns."""
-    table = np.column_stack(list(columns.values()))
-    np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
-
-
-def read_curves(file: Path) -> dict[str, Array]:
-    """The columns of a CSV that ``write_curves`` made."""
-    names = file.read_text(encoding="utf-8").split("\n", 1)[0].split(",")
-    return dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1, unpack=True), strict=True))
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,8 @@ class SiteRecord:
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
     blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
-    same mesh.
+    same mesh. With ``seen`` it is what ultrasound saw of one tissue meanwhile that is compared, of the same
+    simulation; ``weight`` is how much that counts beside a force.
     """
 
     record: Record
@@ -131,11 +131,18 @@ class SiteRecord:
     force_N: Array
     smoothing: Array
     nested_mm: float | None = None
+    seen: Thinning | None = None
+    weight: float = 1.0
 
     @property
     def name(self) -> str:
-        """The record's."""
-        return self.record.name
+        """The record's; with the tissue that ultrasound saw."""
+        return self.record.name if self.seen is None else f"{self.record.name}+{self.seen.tissue}"
+
+    @property
+    def unit(self) -> str:
+        """Of what is compared."""
+        return self.record.unit if self.seen is None else "mm"
 
     @property
     def site(self) -> Site:
@@ -144,18 +151,35 @@ class SiteRecord:
     @property
     def measured(self) -> Measured:
         """What the calibration compares with."""
-        return Measured(self.name, self.compared, self.record.weight, self.site.name, self.record.unit)
+        weight = self.weight * self.record.weight
+        return Measured(self.name, self.compared, weight, self.site.name, self.unit)
 
     @property
     def compared(self) -> Array:
-        """What is compared: force (n,) N, or displacement, mm, under a stated force."""
+        """What is compared: force (n,) N; displacement, mm, under a stated force; compression of a tissue."""
+        if self.seen is not None:
+            return self.seen.compression_mm
         return self.displacement_mm if self.record.forced else self.force_N
+
+    @property
+    def compared_at_s(self) -> Array:
+        """At which times (n,) s from touch-down."""
+        return self.times_s if self.seen is None else self.seen.time_s
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
         plain = as_response(simulation)
+        if self.seen is not None:
+            plain = self._compression(plain, simulation)
         force_N, jacobian = (self.smoothing @ values for values in (plain.force_N, plain.jacobian))
         return replace(plain, force_N=force_N, jacobian=jacobian)
+
+    def _compression(self, plain: SiteResponse, simulation: Simulation) -> SiteResponse:
+        """The response with the compression of its tissue in place of the force."""
+        assert self.seen is not None
+        row, slopes = self.model.layers.index(self.seen.tissue), simulation.compression_jacobian
+        jacobian = np.zeros_like(plain.jacobian) if slopes is None else slopes[row]
+        return replace(plain, force_N=simulation.compression_mm[row], jacobian=jacobian)
 
     def job(
         self, parameters: Array, sensitivities: bool = True, starts: Sequence[Array] = ()
@@ -197,6 +221,19 @@ def site_record(context: Context, record: Record) -> SiteRecord:
         smoothing=np.load(context.store["traces"] / SMOOTHING.format(record.name)),
         nested_mm=context.study.within_mm if context.study.mesh.coarse is None else None,
     )
+
+
+def all_compared(context: Context, records: Sequence[SiteRecord]) -> list[SiteRecord]:
+    """The records, each followed by one for every tissue that ultrasound saw beside it."""
+    facts = context.stored("traces", "traces.json")["sites"]
+    found = []
+    for one in records:
+        found.append(one)
+        for seen in load_thinnings(context.store["traces"], one.record, facts[one.record.name]):
+            weight = weight_of(seen, context.study.calibration.force_error_percent)
+            at = np.array([np.interp(seen.time_s, one.times_s, row) for row in np.eye(len(one.times_s))]).T
+            found.append(replace(one, seen=seen, weight=weight, smoothing=at))
+    return found
 
 
 def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[SiteRecord]:

@@ -35,7 +35,7 @@ from ...acquire.virtual import Fault, Limb, Serving, Surrogate, VirtualFitSocket
 from ...errors import InputError, TraceError
 from ...study import AcquireTable, Indentation, Record, Site, Study
 from ..shared.store import Store, disk_errors, write_json
-from ..stages.traces import read_curves, write_curves
+from ..shared.tabular import read_curves, write_curves
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"
@@ -197,7 +197,7 @@ def _settings(study: Study, one: Indentation, depth_mm: float | None, unattended
         if depth_mm is None:
             remedy = "give --depth, or state its depth_mm"
             raise InputError(
-                "how deep to go is not known",
+                "the depth is not known",
                 file=study.file,
                 place=_place(one).removesuffix(".trace"),
                 remedy=remedy,

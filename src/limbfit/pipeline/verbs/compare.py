@@ -29,7 +29,7 @@ from ...indentation import Parameters, first_steps
 from ...study import Study
 from ..shared.context import Listener, quiet
 from ..shared.store import write_json
-from ..stages.traces import write_curves
+from ..shared.tabular import write_curves
 from .simulate import Indentation, feb_settings, prepare_site, run_febio_site, site_problem
 
 Array = NDArray[np.float64]

@@ -46,7 +46,7 @@ def fit_socket(
     RunError
         Where the simulation does not come to its end.
     """
-    used, origin = (parameters, "given") if parameters else _known(study, literature)
+    used, origin = (parameters, "given") if parameters else known_tissues(study, literature)
     covariance = None
     if origin == IDENTIFIED:
         calibration = Store(study.results).read("calibrate", "calibration.json")
@@ -98,7 +98,7 @@ def design_socket(
     doubled = sorted({name for name in optimise if list(optimise).count(name) > 1})
     if doubled:
         raise InputError(f"region {doubled[0]!r} is named twice", remedy="name it once")
-    used, origin = (parameters, "given") if parameters else _known(study, literature)
+    used, origin = (parameters, "given") if parameters else known_tissues(study, literature)
     return run_experiment(
         study,
         "socket_design",
@@ -110,7 +110,8 @@ def design_socket(
     )
 
 
-def _known(study: Study, literature: bool) -> tuple[Parameters, str]:
+def known_tissues(study: Study, literature: bool = False) -> tuple[Parameters, str]:
+    """Parameters of a study's tissues, and where they are from: identified, or ``literature``: of people."""
     store = Store(study.results)
     if not literature and store.stamp("calibrate") is not None:
         return known_parameters(study, store)

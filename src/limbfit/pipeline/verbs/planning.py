@@ -72,6 +72,7 @@ def plan_protocol(
     criterion: Criterion = "D",
     draws: int = 3,
     seed: int = 0,
+    ultrasound_sd_mm: float | None = None,
     parameters: Parameters | None = None,
     listener: Listener = quiet,
 ) -> dict[str, Any]:
@@ -87,6 +88,8 @@ def plan_protocol(
     determine : parameters such as ``muscle.c_kPa``; by default all.
     criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances.
     draws : tissues that the protocol is judged at, the first those of ``parameters``.
+    ultrasound_sd_mm : how well ultrasound through the indenter reads the thickness of a tissue; None: there
+        is none.
     parameters : per tissue; by default the identified ones, or the study's start.
 
     Returns
@@ -119,6 +122,7 @@ def plan_protocol(
         parameters=used,
         parameters_from=origin,
         noise=_noise_of(study, origin),
+        ultrasound_sd_mm=ultrasound_sd_mm,
     )
 
 
@@ -127,9 +131,9 @@ def _noise_of(study: Study, origin: str) -> dict[str, float]:
     if origin != IDENTIFIED:
         return {"sensor_N": _SENSOR_N, "misfit": _MISFIT, "correlation": _CORRELATION}
     residuals = Store(study.results).read("calibrate", "calibration.json")["uncertainty"]["residuals"]
-    noise = [row["compared_noise_sd_N"] for row in residuals["sites"].values()]
+    noise = [row["compared_noise_sd_N"] for row in residuals["sites"].values() if row["unit"] == "N"]
     return {
-        "sensor_N": float(max(np.median(noise), 1e-3)),
+        "sensor_N": float(max(np.median(noise), 1e-3)) if noise else _SENSOR_N,
         "misfit": float(residuals["misfit_elsewhere"]),
         "correlation": _CORRELATION,
     }

@@ -17,7 +17,7 @@ from ..shared.context import Listener, quiet
 from ..shared.hand_labels import hand_labels
 from ..shared.provenance import input_digests, settings_record, versions
 from ..shared.store import Store, read_json
-from ..stages.traces import read_curves
+from ..shared.tabular import read_curves
 from .run import run_study
 
 TOLERANCE = 1e-6  # of a parameter, and of the largest force of a site, relative

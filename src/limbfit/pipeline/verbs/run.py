@@ -33,11 +33,12 @@ from ..stages.traces import run_traces
 from .journal import journal
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
-_RECORD = ("trace", "touch_down_s", "peak_s", "control")
+_RECORD = ("trace", "touch_down_s", "peak_s", "control", "ultrasound", "ultrasound_sd_mm")
 _UNSEEN: dict[str, Any] = {
-    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter")),
+    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter", "ultrasound")),
     "region": "",
     "control": "displacement",
+    "ultrasound_sd_mm": 0.1,
 }
 _NAMED = ("site", "name")
 STAGES = (

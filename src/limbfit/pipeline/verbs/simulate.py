@@ -17,7 +17,7 @@ from ...study import Study
 from ..shared.context import Context, Listener, quiet
 from ..shared.simulations import CURVE_POINTS, model_of
 from ..shared.store import Store, write_json
-from ..stages.traces import write_curves
+from ..shared.tabular import write_curves
 from .run import keys, run_study
 
 IDENTIFIED = "identified"

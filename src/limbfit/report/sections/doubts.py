@@ -100,7 +100,7 @@ def _left_out_tables(store: Results, left_out: list[Json]) -> tuple[Table, ...]:
     )
     caption = (
         "Every site predicted from all others: root mean square error over the peak; that of the others when "
-        "the site has no say; their ratio; the best factor from predicted to measured force; and how far the "
-        "site moves the fit, against the misfit. Computed on the first-order expansion about the answer."
+        "the site is left out; their ratio; the best factor from predicted to measured force; and how far "
+        "the site moves the fit, against the misfit. Computed on the first-order expansion about the answer."
     )
     return (Table("left-out", caption, head, rows),)

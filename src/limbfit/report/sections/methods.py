@@ -107,7 +107,7 @@ def _layers(geometry: Json) -> str:
         stated, least = layer.get("thickness_mm"), layer.get("min_thickness_mm")
         thick = f"{stated} mm" if stated else f"as thick as the segmented fat, at least {least} mm"
         words.append(f"{layer['name']} ({thick})")
-    return f"Over the {geometry.get('core')} lie, outermost first: {', '.join(words)}."
+    return f"Layers over the {geometry.get('core')}, outermost first: {', '.join(words)}."
 
 
 def _indentations(store: Results) -> str:
@@ -170,7 +170,7 @@ def _search(store: Results) -> str:
     coarse = _settings(store, "mesh").get("coarse")
     radius = _settings(store, "calibration").get("search_radius_mm")
     of = f"coarser meshes ({_pairs(coarse)})" if coarse else "these meshes" if radius else ""
-    within = f"what of {of} is within {radius} mm of the site" if radius else of
+    within = f"the part of {of} within {radius} mm of the site" if radius else of
     return f"Parameters were searched on {within}, corrected by the whole meshes." if of else ""
 
 
@@ -341,7 +341,7 @@ def _mesh_error(sites: Json) -> str:
     """The meshes' part of the residuals' covariance, in words; nothing where it was not measured."""
     shares = [100 * one["mesh_share"] for one in sites.values() if one.get("mesh_share") is not None]
     ends = f"{fixed(min(shares), 1)} to {fixed(max(shares), 1)}" if shares else ""
-    return f", and for the error of the meshes: {ends} % of the largest force, from others" if shares else ""
+    return f", and for the error of the meshes: {ends} % of the largest force" if shares else ""
 
 
 def _uncertainty(store: Results) -> str:

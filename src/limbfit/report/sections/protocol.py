@@ -19,6 +19,10 @@ def protocol_section(store: Results, content: Json) -> Section:
         f"{content['parameters_from']}. Every site with another indenter takes {content['setup_s']:g} s to "
         f"prepare, every record {content['rest_s']:g} s of rest. In short: {content['verdict']}."
     )
+    if content.get("ultrasound_sd_mm") is not None:
+        sd = f"{content['ultrasound_sd_mm']:g} mm"
+        seen = f"Ultrasound through the indenter reads every tissue's thickness to {sd}"
+        words = Prose(f"{words.text} {seen}, but for the plain ramps and the protocol without it.")
     figure = expected_figure("protocols", content["protocols"], "the records of a protocol")
     blocks: list[Block] = [words, _records(content), _protocols(content), figure]
     if content["left_out"]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from .. import site_tables, tables
 from ..drawing import figures, pictures
 from ..drawing.interactive import convergence_curves, explorer, record_curves
+from ..drawing.layer_figures import layer_figure
 from ..drawing.slices import slices_figure
 from ..formats import fixed
 from ..page import Block, Bullets, Figure, Note, Page, Prose, Section, Table
@@ -127,6 +128,7 @@ def fit(store: Results) -> Section:
     rows = [row for row in store.predicted if row.get("fitted")]
     blocks = _blocks(
         figures.force_figure(store, rows, "time_s", "forces-fitted", 2),
+        layer_figure(store, fitted=True),
         pictures.field_figure(store, store.fitted[:4], "predict", "field"),
         otherwise="No simulated forces of fitted sites are stored yet.",
     )
@@ -141,6 +143,7 @@ def prediction(store: Results) -> Section:
         figures.error_figure(store),
         figures.force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
+        layer_figure(store, fitted=False),
         otherwise="No predictions are stored yet.",
     )
     if store.predicted and not rows:
@@ -174,7 +177,7 @@ def _residuals(store: Results) -> str:
     if not rows:
         return ""
     sites = ", ".join(
-        f"{name} {fixed(site['noise_sd_N'], 3)} N and {fixed(site['misfit_sd_N'], 3)} N"
+        f"{name} {fixed(site['noise_sd_N'], 3)} and {fixed(site['misfit_sd_N'], 3)} {site.get('unit', 'N')}"
         for name, site in rows.items()
     )
     meshes = ", ".join(
@@ -187,7 +190,7 @@ def _residuals(store: Results) -> str:
         f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
         f"{fixed(100 * found['correlation'], 0)} % of a record. "
         + (
-            f"To these comes the error of the meshes, from others, in percent of the largest force: {meshes}."
+            f"The error of the meshes is added, in percent of the largest force: {meshes}."
             if meshes
             else "The error of the meshes is not in them: no other mesh was simulated."
         )

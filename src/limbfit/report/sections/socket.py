@@ -9,16 +9,13 @@ from ..drawing.socket_pictures import inside_figure, pressure_figures, settling_
 from ..formats import NOTHING, fixed, friction, heading, numeric
 from ..page import Block, Note, Prose, Row, Section, Table
 from ..store import Json, Results
+from .socket_beside import interval_blocks, mostly, published_blocks
 
 ORIGINS = {
     "identified": "identified from this limb's records",
     "literature": "those of people (medians), not of this limb",
     "given": "given by hand",
 }
-PUBLISHED = (
-    "For measured pressures to hold these against see Al-Fakih et al. (Sensors 2016, 16:1119, a review), "
-    "Sanders et al. (J Rehabil Res Dev 1997, 34:19) and Dumbleton et al. (J Rehabil Res Dev 2009, 46:405)."
-)
 
 
 def socket_section(store: Results, content: Json) -> Section:
@@ -33,11 +30,13 @@ def socket_section(store: Results, content: Json) -> Section:
             "of the limb."
         ),
         Prose(_shape(content)),
+        *(Note(f"The socket's file: {text}.") for text in content["socket"]["notes"]),
         Prose(_loads(loads)),
         *pressure_figures(store, {name: folder / f"held-{i}.vtu" for i, name in enumerate(names)}),
         settling_figure(content),
         _regions(names, held),
-        Prose(PUBLISHED),
+        *interval_blocks(held[-1], names[-1]),
+        *published_blocks(content),
         *inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
         _inside(names, held),
         Prose(
@@ -75,7 +74,11 @@ def _loads(loads: list[Json]) -> str:
     words = []
     for load in loads:
         size = sum(value**2 for value in load["force_N"]) ** 0.5
-        words.append(f"{load['name']}, {size:.0f} N: the limb settles by {load['settling_mm']:.1f} mm")
+        known = load["settling_interval_mm"]
+        limits = "" if known is None else f" (95 %: {fixed(known[0])} to {fixed(known[1])})"
+        words.append(
+            f"{load['name']}, {size:.0f} N: the limb settles by {load['settling_mm']:.1f} mm{limits}"
+        )
     return "; ".join(words) + "."
 
 
@@ -84,6 +87,7 @@ def _regions(names: list[str], held: list[Mapping[str, Any]]) -> Table:
         "Region",
         "Mean pressure (kPa)",
         "95 % (kPa)",
+        "Mostly from",
         "Peak (kPa)",
         "Mean shear (kPa)",
         "Peak shear (kPa)",
@@ -94,7 +98,7 @@ def _regions(names: list[str], held: list[Mapping[str, Any]]) -> Table:
         for region in one["regions"]:
             known = region["interval_kPa"]
             interval = NOTHING if known is None else f"{fixed(known[0])} to {fixed(known[1])}"
-            cells = [fixed(region["mean_kPa"]), interval]
+            cells = [fixed(region["mean_kPa"]), interval, mostly(region["interval_from"])]
             cells += [fixed(region[key]) for key in ("peak_kPa", "shear_kPa", "shear_peak_kPa")]
             rows.append(Row((heading(region["region"]), *map(numeric, cells))))
     caption = (

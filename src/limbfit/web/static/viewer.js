@@ -243,13 +243,15 @@ export class Viewer {
     this.redraw();
   }
 
-  /** A click that was no drag: tells onSite of a site, else onSurface of the point hit; while `placing` that alone. */
+  /** A click that was no drag: tells onSite of a site, else onSurface or onMesh of the point hit; while `placing` that alone. */
   click(event) {
     if (this.view.moved > 4 || event.button !== 0) return;
     const site = this.placing ? null : this.siteAt(event);
     if (site && this.onSite) return this.onSite(site.name);
     const hit = this.surfaceAt(event, "skin");
     if (hit && this.onSurface) this.onSurface(hit);
+    const at = !hit && this.onMesh ? this.meshAt(event) : null;
+    if (at) this.onMesh(at);
   }
 
   /** The site whose mark is within a few pixels of a pointer, nearest first, or none. */

@@ -44,7 +44,7 @@ class IdentificationView {
       el("div", { class: "field" }, el("label", { for: "run-until" }, "Stop after"), this.until),
       el("div", { class: "row" }, this.start, this.stop), this.state, this.meter, this.stages,
       el("details", {}, el("summary", {}, "Log"), this.log),
-      el("p", { class: "hint" }, "A run goes on when this page or its server is closed. A stopped run goes on where it stopped."));
+      el("p", { class: "hint" }, "A run continues when this page or its server is closed. A stopped run continues where it stopped."));
   }
 
   build() {

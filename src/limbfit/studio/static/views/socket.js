@@ -1,94 +1,184 @@
-// The view Socket: stored runs of a socket, the limb coloured by pressure through donning and loads.
+// The view Socket: the shape with its areas, runs started, and stored runs stepped through, two beside each other.
 import { el, replace, table } from "/static/dom.js";
-import { readArrays } from "/web/arrays.js";
-import { shortNumber } from "/web/colours.js";
-import { canDraw, Viewer } from "/web/viewer.js";
-import { labelled, loadMesh, NAVIGATION, NO_WEBGL, REGION_COLOURS, SIDES } from "/static/views/parts.js";
+import { labelled, NAVIGATION, SIDES } from "/static/views/parts.js";
+import { ShapeEditor } from "/static/views/socket_areas.js";
+import { link, Pane } from "/static/views/socket_pane.js";
 
 const FIELDS = { pressure: "contact pressure", shear: "shear" };
 const NONE = "No socket run is stored: limbfit socket STUDY makes one, limbfit socket design STUDY designs.";
+const RUNS = "runs", SHAPE = "shape";
 
 export async function mount(element, context) {
   const view = new SocketView(element, context);
   await view.refresh();
-  context.on((changed) => changed.stages && view.refresh());
-  return { show: () => view.viewer?.resize() };
+  context.on((changed) => (changed.study || changed.stages || changed.log || changed.run) && view.refresh(changed));
+  return { show: () => view.panes.forEach((pane) => pane.viewer?.resize()) };
 }
 
 class SocketView {
   constructor(element, context) {
-    Object.assign(this, { context, runs: [], frames: [], turn: 0, mesh: null, marks: "" });
+    Object.assign(this, { context, runs: [], turn: 0, marks: "", frame: null });
     const side = el("div", { class: "side", tabindex: "0", role: "region", "aria-label": "Settings of the socket" });
     const main = el("div", { class: "stagearea results-main" });
-    this.stage = el("div", { class: "player-stage" });
     element.classList.add("split");
     element.append(side, main);
-    this.run = el("select", { onchange: () => this.load() });
-    this.field = el("select", { onchange: () => this.read() }, ...Object.entries(FIELDS).map(([key, text]) => el("option", { value: key }, `${text} (kPa)`)));
-    this.map = el("select", { onchange: () => this.scale() }, ...["viridis", "cividis"].map((name) => el("option", { value: name }, name)));
+    const choice = (entries, act) => el("select", { onchange: act }, ...entries.map(([key, text]) => el("option", { value: key }, text)));
+    this.mode = choice([[RUNS, "stored runs"], [SHAPE, "its shape"]], () => this.switch());
+    this.run = choice([], () => this.load());
+    this.beside = choice([["", "nothing"]], () => this.load());
+    this.field = choice(Object.entries(FIELDS).map(([key, text]) => [key, `${text} (kPa)`]), () => this.read());
+    this.colours = choice(["viridis", "cividis"].map((name) => [name, name]), () => (this.shaping ? this.editor.paint() : this.scale()));
     this.slider = el("input", { type: "range", min: "0", max: "0", step: "1", value: "0", "aria-label": "step", oninput: () => this.show() });
     this.words = el("output", { class: "player-words" });
     this.pointed = el("output", { class: "hint socket-pointed" });
     this.table = el("div", { class: "padded table-box", tabindex: "0", role: "region", "aria-label": "Regions" });
     this.none = el("p", { class: "padded", hidden: true }, NONE);
-    main.append(this.none, this.stage, el("div", { class: "player-bar" }, this.slider, this.words), this.table);
-    if (canDraw()) {
-      this.viewer = new Viewer(this.stage, "The limb coloured by what the socket does to it.");
-      this.viewer.canvas.addEventListener("pointermove", (event) => this.point(event));
-    } else this.stage.append(el("p", { class: "padded failed" }, NO_WEBGL));
-    replace(side, labelled("run", this.run), labelled("show", this.field), labelled("colours", this.map),
+    this.stages = el("div", { class: "socket-stages" });
+    this.bar = el("div", { class: "player-bar" }, this.slider, this.words);
+    main.append(this.none, this.stages, this.bar, this.table);
+    this.panes = [this.pane()];
+    this.editor = new ShapeEditor(this);
+    if (this.viewer) Object.assign(this.viewer, { onSite: (name) => this.editor.choose(name), onMesh: (point) => this.shaping && this.editor.placed(point) });
+    this.ofRuns = el("div", {}, labelled("run", this.run), labelled("beside it", this.beside), labelled("show", this.field));
+    this.starters = [["Run the socket", false], ["Run the design", true]].map(([text, design]) =>
+      el("button", { type: "button", onclick: () => this.start(design) }, text));
+    this.stop = el("button", { type: "button", onclick: () => this.post("identification/stop", {}, "was asked to stop; what is finished is kept") }, "Stop");
+    this.progress = el("p", { class: "hint", role: "status" });
+    replace(side, labelled("view", this.mode), this.ofRuns, this.editor.part, labelled("colours", this.colours),
       el("div", { class: "row", role: "group", "aria-label": "Side of the limb" },
         SIDES.map(([name, azimuth]) => el("button", { type: "button", onclick: () => this.viewer?.view.side(azimuth) }, name))),
-      el("p", { class: "hint" }, NAVIGATION), el("h2", {}, "Under the pointer"), this.pointed);
+      el("p", { class: "hint" }, NAVIGATION), (this.underPointer = el("h2", {}, "Under the pointer")), this.pointed,
+      el("h2", {}, "Run"), el("div", { class: "row" }, this.starters, this.stop), this.progress);
+    this.arrange();
+  }
+
+  get viewer() {
+    return this.panes[0].viewer;
+  }
+
+  get shaping() {
+    return this.mode.value === SHAPE;
+  }
+
+  map() {
+    return this.colours.value;
+  }
+
+  pane() {
+    const pane = new Pane(this.stages, this.context);
+    pane.viewer?.canvas.addEventListener("pointermove", (event) => {
+      if (!this.shaping) this.pointed.textContent = pane.pointed(event, FIELDS[this.field.value]);
+    });
+    return pane;
+  }
+
+  arrange() {
+    this.ofRuns.hidden = this.underPointer.hidden = this.pointed.hidden = this.shaping;
+    this.editor.part.hidden = !this.shaping;
+    this.bar.hidden = this.table.hidden = this.shaping;
+  }
+
+  async switch() {
+    this.arrange();
+    this.editor.leave();
+    this.compareWith(null);
+    this.panes[0].clear();
+    this.marks = "";
+    await this.refresh();
   }
 
   async refresh() {
     try {
+      const shape = await this.context.api.get("socket/shape");
+      this.tellRun(shape);
       const found = await this.context.api.get("socket"), marks = JSON.stringify(found);
-      if (marks === this.marks) return;
-      Object.assign(this, { marks, runs: found.runs, frame: found.frame });
-      const before = this.run.value;
-      replace(this.run, ...found.runs.map((one) => el("option", { value: one.run }, one.run)));
-      if (found.runs.some((one) => one.run === before)) this.run.value = before;
-      await this.load();
+      this.frame = found.frame;
+      if (this.shaping) {
+        this.none.hidden = true;
+        this.stages.hidden = false;
+        const seen = JSON.stringify({ ...shape, run: null, starting: null, last: null });
+        if (seen !== this.marks) await this.editor.take(shape);
+        this.marks = seen;
+      } else if (marks !== this.marks) {
+        Object.assign(this, { marks, runs: found.runs });
+        this.options(this.run, found.runs);
+        this.options(this.beside, found.runs, [["", "nothing"]]);
+        await this.load();
+      }
     } catch (error) {
       this.context.warn(error.message);
     }
   }
 
+  options(select, runs, first = []) {
+    const before = select.value;
+    replace(select, ...[...first, ...runs.map((one) => [one.run, one.run])].map(([key, text]) => el("option", { value: key }, text)));
+    if ([...select.options].some((one) => one.value === before)) select.value = before;
+  }
+
+  tellRun({ run, starting, last }) {
+    const busy = Boolean(run || starting);
+    for (const button of this.starters) button.disabled = busy;
+    this.stop.disabled = !busy;
+    const now = last?.now;
+    this.progress.textContent = busy ? (now ? `${now.stage}: ${now.text}` : "Starting …") : last?.error ?? "";
+    this.progress.className = !busy && last?.error ? "bad" : "hint";
+    clearTimeout(this.soon);
+    if (starting && !run) this.soon = setTimeout(() => this.refresh(), 1500);
+  }
+
+  start(design) {
+    return this.post("socket/start", { design }, "was started");
+  }
+
+  async post(path, values, text) {
+    try {
+      const { process } = await this.context.api.post(path, values);
+      this.context.say(`Process ${process} ${text}.`);
+    } catch (error) {
+      this.context.warn(error.message);
+    }
+    this.context.refresh();
+    await this.refresh();
+  }
+
+  /** A second picture beside the first, or none. */
+  compareWith(run) {
+    if (run && !this.panes[1]) {
+      this.panes.push(this.pane());
+      if (this.viewer) link(this.viewer, this.panes[1].viewer);
+    } else if (!run && this.panes[1]) this.panes.pop().close();
+    this.stages.classList.toggle("two-panes", Boolean(run));
+    for (const pane of this.panes) pane.viewer?.resize();
+  }
+
   async load() {
-    const turn = ++this.turn, chosen = this.runs.find((one) => one.run === this.run.value);
+    const turn = ++this.turn, find = (name) => this.runs.find((one) => one.run === name);
+    const chosen = find(this.run.value), other = find(this.beside.value);
     this.none.hidden = Boolean(chosen);
-    this.stage.hidden = !chosen;
-    Object.assign(this, { chosen, mesh: null, frames: [] });
-    for (const part of [this.run, this.field, this.map, this.slider]) part.disabled = !chosen;
-    this.viewer?.setMesh(null);
-    this.viewer?.setColours(null);
+    this.stages.hidden = !chosen;
+    this.chosen = chosen;
+    for (const part of [this.run, this.beside, this.field, this.slider]) part.disabled = !chosen;
+    this.compareWith(chosen && other);
+    this.panes[0].clear();
     if (!chosen) return replace(this.table), (this.words.textContent = "");
     this.slider.max = String(chosen.steps.length - 1);
     try {
-      const { mesh, arrays, facts } = await loadMesh(this.context, `socket/mesh/${encodeURIComponent(chosen.run)}`);
-      if (turn !== this.turn) return;
-      Object.assign(this, { mesh, place: arrays.place.values, places: facts.places });
-      this.viewer?.setMesh(mesh, facts.regions.map((_, i) => REGION_COLOURS(i, facts.regions.length)));
-      this.viewer?.setStyle({ edged: false });
-      this.viewer?.lookAtAll(this.frame);
-      await this.read();
+      const wanted = [chosen, other].filter(Boolean);
+      await Promise.all(wanted.map((run, i) => this.panes[i].load(run, this.frame)));
+      if (turn === this.turn) await this.read();
     } catch (error) {
-      this.context.warn(error.message);
+      if (turn === this.turn) this.context.warn(error.message);
     }
   }
 
   /** The chosen field at all steps. */
   async read() {
-    const turn = ++this.turn, { chosen } = this;
-    if (!this.mesh) return;
+    const turn = this.turn;
+    if (this.panes.some((pane) => !pane.run)) return;
     try {
-      const path = `socket/step/${encodeURIComponent(chosen.run)}`;
-      const frames = await Promise.all(chosen.steps.map(async (_, at) =>
-        readArrays(await this.context.api.bytes(`${path}/${at}/${this.field.value}`)).arrays.values.values));
+      await Promise.all(this.panes.map((pane) => pane.read(this.field.value)));
       if (turn !== this.turn) return;
-      this.frames = frames;
       this.scale();
       this.show();
     } catch (error) {
@@ -96,41 +186,39 @@ class SocketView {
     }
   }
 
-  /** One colour range for all steps, from zero to the largest value of all. */
+  /** One colour range for all steps and both pictures, from zero to the largest value of all. */
   scale() {
-    if (!this.frames.length) return;
-    const high = Math.max(...this.frames.map(largest));
-    this.viewer?.setColours({ map: this.map.value, low: 0, high, beyond: [false, false], title: `${FIELDS[this.field.value]} (kPa)` });
+    if (this.panes.some((pane) => !pane.frames.length)) return;
+    const high = Math.max(...this.panes.map((pane) => pane.high));
+    for (const pane of this.panes) pane.scale(this.map(), high, `${FIELDS[this.field.value]} (kPa)`);
   }
 
   show() {
-    const at = Number(this.slider.value), step = this.chosen?.steps[at], values = this.frames[at];
-    if (!values) return;
-    const settled = typeof step.settling_mm === "number" ? `; settles by ${step.settling_mm.toFixed(1)} mm` : "";
-    this.words.textContent = `${step.name}; ${FIELDS[this.field.value]} at most ${shortNumber(largest(values))} kPa at a node${settled}`;
-    this.slider.setAttribute("aria-valuetext", step.name);
-    this.viewer?.setMoment({ on: "nodes", values }, null);
-    const number = (value) => value.toFixed(1);
-    replace(this.table, table(["region", "mean (kPa)", "95 % (kPa)", "peak (kPa)", "shear (kPa)"],
-      step.regions.map((row) => [row.region, number(row.mean_kPa), row.interval_kPa?.map(number).join(" to ") ?? "–", number(row.peak_kPa), number(row.shear_kPa)]),
-      `Regions, ${step.name}`));
-  }
-
-  /** What the node nearest to the pointer bears. */
-  point(event) {
-    const values = this.frames[Number(this.slider.value)], hit = values && this.viewer.meshAt(event);
-    if (!hit) return (this.pointed.textContent = "");
-    const { points } = this.mesh;
-    let node = 0, near = Infinity;
-    for (let i = 0; i < points.length / 3; i++) {
-      const far = (points[3 * i] - hit[0]) ** 2 + (points[3 * i + 1] - hit[1]) ** 2 + (points[3 * i + 2] - hit[2]) ** 2;
-      if (far < near) [node, near] = [i, far];
-    }
-    const place = this.places[this.place[node]] || "no region";
-    this.pointed.textContent = `${FIELDS[this.field.value]} ${shortNumber(values[node])} kPa; ${place}`;
+    const at = Number(this.slider.value), name = this.chosen?.steps[at]?.name;
+    const told = this.panes.map((pane) => pane.show(name, at, FIELDS[this.field.value]));
+    if (told.includes(null)) return;
+    this.words.textContent = told.length > 1 ? told.map((text, i) => `${this.panes[i].run.run}: ${text}`).join(" | ") : told[0];
+    this.slider.setAttribute("aria-valuetext", name);
+    replace(this.table, told.length > 1 ? compared(this.panes) : single(this.panes[0].step));
   }
 }
 
-function largest(values) {
-  return values.reduce((most, value) => Math.max(most, value), 0);
+const number = (value) => value.toFixed(1);
+
+function single(step) {
+  return table(["region", "mean (kPa)", "95 % (kPa)", "peak (kPa)", "shear (kPa)"],
+    step.regions.map((row) => [row.region, number(row.mean_kPa), row.interval_kPa?.map(number).join(" to ") ?? "–", number(row.peak_kPa), number(row.shear_kPa)]),
+    `Regions, ${step.name}`);
+}
+
+/** Means and peaks of two runs, and by how much the second's peak differs. */
+function compared([one, other]) {
+  const names = [one.run.run, other.run.run], rows = one.step.regions.map((row) => [row, other.step.regions.find((same) => same.region === row.region)]);
+  return table(["region", ...names.map((name) => `mean (kPa), ${name}`), ...names.map((name) => `peak (kPa), ${name}`), "change of peak (%)"],
+    rows.map(([row, same]) => {
+      const change = same && row.peak_kPa > 0 ? Math.round(100 * (same.peak_kPa / row.peak_kPa - 1)) : null;
+      const sign = change > 0 ? "+" : change < 0 ? "−" : "";
+      return [row.region, number(row.mean_kPa), same ? number(same.mean_kPa) : "–", number(row.peak_kPa), same ? number(same.peak_kPa) : "–",
+        change === null ? "–" : `${sign}${Math.abs(change)}`];
+    }), `Regions, ${one.step.name}`);
 }

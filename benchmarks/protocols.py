@@ -1,0 +1,434 @@
+"""What the paper's protocol, a designed one and each ingredient alone determine of a limb with known truth.
+
+    python benchmarks/protocols.py [--folder runs/protocols] [--only paper designed] [--seeds 0] [--json FILE]
+
+The limb is the stump of `identification_cases`: its true records come from other meshes (edges of 3 mm
+instead of the study's), finer surfaces, another element and more steps than the study has, with 0.05 N of
+noise, and 0.1 mm of noise in what ultrasound sees at 20 Hz. Four sites are fitted, two are held out with one
+ramp each. Judged are how many of the eight parameters are determined (95 % interval of at most -20 to +25 %),
+how many intervals hold the true value, the error at the held-out sites, and the patient's time: each record,
+30 s of rest after it, 60 s to prepare a site with an indenter. What is done is kept in the folder; a run that
+was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from identification_cases import (
+    HEAD,
+    INDENTER,
+    NOISE_N,
+    SPOTS,
+    STUDY_SPACING_MM,
+    TRUE_ELEMENT,
+    TRUE_MESH,
+    TRUE_SPACING_MM,
+    TRUE_STEPS,
+    Spot,
+    Stump,
+    parameters_of,
+)
+
+from limbfit import load_study, plan_protocol, run_study
+from limbfit.anatomy.meshing.meshing import base_mesh, mesh_site
+from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
+from limbfit.anatomy.surfaces.surfaces import save_anatomy
+from limbfit.execution import SerialExecutor
+from limbfit.fe import solve
+from limbfit.identify.checks.design import NoiseModel, information_of, prior_information
+from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan
+from limbfit.identify.fit.objective import SiteResponse
+from limbfit.indentation import SiteModel, build_problem, compressions, to_vector
+from limbfit.mesh import Mesh, gauges_along, read_vtu, write_vtu
+from limbfit.phantom.record import (
+    CLEARANCE_MM,
+    DISPLACEMENT_NOISE_MM,
+    HEADER,
+    RATE_HZ,
+    ULTRASOUND_HZ,
+    ULTRASOUND_NOISE_MM,
+)
+from limbfit.pipeline.experiments.protocol import DETERMINED
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
+from limbfit.pipeline.shared.store import Store, write_json
+from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.study import IndenterTable, Study
+
+SLOW, FAST, HOLD_S = 0.96, 4.8, 30.0
+BALL = IndenterTable(shape="sphere", width_mm=12.0)
+BALL_TABLE = '\n[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
+PRIORS = 'priors = "population"\n'
+REST_S, SETUP_S, MINUTES = 30.0, 60.0, 25.0
+AFTER_S = 0.4
+# Of linear theory: noise of a compared force, and the model's own error, which drifts along a record.
+EXPECTED_N, EXPECTED_CORRELATION, MISFITS = 0.015, 0.95, (0.02, 0.01, 0.005, 0.002)
+TISSUES = ("skin", "muscle")
+
+
+@dataclass(frozen=True)
+class Take:
+    """One record: where, with what, how fast and held for how long; ``seen``: with ultrasound."""
+
+    site: str
+    speed: float = SLOW
+    hold_s: float = 0.0
+    ball: bool = False
+    depth: float | None = None
+    seen: bool = False
+
+    @property
+    def name(self) -> str:
+        depth = "" if self.depth is None else f"-{self.depth:g}mm"
+        return f"{self.site}-{'ball' if self.ball else 'punch'}-{self.speed:g}-{self.hold_s:g}s{depth}"
+
+    @property
+    def spot(self) -> Spot:
+        return next(spot for spot in SPOTS if spot.name == self.site)
+
+    @property
+    def knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        depth = self.depth or self.spot.depth
+        ramp = depth / self.speed
+        if not self.hold_s:
+            return (0.0, ramp, 2 * ramp), (0.0, depth, 0.0)
+        return (0.0, ramp, ramp + self.hold_s, 2 * ramp + self.hold_s), (0.0, depth, depth, 0.0)
+
+
+FITTED = tuple(spot.name for spot in SPOTS if spot.fitted)
+HELD_OUT = tuple(Take(spot.name) for spot in SPOTS if not spot.fitted)
+RAMPS = tuple(Take(site) for site in FITTED)
+INGREDIENTS: dict[str, tuple[Take, ...]] = {
+    "paper": RAMPS,
+    "prior": RAMPS,
+    "hold": tuple(replace(one, hold_s=HOLD_S) for one in RAMPS),
+    "speed": (*RAMPS, *(replace(one, speed=FAST) for one in RAMPS)),
+    "indenter": (*RAMPS, *(replace(one, ball=True) for one in RAMPS)),
+    "ultrasound": tuple(replace(one, seen=True) for one in RAMPS),
+}
+DESIGNED = ("designed", "designed without ultrasound", "designed with prior")
+SHORT, SHORT_MINUTES = "8 minutes", 8.0  # the best at the true tissue
+CASES = (*INGREDIENTS, *DESIGNED, SHORT)
+
+
+@dataclass(frozen=True)
+class Limb:
+    """The true limb of a seed, whose meshes and answers are kept in a folder."""
+
+    folder: Path
+    seed: int
+
+    def _mesh(self, site: str) -> tuple[Mesh, tuple[float, ...], tuple[float, ...]]:
+        file, place = self.folder / "truth" / f"{site}.vtu", self.folder / "truth" / f"{site}.json"
+        if not place.is_file():
+            anatomy = Stump().anatomy(TRUE_SPACING_MM)
+            spot = Take(site).spot
+            position, _ = project_to_skin(anatomy, Stump().at(spot.degrees, spot.height))
+            axis = indenter_axis(anatomy.skin, position, INDENTER.width_mm)
+            mesh, _ = mesh_site(anatomy, position, axis, TRUE_MESH, base_mesh(anatomy, TRUE_MESH))
+            write_vtu(mesh, file)
+            write_json(place, {"position": list(map(float, position)), "axis": list(map(float, axis))})
+        known = json.loads(place.read_text())
+        return read_vtu(file), tuple(known["position"]), tuple(known["axis"])
+
+    def answer(self, take: Take) -> dict[str, np.ndarray]:
+        """Times from touch-down, true force and compressions, and the layers' thickness; simulated once."""
+        file = self.folder / "truth" / f"{self.seed}-{take.name}.npz"
+        if not file.is_file():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            mesh, position, axis = self._mesh(take.site)
+            indenter = BALL if take.ball else INDENTER
+            model = SiteModel(take.name, Path(), "", position, axis, *take.knots, indenter=indenter)
+            gauges = gauges_along(mesh, np.array(position), np.array(axis))
+            model = replace(model, layers=tuple(one.region for one in gauges))
+            problem = build_problem(model, mesh, parameters_of(self.seed))
+            steps = replace(TRUE_STEPS, load_steps=12, unload_steps=20)  # holds take those of unloading
+            result = solve(replace(problem, element=TRUE_ELEMENT), steps=steps, store="all")
+            if not result.completed:
+                raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
+            times = model.curve_times(401)
+            lost, _ = compressions(result, model, times)
+            told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
+            told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}
+            np.savez(file, times=times, force=result.force_at(times), **told)
+        with np.load(file) as stored:
+            return dict(stored)
+
+    def write(self, folder: Path, take: Take) -> None:
+        """What the robot writes of a record, and what ultrasound sees."""
+        found = self.answer(take)
+        random = np.random.default_rng([self.seed, *take.name.encode()])
+        clearance = random.uniform(*CLEARANCE_MM)
+        touch = clearance / take.speed
+        knots_s, knots_mm = take.knots
+        path_s = np.array([0.0, *(touch + t for t in knots_s), knots_s[-1] + 2 * touch])
+        path_mm = np.array([0.0, *(clearance + d for d in knots_mm), 0.0])
+        time = np.arange(0.0, path_s[-1] + AFTER_S, 1 / RATE_HZ)
+        moved = np.interp(time, path_s, path_mm) + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size)
+        force = np.interp(time - touch, found["times"], found["force"], left=0.0, right=0.0)
+        force = force + NOISE_N * random.standard_normal(time.size)
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savetxt(
+            folder / f"{take.name}.csv", np.column_stack([time, moved, force]), fmt=("%.3f", "%.4f", "%.4f"),
+            delimiter=",", header=HEADER, comments="",
+        )  # fmt: skip
+        if take.seen:
+            time = np.arange(0.0, path_s[-1], 1 / ULTRASOUND_HZ)
+            columns = [time]
+            for tissue in TISSUES:
+                lost = np.interp(time - touch, found["times"], found[f"compression_{tissue}"], left=0.0)
+                noise = ULTRASOUND_NOISE_MM * random.standard_normal(time.size)
+                columns.append(float(found[f"thickness_{tissue}"]) - lost + noise)
+            np.savetxt(
+                folder / f"{take.name}-layers.csv", np.column_stack(columns), fmt="%.3f", delimiter=",",
+                header=",".join(["time_s", *(f"{tissue}_mm" for tissue in TISSUES)]), comments="",
+            )  # fmt: skip
+
+
+def write_case(
+    folder: Path, limb: Limb, takes: Sequence[Take], edge_mm: float, prior: bool, held_out: Sequence[Take]
+) -> None:
+    """A study with these records of its fitted sites, and those that are ``held_out``."""
+    every = (*takes, *held_out)
+    save_anatomy(folder / "limb", Stump().anatomy(STUDY_SPACING_MM))
+    text = HEAD.replace("edge_near_mm = 6.0", f"edge_near_mm = {edge_mm}")
+    text = text.replace("load_steps = 5\nunload_steps = 4", "load_steps = 8\nunload_steps = 12")
+    if prior:
+        text = text.replace("[calibration]\n", f"[calibration]\n{PRIORS}")
+    text += BALL_TABLE if any(take.ball for take in takes) else ""
+    for spot in SPOTS:
+        if any(take.site == spot.name for take in every):
+            text += f'\n[[sites]]\nname = "{spot.name}"\nregion = "{spot.region}"\n'
+            text += f"fitted = {json.dumps(spot.fitted)}\n"
+            text += f"position = {Stump().at(spot.degrees, spot.height).tolist()}\n"
+    for take in every:
+        limb.write(folder / "traces", take)
+        name = take.name.removeprefix(f"{take.site}-")
+        text += f'\n[[records]]\nsite = "{take.site}"\nname = "{name}"\ntrace = "traces/{take.name}.csv"\n'
+        text += 'indenter = "ball"\n' if take.ball else ""
+        text += f'ultrasound = "traces/{take.name}-layers.csv"\n' if take.seen else ""
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+
+
+def minutes_of(takes: Sequence[Take]) -> float:
+    """How long a patient sits for these records."""
+    places = {(take.site, take.ball) for take in takes}
+    return (sum(take.knots[0][-1] + REST_S for take in takes) + SETUP_S * len(places)) / 60.0
+
+
+def plan_study(folder: Path, limb: Limb, edge_mm: float) -> Study:
+    """The fitted sites as they are before anybody is indented but for a ramp at each, with both indenters."""
+    place = folder / "plan"
+    if not (place / "study.toml").is_file():
+        write_case(place, limb, RAMPS, edge_mm, True, ())
+        text = (place / "study.toml").read_text()
+        (place / "study.toml").write_text(text.replace("\n[[sites]]", f"{BALL_TABLE}\n[[sites]]", 1))
+    study = load_study(place)
+    run_study(study, until="mesh", listener=lambda event: None)
+    return study
+
+
+def designed(folder: Path, limb: Limb, edge_mm: float, ultrasound: bool) -> tuple[Take, ...]:
+    """The protocol that limbfit designs before anybody is indented: at the start and two more tissues."""
+    seen = ULTRASOUND_NOISE_MM if ultrasound else None
+    found = plan_protocol(
+        plan_study(folder, limb, edge_mm),
+        minutes=MINUTES,
+        speeds_mm_s=(SLOW, FAST),
+        holds_s=(0.0, HOLD_S),
+        ultrasound_sd_mm=seen,
+    )
+    return tuple(
+        Take(
+            row["site"],
+            row["speed_mm_s"],
+            row["hold_s"],
+            row["indenter"] == "ball",
+            round(row["depth_mm"], 2),
+            ultrasound,
+        )
+        for row in found["records"]
+    )
+
+
+def told_of(
+    folder: Path, limb: Limb, edge_mm: float, takes: Sequence[Take], misfit: float
+) -> dict[Take, Option]:
+    """What records tell of the true tissue where the model's own error is ``misfit`` of the largest value.
+
+    With what ultrasound sees where a take is ``seen``. Simulated on the study's meshes, once.
+    """
+    study = plan_study(folder, limb, edge_mm)
+    context = Context(study, Store(study.results), SerialExecutor(), lambda event: None)
+    truth = study.vector(parameters_of(limb.seed))
+    force = NoiseModel(EXPECTED_N, misfit, EXPECTED_CORRELATION)
+    layers = NoiseModel(ULTRASOUND_NOISE_MM, misfit, EXPECTED_CORRELATION)
+    plain = [replace(take, seen=False) for take in takes]
+    jobs = []
+    for take in plain:
+        site = study.site(take.site).model_copy(update={"indenter": "ball" if take.ball else None})
+        model = site_model(context, site, *take.knots, searched=True, layers=TISSUES)
+        jobs.append(curve_job(replace(model, name=take.name), study.tissues, truth))
+    found = {}
+    done = SimulationCache(folder / f"expected-{limb.seed}").run(jobs, context.executor)
+    for take, one in zip(takes, done, strict=True):
+        if not one.completed:
+            raise SystemExit(f"{take.name} could not be simulated: {one.reason}")
+        information = information_of(SiteResponse(one.force_N, one.jacobian), truth, force)
+        if take.seen:
+            for lost, slopes in zip(one.compression_mm, one.compression_jacobian, strict=True):
+                information = information + information_of(SiteResponse(lost, slopes), truth, layers)
+        place = take.site, "ball" if take.ball else "punch"
+        found[take] = Option(place, take.knots[0][-1] + REST_S, information[None])
+    return found
+
+
+def wanted_of(folder: Path, limb: Limb, edge_mm: float) -> Wanted:
+    """All eight parameters, given the study's bounds."""
+    return Wanted(prior_information(unknowns(plan_study(folder, limb, edge_mm))), tuple(range(8)))
+
+
+def best_at_truth(
+    folder: Path, limb: Limb, edge_mm: float, minutes: float, misfit: float, seen: bool
+) -> tuple[Take, ...]:
+    """The protocol of so many minutes that linear theory prefers at the true tissue."""
+    ways = product(FITTED, (SLOW, FAST), (0.0, HOLD_S), (False, True))
+    every = [Take(site, speed, hold, ball, seen=seen) for site, speed, hold, ball in ways]
+    options = list(told_of(folder, limb, edge_mm, every, misfit).values())
+    best = plan(options, Budget(60.0 * minutes, SETUP_S), wanted_of(folder, limb, edge_mm))
+    return tuple(every[i] for i in best)
+
+
+def expected(folder: Path, limb: Limb, edge_mm: float) -> list[dict[str, Any]]:
+    """What linear theory expects of every protocol at the true tissue, by the size of the model's own error.
+
+    The designed ones are the best that fit into the session; all within the study's bounds.
+    """
+    wanted, rows = wanted_of(folder, limb, edge_mm), []
+    for misfit in MISFITS:
+        chosen = {name: takes for name, takes in INGREDIENTS.items() if name != "prior"}
+        for name, seen, minutes in (
+            ("designed", True, MINUTES),
+            ("designed without ultrasound", False, MINUTES),
+            (SHORT, True, SHORT_MINUTES),
+        ):
+            chosen[name] = best_at_truth(folder, limb, edge_mm, minutes, misfit, seen)
+        for name, takes in chosen.items():
+            options = list(told_of(folder, limb, edge_mm, takes, misfit).values())
+            (factors,) = factors_95(wanted.covariances(options, range(len(options)), 1))
+            rows.append(
+                {
+                    "case": name,
+                    "misfit_percent": 100 * misfit,
+                    "records": len(takes),
+                    "minutes": minutes_of(takes),
+                    "determined": int(np.sum(factors <= DETERMINED)),
+                    "factor_95": factors.tolist(),
+                }
+            )
+    return rows
+
+
+def judged(folder: Path, limb: Limb, takes: Sequence[Take]) -> dict[str, Any]:
+    """What a study that was run to its prediction found, beside the truth."""
+    store = Store(folder / "results")
+    found, predicted = store.read("calibrate", "calibration.json"), store.read("predict", "predict.json")
+    truth, known = to_vector(parameters_of(limb.seed), TISSUES), found["uncertainty"]
+    names = list(known["verdict"])
+    intervals = [known["intervals_95"][tissue][key] for tissue, key in (n.split(".") for n in names)]
+    inside = [bool(low <= value <= high) for value, (low, high) in zip(truth, intervals, strict=True)]
+    factors = [float(np.sqrt(high / low)) for low, high in intervals]
+    return {
+        "records": len(takes),
+        "minutes": minutes_of(takes),
+        "determined": sum(verdict == "determined" for verdict in known["verdict"].values()),
+        "inside": sum(inside),
+        "names": names,
+        "truth": truth.tolist(),
+        "answer": to_vector(found["stages"][-1]["parameters"], TISSUES).tolist(),
+        "factor_95": factors,
+        "inside_by_parameter": inside,
+        "error_fitted_percent": predicted["mean_error_fitted_percent"],
+        "error_heldout_percent": predicted["mean_error_heldout_percent"],
+        "misfit_percent": 100 * known["residuals"]["misfit_elsewhere"],
+    }
+
+
+def run_case(folder: Path, name: str, seed: int, edge_mm: float) -> dict[str, Any]:
+    limb = Limb(folder, seed)
+    place = folder / f"{seed}-{name.replace(' ', '-')}"
+    began = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+    ultrasound = "without" not in name
+    if name == SHORT:
+        takes = best_at_truth(folder, limb, edge_mm, SHORT_MINUTES, MISFITS[0], True)
+    else:
+        takes = INGREDIENTS[name] if name in INGREDIENTS else designed(folder, limb, edge_mm, ultrasound)
+    if not (place / "study.toml").is_file():
+        write_case(place, limb, takes, edge_mm, "prior" in name, HELD_OUT)
+    run_study(load_study(place), until="predict", listener=lambda event: None)
+    spent = resource.getrusage(resource.RUSAGE_SELF).ru_utime - began
+    return {"case": name, "seed": seed, "cpu_s": spent, **judged(place, limb, takes)}
+
+
+def line(case: dict[str, Any]) -> str:
+    widths = ", ".join(
+        f"{name} x/{factor:.2f}{'' if held else ' (outside)'}"
+        for name, factor, held in zip(
+            case["names"], case["factor_95"], case["inside_by_parameter"], strict=True
+        )
+    )
+    return (
+        f"{case['case']}, seed {case['seed']}: {case['records']} records in {case['minutes']:.0f} min, "
+        f"{case['determined']} of 8 determined, {case['inside']} of 8 inside, held-out error "
+        f"{case['error_heldout_percent']:.2f} %; {widths}"
+    )
+
+
+def told(row: dict[str, Any]) -> str:
+    factors = ", ".join(f"{factor:.2f}" for factor in row["factor_95"])
+    return (
+        f"{row['misfit_percent']:g} % of model error, {row['case']}: {row['records']} records in "
+        f"{row['minutes']:.0f} min, {row['determined']} of 8 determined; x/ {factors}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=Path("runs/protocols"))
+    parser.add_argument("--only", nargs="+", choices=CASES, default=CASES)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--edge", type=float, default=6.0, help="of the study's meshes near a site, mm")
+    parser.add_argument("--json", type=Path, help="write every case here; cases found there are kept")
+    parser.add_argument("--expected", action="store_true", help="linear theory at the truth instead of fits")
+    given = parser.parse_args()
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    if given.expected:
+        for seed in given.seeds:
+            for row in expected(given.folder, Limb(given.folder, seed), given.edge):
+                print(told(row), flush=True)
+        return
+    cases = json.loads(given.json.read_text()) if given.json and given.json.is_file() else []
+    for seed in given.seeds:
+        for name in given.only:
+            known = next((one for one in cases if (one["case"], one["seed"]) == (name, seed)), None)
+            if known is None:
+                known = run_case(given.folder, name, seed, given.edge)
+                cases.append(known)
+            print(line(known), flush=True)
+            if given.json:
+                given.json.write_text(json.dumps(cases, indent=1))
+
+
+if __name__ == "__main__":
+    main()

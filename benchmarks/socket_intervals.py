@@ -1,0 +1,147 @@
+"""Are the intervals of a socket's pressures and settling those of re-simulated parameters?
+
+    python benchmarks/socket_intervals.py STUDY --draws 12 --json intervals.json
+    python benchmarks/socket_intervals.py STUDY --identified OTHER --json intervals.json
+
+STUDY has identified parameters, or takes those of OTHER with their covariance.  Its socket is put on and
+loaded once with derivatives, and then with parameters drawn from the lognormal distribution of that
+covariance (by the seed and the number of the draw alone).  Told for the mean pressure of every region and
+the settling: the standard deviation by derivatives and of the draws, how far the draws are from what the
+derivatives foresee (rms), and how many lie within the 95 % interval, simulated and foreseen.  Also the change
+for a coefficient of friction 10 % larger, which counts as known.  Draws in the file of ``--json`` are not run
+again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import limbfit
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import flat_names, to_parameters, to_vector
+from limbfit.mesh import Mesh
+from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT, Z95
+from limbfit.pipeline.experiments.socket_limb import SocketLimb
+from limbfit.pipeline.shared.context import Context, quiet
+from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.pipeline.shared.store import Store
+from limbfit.socket import Socket
+
+SETTLING = "settling (mm)"
+FRICTION = 1.1  # times the study's
+
+
+class Bench:
+    """A study's limb and socket, and what is known of its tissues."""
+
+    def __init__(self, study: limbfit.Study, identified: limbfit.Study, folder: Path) -> None:
+        limbfit.run_study(study, until="surfaces")
+        context = Context(study, Store(study.results), SerialExecutor(), quiet)
+        found = Store(identified.results).read("calibrate", "calibration.json")
+        self.study = study
+        self.covariance = np.array(found["uncertainty"]["covariance_log"])
+        self.centre = to_vector(found["stages"][-1]["parameters"], study.tissues)
+        self.limb = SocketLimb.of(context, "intervals")
+        self.socket: Socket = socket_of(study, self.limb.anatomy, self.limb.outer.skin)
+        self.mesh: Mesh = self.limb.mesh(context, "intervals", folder, self.socket)[0]
+
+    def run(self, parameters: np.ndarray, *, known: bool = False, friction: float = 1.0) -> dict[str, Any]:
+        """Means and settling at parameters; ``known``: with their deviations by derivatives."""
+        table = self.study.socket
+        if friction != 1.0:
+            table = table.model_copy(update={"friction": friction * float(table.friction)})
+        study = self.study.model_copy(update={"socket": table})
+        limb, started = replace(self.limb, study=study), time.process_time()
+        laws = limb.materials(to_parameters(parameters, study.tissues))
+        found = limb.don(self.mesh, laws, self.socket, lambda *_: None, known)
+        load = limb.facts(found, self.socket, self.covariance.tolist() if known else None)["loads"][-1]
+        row = {"values": {one["region"]: one["mean_kPa"] for one in load["regions"]}}
+        row["values"][SETTLING] = load["settling_mm"]
+        row["cpu_s"] = round(time.process_time() - started, 1)
+        if known:
+            high = {one["region"]: one["interval_kPa"][1] for one in load["regions"]}
+            high[SETTLING] = load["settling_interval_mm"][1]
+            row["sd"] = {name: (high[name] - value) / Z95 for name, value in row["values"].items()}
+            row["from"] = {one["region"]: one["interval_from"] for one in load["regions"]}
+            row["from"][SETTLING] = load["settling_interval_from"]
+            row["change"] = {one["region"]: one["change_kPa"] for one in load["regions"]}
+            row["change"][SETTLING] = load["settling_change_mm"]
+        return row
+
+    def drawn(self, seed: int, number: int) -> np.ndarray:
+        """By how much the logarithms of a draw's parameters differ from the identified ones."""
+        random = np.random.default_rng([seed, number])
+        return random.multivariate_normal(np.zeros(len(self.centre)), self.covariance, method="eigh")
+
+    def foreseen(self, centre: dict[str, Any], name: str, step: np.ndarray) -> float:
+        """A value of a draw, by the derivatives at the centre."""
+        keys = [f"{tissue}.{key}" for tissue, key in flat_names(self.study.tissues)]
+        slopes = np.array([centre["change"][name][key] for key in keys]) / np.log1p(CHANGE_PERCENT / 100.0)
+        return float(centre["values"][name] + slopes @ step)
+
+
+def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
+    """Of each region, and settling."""
+    centre, draws = rows["centre"], {int(name): row for name, row in rows.items() if name.isdigit()}
+    steps = [bench.drawn(seed, number) for number in draws]
+    found = []
+    for name, value in centre["values"].items():
+        sample, sd = np.array([draw["values"][name] for draw in draws.values()]), centre["sd"][name]
+        linear = np.array([bench.foreseen(centre, name, step) for step in steps])
+        first, percent = next(iter(centre["from"][name].items()))
+        found.append(
+            {
+                "of": name,
+                "value": value,
+                "sd": sd,
+                "sd_drawn": float(sample.std(ddof=1)) if len(sample) > 1 else None,
+                "off_linear": float(np.sqrt(np.mean((sample - linear) ** 2))) if len(sample) else None,
+                "within": int((np.abs(sample - value) <= Z95 * sd).sum()),
+                "within_linear": int((np.abs(linear - value) <= Z95 * sd).sum()),
+                "draws": len(sample),
+                "mostly_from": f"{first} {percent:.0f} %",
+                "liner_c": centre["change"][name].get("liner.c_kPa"),
+                "friction": rows["friction"]["values"][name] - value if "friction" in rows else None,
+            }
+        )
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("study", type=Path)
+    parser.add_argument("--identified", type=Path, help="the study whose parameters and covariance are taken")
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, default=Path("runs/socket-intervals"), help="of the mesh")
+    parser.add_argument("--json", type=Path, required=True)
+    asked = parser.parse_args()
+    study = limbfit.load_study(asked.study)
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    identified = study if asked.identified is None else limbfit.load_study(asked.identified)
+    bench = Bench(study, identified, asked.folder)
+    rows: dict[str, Any] = json.loads(asked.json.read_text())["rows"] if asked.json.exists() else {}
+    wanted = ["centre", *(["friction"] if isinstance(study.socket.friction, float) else [])]
+    for name in (*wanted, *map(str, range(asked.draws))):
+        if name not in rows:
+            if name.isdigit():
+                rows[name] = bench.run(bench.centre * np.exp(bench.drawn(asked.seed, int(name))))
+            else:
+                rows[name] = bench.run(
+                    bench.centre, known=name == "centre", friction=FRICTION if name == "friction" else 1.0
+                )
+            print(f"{name}: {rows[name]['cpu_s']:.0f} CPU s", flush=True)
+            asked.json.write_text(json.dumps({"seed": asked.seed, "rows": rows}, indent=1) + "\n")
+    for row in told(bench, rows, asked.seed):
+        print(json.dumps(row))
+
+
+if __name__ == "__main__":
+    main()

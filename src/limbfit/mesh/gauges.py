@@ -1,0 +1,147 @@
+"""How thick the regions of a mesh are along a line, and how that changes as the mesh deforms.
+
+The line meets faces between regions; the points of these faces are followed as material points. What the
+thickness of a region loses is then a fixed linear function of the nodal displacements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from .cells import linear_simplex, quadratic_simplex
+from .volume import Mesh
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_ON_EDGE = 1e-9  # of a triangle's own coordinates: a line through an edge meets the faces on both sides
+_SAME_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """The thickness of one region along a line.
+
+    With displacements ``u`` along the line the region is ``weights @ u[nodes]`` mm thinner than its
+    ``thickness_mm`` at rest; ``nodes`` and ``weights`` are (k,).
+    """
+
+    region: str
+    thickness_mm: float
+    nodes: Ints
+    weights: Array
+
+
+@dataclass(frozen=True)
+class _Crossing:
+    """Where the line meets a face: so far along it (mm), from region ``above`` into ``below`` (-1: outside).
+
+    ``weights`` (j,) interpolate between the face's ``nodes`` (j,).
+    """
+
+    along_mm: float
+    above: int
+    below: int
+    nodes: Ints
+    weights: Array
+
+
+def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
+    """A gauge of each region that a line meets, from where it enters the mesh nearest to ``origin``.
+
+    It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
+    that is met twice, as skin is where the line passes no bone, the first part counts. Curved faces are met
+    as the flat triangles of their corners, and quadrilaterals as two.
+
+    Parameters
+    ----------
+    origin, axis : (3,) a point in mm, and the direction in which regions are met.
+
+    Raises
+    ------
+    ProblemError
+        Where the line does not enter the mesh.
+    """
+    axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    crossings = _crossings(mesh, np.asarray(origin, dtype=float), axis)
+    entries = [k for k, one in enumerate(crossings) if one.above < 0]
+    if not entries:
+        raise ProblemError("no tissue lies under the indenter's axis", remedy="check the site's position")
+    first = min(entries, key=lambda k: abs(crossings[k].along_mm))
+    end = next((k for k in range(first + 1, len(crossings)) if crossings[k].below < 0), None)
+    if end is None:
+        raise ProblemError("the mesh under the indenter is not closed", remedy="mesh the site anew")
+    spans: dict[int, tuple[_Crossing, _Crossing]] = {}
+    for top, bottom in pairwise(crossings[first : end + 1]):
+        spans.setdefault(top.below, (top, bottom))
+    return tuple(_gauge(mesh.region_names[region], *span) for region, span in spans.items())
+
+
+def _gauge(region: str, top: _Crossing, bottom: _Crossing) -> Gauge:
+    weights: Array = np.concatenate([top.weights, -bottom.weights])
+    kept, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
+    thickness = bottom.along_mm - top.along_mm
+    return Gauge(region, thickness, kept, np.bincount(place, weights).astype(np.float64))
+
+
+def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
+    """Where the line goes from one region into another, in order, each place once."""
+    near = _cells_at(mesh, origin, axis)
+    faces = mesh.cells[near][:, mesh.kind.faces]
+    owners = np.repeat(near, faces.shape[1])
+    faces = faces.reshape(-1, faces.shape[2])
+    corners = np.sort(faces[:, : mesh.kind.face_corners], axis=1)
+    _, first, place, counts = np.unique(
+        corners, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    last = np.empty(len(first), dtype=np.int64)
+    last[place.ravel()] = np.arange(len(faces))
+    found: list[_Crossing] = []
+    for one, other, count in zip(first, last, counts):
+        here, there = mesh.regions[owners[one]], mesh.regions[owners[other]]
+        if count == 1 or here != there:
+            outside = -1 if count == 1 else int(there)
+            found += _met(mesh, faces[one], origin, axis, int(here), outside)
+    found.sort(key=lambda c: c.along_mm)
+    kept: list[_Crossing] = []
+    for one in found:
+        doubled = kept and one.along_mm - kept[-1].along_mm < _SAME_MM and one.below == kept[-1].below
+        if not doubled:
+            kept.append(one)
+    return kept
+
+
+def _cells_at(mesh: Mesh, origin: Array, axis: Array) -> Ints:
+    """Cells (k,) whose corners lie around the line: in a ball about their middle that it meets."""
+    corners = mesh.points[mesh.corners]
+    middle = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    offset = middle - origin
+    away = np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1)
+    return np.flatnonzero(away <= radius + _SAME_MM)
+
+
+def _met(mesh: Mesh, face: Ints, origin: Array, axis: Array, inside: int, outside: int) -> list[_Crossing]:
+    """Where the line meets a face that is outward from region ``inside``: nowhere or once."""
+    triangles = [[0, 1, 2]] if mesh.kind.face_corners == 3 else [[0, 1, 2], [0, 2, 3]]
+    for triangle in triangles:
+        a, b, c = mesh.points[face[triangle]]
+        normal = np.cross(b - a, c - a)
+        slope = float(normal @ axis)
+        if abs(slope) <= 1e-12 * np.linalg.norm(normal):
+            continue
+        along = float(normal @ (a - origin)) / slope
+        local = np.linalg.lstsq(np.column_stack([b - a, c - a]), origin + along * axis - a, rcond=None)[0]
+        if local.min() < -_ON_EDGE or local.sum() > 1.0 + _ON_EDGE:
+            continue
+        shape = quadratic_simplex if len(face) == 6 else linear_simplex
+        nodes = face if len(face) == 6 else face[triangle]
+        weights = shape(local[None])[0][0]
+        above, below = (inside, outside) if slope > 0.0 else (outside, inside)
+        return [_Crossing(along, above, below, nodes, weights)]
+    return []

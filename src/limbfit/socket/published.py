@@ -1,0 +1,76 @@
+"""What others found where a socket presses, by region: to be read beside a result, without a verdict.
+
+Only findings that the cited abstracts state; figures in kPa depend on sensor, socket and activity and are
+left to the papers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+WHOLE = "the limb"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found over some regions, how, and by whom."""
+
+    regions: tuple[str, ...]
+    found: str
+    method: str
+    source: str
+
+
+SANDERS_1997 = "Sanders et al., J Rehabil Res Dev 1997, 34:19"
+FINDINGS = (
+    Finding(
+        ("tibial crest", "distal tibia", "anterior middle", "anterior distal"),
+        "the largest pressure and shear of stance, in its first half",
+        "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
+        SANDERS_1997,
+    ),
+    Finding(
+        ("medial proximal", "lateral proximal"),
+        "in front of them, the largest pressure in the second half of stance",
+        "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
+        SANDERS_1997,
+    ),
+    Finding(
+        ("patellar tendon",),
+        "the load grows where the limb shrinks, as at the distal end",
+        "measured monthly at 13 sites, walking, 2 persons who lost weight",
+        "Sanders et al., Prosthet Orthot Int 2002, 26:243",
+    ),
+    Finding(
+        ("patellar tendon",),
+        "a bar moved by 10 mm either way changed pressures elsewhere by nothing significant",
+        "measured, 10 men, patellar-tendon-bearing sockets",
+        "Abu Osman et al., Med Eng Phys 2010, 32:760",
+    ),
+    Finding(
+        ("distal fibula",),
+        "pressure concentrates there and near the brim with patellar-tendon bearing; it is lower and more "
+        "even in a hydrostatic socket",
+        "simulated by finite elements",
+        "Moo et al., Acta Bioeng Biomech 2009, 11(4)",
+    ),
+    Finding(
+        (WHOLE,),
+        "pressures are distributed alike in pressure-cast and in hand-cast patellar-tendon-bearing sockets, "
+        "and higher in the former",
+        "measured over more than 90 % of the socket, walking, 48 persons",
+        "Dumbleton et al., J Rehabil Res Dev 2009, 46:405",
+    ),
+)
+
+
+def published(regions: Collection[str]) -> list[Mapping[str, Any]]:
+    """The findings over any of the ``regions``, or over the whole limb, as they are stored."""
+    rows: list[Mapping[str, Any]] = []
+    for finding in FINDINGS:
+        here = [name for name in finding.regions if name in regions or name == WHOLE]
+        if here:
+            rows.append(asdict(finding) | {"regions": here})
+    return rows

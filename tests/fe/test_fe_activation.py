@@ -1,0 +1,114 @@
+"""Active stress along fibres: closed forms, tangent, no relaxation, derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import block, check_tangent, punch
+from scipy.optimize import brentq
+from test_fe_fibres import ASKEW, GROUND, LINES, TISSUE, bent, body
+
+from limbfit import History, OgdenQLV, Problem
+from limbfit.errors import ProblemError
+from limbfit.fe import Activation, Contractile, Fibred, StepControl, Support, System, iterate, solve
+from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.observables import element_fields
+from limbfit.fe.system import Increment
+
+ELASTIC = OgdenQLV(0.005, 4.0, 0.0, 1.0)
+RAMP = Activation([0.0, 1.0], [0.0, 1.0])
+
+
+def bar(tissue: Contractile, held: bool, end_s: float = 1.0, activation: Activation = RAMP) -> Problem:
+    """A cube with fibres along x, its sides free; its ends are held, or free too."""
+    mesh = block("hex8", LINES, LINES, LINES)
+    planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
+    if held:
+        planes.append(Support(np.flatnonzero(mesh.points[:, 0] == 1.0), 0))
+    return Problem(
+        mesh, {"skin": tissue, "muscle": tissue}, np.zeros(0, dtype=int), mesh.face_sets["top"][:0], None,
+        History(np.array([0.0, end_s]), np.array([0.0, 1e-9])), supports=tuple(planes),
+        fibres=(1.0, 0.0, 0.0), activation=activation,
+    )  # fmt: skip
+
+
+def test_a_free_bar_shortens_until_the_ground_bears_the_active_stress():
+    """At constant volume ``c/m (2 l^m + ...)`` along and across: ``T = 2 c/m (sinh(m e) + sinh(m e/2))``."""
+    tissue = Contractile(Fibred(replace(ELASTIC, kappa_ratio=1e4), 0.0, 1.0), 0.01)
+    result = solve(bar(tissue, held=False), StepControl(load_steps=5, tolerance=1e-10), store="all")
+    assert result.completed, result.reason
+    stretch = 1.0 + result.states[-1].u[:, 0].min()
+    c, m = ELASTIC.c, ELASTIC.m
+
+    def missing(e: float) -> float:
+        return 2.0 * c / m * (np.sinh(m * e) + np.sinh(m * e / 2.0)) - 0.01
+
+    assert stretch == pytest.approx(np.exp(-brentq(missing, 0.0, 1.0)), rel=1e-3)
+    assert stretch < 0.85
+
+
+def test_a_held_bar_pulls_with_the_active_stress_and_does_not_relax():
+    """Sides free, length held: the stress along is the active one; it stays in a hold of relaxing tissue."""
+    tissue = Contractile(Fibred(replace(GROUND, kappa_ratio=1e4), 0.02, 3.0), 0.004)
+    held = Activation([0.0, 1.0, 9.0], [0.0, 1.0, 1.0])
+    times = StepControl(times=(0.5, 1.0, 3.0, 9.0), tolerance=1e-10)
+    problem = bar(tissue, True, 9.0, held)
+    system, laws = System(problem), Laws.build([tissue, tissue])
+    stress = [element_fields(system, laws, step.state).cauchy[:, 0] for step in iterate(problem, times)]
+    assert len(stress) == 4
+    for found, share in zip(stress, (0.5, 1.0, 1.0, 1.0)):
+        np.testing.assert_allclose(found, 0.004 * share, rtol=1e-3)
+
+
+@pytest.mark.parametrize("element", ["", "tet10p0"])
+def test_forces_and_tangent_are_derivatives(element):
+    system, passive = body("tet10", element)
+    laws = Laws.build([OgdenQLV(0.009, 6.0, 2.0, 0.5), Contractile(TISSUE, 0.1)])
+    K = 0.001 * np.random.default_rng(2).normal(size=(*system.weights.shape, 6))
+    step = Increment(0.0, 0.0, np.array([1.5, 2.5]), K, 1.0, activation=0.7)
+    u = bent(system)
+    d = np.random.default_rng(5).normal(size=u.shape) * ~system.supported
+    here = check_tangent(system, laws, u, step, d)
+    without = system.evaluate(u, passive, step).residual
+    assert np.abs(here.residual - without).max() > 0.05 * np.abs(without).max()
+
+
+def test_sensitivities_of_a_contracting_muscle_under_a_punch():
+    """It tenses while it is pressed; forces by the active stress, the fibres and the ground."""
+    muscle = Contractile(TISSUE, 0.006)
+    problem = punch(
+        "tet10", 2, 1, materials={"skin": GROUND, "muscle": muscle}, fibres=ASKEW,
+        activation=Activation([0.0, 4.0, 9.0], [0.0, 1.0, 0.5]),
+    )  # fmt: skip
+    control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-11)
+    centre = solve(problem, control, sensitivities=True, store="all")
+    assert centre.completed, centre.reason
+    names = list(centre.parameter_names)
+    assert names[-1] == ("muscle", "active")
+    passive = solve(replace(problem, materials={"skin": GROUND, "muscle": TISSUE}), control)
+    assert np.abs(centre.force - passive.force_at(centre.times)).max() > 0.02 * passive.force.max()
+    for name in ("active", "k1", "c"):
+        value = dict(zip(muscle.parameter_names, muscle.parameters))[name]
+        forces = []
+        for sign in (1, -1):
+            moved = muscle.with_parameters({name: value * (1 + sign * 1e-4)})
+            changed = problem.with_materials({"skin": GROUND, "muscle": moved})
+            forces.append(solve(changed, control, warm_start=centre).force)
+        difference = (forces[0] - forces[1]) / (2e-4 * value)
+        slope = centre.force_sensitivity[:, names.index(("muscle", name))]
+        np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max(), err_msg=name)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ProblemError, match=r"active = -1\.0 is negative"):
+        Contractile(TISSUE, -1.0)
+    with pytest.raises(ProblemError, match="acts at no stated time"):
+        solve(replace(bar(Contractile(TISSUE, 0.01), True), activation=None))
+    with pytest.raises(ProblemError, match="do not grow from 0"):
+        Activation([1.0, 2.0], [0.0, 1.0])
+    with pytest.raises(ProblemError, match="negative or not finite"):
+        Activation([0.0, 1.0], [0.0, -1.0])
+    with pytest.raises(ProblemError, match="have no direction"):
+        solve(replace(bar(Contractile(Fibred(GROUND, 0.0, 1.0), 0.01), True), fibres=None))

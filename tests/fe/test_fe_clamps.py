@@ -1,0 +1,78 @@
+"""The pins that clamp a limb: where they are, what they do, and the indentation between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from blocks import boundary
+
+from limbfit import History, Indenter, OgdenQLV, Problem
+from limbfit.bench.blocks import SIX_TETS, boxes, upright
+from limbfit.errors import ProblemError
+from limbfit.fe import StepControl, solve
+from limbfit.indentation.clamps import Clamps, clamped, clamping_pins
+from limbfit.mesh import Mesh
+
+INNER, OUTER, LENGTH = 15.0, 45.0, 100.0  # mm
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def pipe(radial: int = 3, around: int = 28, up: int = 10) -> Mesh:
+    """Tissue around a rigid bone along z."""
+    lines = np.linspace(INNER, OUTER, radial + 1), np.linspace(0.0, 2.0 * np.pi, around + 1)
+    points, corners = boxes(*lines, np.linspace(0.0, LENGTH, up + 1))
+    r, angle, z = points.T
+    points = np.column_stack([r * np.cos(angle), r * np.sin(angle), z])
+    _, first, number = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
+    cells = number.ravel()[corners[:, SIX_TETS].reshape(-1, 4)]
+    points, r = points[first], r[first]
+    cells = upright(points, cells)
+    faces = boundary(cells, "tet4")
+    skin = faces[(r[faces] > OUTER - 1e-6).all(axis=1)]
+    sets = {"fixed_bone": np.flatnonzero(r < INNER + 1e-6)}
+    return Mesh(points, cells, "tet4", np.zeros(len(cells), dtype=int), ("muscle",), sets, {"skin": skin})
+
+
+def site(mesh: Mesh, axis: tuple[float, float, float] = (-1.0, 0.0, 0.0)) -> Problem:
+    """An indentation by 4 mm from the x axis."""
+    faces = mesh.face_sets["skin"]
+    near = mesh.points[faces].mean(axis=1)[:, 0] > 0.6 * OUTER
+    tool = Indenter("square", 20.0, 2.0, centre=(OUTER, 0.0, 0.5 * LENGTH), axis=axis)
+    history = History(np.array([0.0, 4.0, 8.0]), np.array([0.0, 4.0, 0.0]))
+    tissue = {"muscle": OgdenQLV(0.02, 4.0, 0.5, 0.5)}
+    return Problem(mesh, tissue, mesh.held, faces[near], tool, history)
+
+
+def test_eleven_of_fourteen_pins_clamp_all_around_but_beside_the_test_pin():
+    problem = site(pipe())
+    pins = clamping_pins(problem.mesh, problem.indenter, UP, Clamps())
+    assert len(pins) == 11
+    axes = np.array([pin.frame[2] for pin in pins])
+    turns = np.degrees(np.arccos(axes @ [-1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        sorted(turns), sorted([360.0 / 14.0 * min(k, 14 - k) for k in range(2, 13)]), atol=1e-6
+    )
+    np.testing.assert_allclose(axes[:, 2], 0.0, atol=1e-12)
+    assert len(clamping_pins(problem.mesh, problem.indenter, UP, Clamps(pins=8, clear=2))) == 3
+
+
+def test_a_test_pin_along_the_limb_has_no_ring():
+    problem = site(pipe(), axis=(-0.1, 0.0, -1.0))
+    with pytest.raises(ProblemError, match="points along the limb"):
+        clamping_pins(problem.mesh, problem.indenter, UP, Clamps())
+
+
+@pytest.mark.slow
+def test_a_clamped_limb_bulges_between_the_pins_and_is_stiffer_there():
+    problem, control = site(pipe()), StepControl(load_steps=4, unload_steps=3)
+    bare = solve(problem, control)
+    held = clamped(problem, UP, Clamps(force_N=8.0, settling_s=2.0), control)
+    assert held.moved_mm < -0.1  # outwards: the tissue has to go somewhere
+    assert (held.sunk_mm > 0.2).all()
+    found = solve(held.problem, control)
+    assert found.completed, found.reason
+    after = found.times > held.started_s
+    np.testing.assert_allclose(found.reactions[after, 1:, 2], 8.0, rtol=1e-3)
+    assert np.abs(found.force[found.times <= held.started_s]).max() < 1e-6
+    peak = held.started_s + 4.0
+    assert found.force_at([peak])[0] > 1.05 * bare.peak_force

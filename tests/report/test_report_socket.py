@@ -1,0 +1,74 @@
+"""What table and report say beside a socket's pressures: where intervals come from, what others found."""
+
+from __future__ import annotations
+
+import pytest
+
+from limbfit.cli.socket import show_socket
+from limbfit.report.page import Table
+from limbfit.report.sections.socket_beside import interval_blocks, published_blocks
+from limbfit.socket.published import FINDINGS, WHOLE, published
+
+SHARES = {"skin.c_kPa": 80.0, "muscle.tau_s": 12.4}
+REGION = {
+    "region": "tibial crest",
+    "mean_kPa": 30.0,
+    "peak_kPa": 60.0,
+    "shear_kPa": 4.0,
+    "interval_kPa": [28.0, 32.0],
+    "interval_from": SHARES,
+    "change_kPa": {"skin.c_kPa": 1.0, "muscle.tau_s": 0.2, "liner.c_kPa": -0.5},
+}
+HELD = {
+    "name": "stance",
+    "peak_kPa": 60.0,
+    "contact_area_mm2": 3e4,
+    "settling_mm": 9.0,
+    "settling_interval_mm": [8.0, 10.0],
+    "settling_interval_from": SHARES,
+    "settling_change_mm": {"liner.c_kPa": -0.25},
+    "regions": [REGION],
+}
+
+
+def test_the_table_of_intervals_names_parameters_and_what_the_liner_changes():
+    (table,) = interval_blocks(HELD, "stance")
+    assert isinstance(table, Table)
+    assert table.head[3:] == ("muscle τ (%)", "skin c (%)", "Change, liner c 10 % larger")
+    rows = [[cell.text for cell in row.cells] for row in table.rows]
+    assert rows == [
+        ["tibial crest", "30.0 kPa", "2.00 kPa", "12", "80", "−0.5 kPa"],
+        ["settling", "9.0 mm", "1.00 mm", "12", "80", "−0.25 mm"],
+    ]
+
+
+def test_without_identified_tissues_there_is_no_such_table():
+    unknown = {**REGION, "interval_kPa": None, "interval_from": None, "change_kPa": None}
+    assert interval_blocks({"regions": [unknown]}, "donning") == ()
+
+
+def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
+    donning = {**HELD, "name": "donning"}
+    del donning["settling_mm"]
+    show_socket(
+        {
+            "donning": donning,
+            "loads": [HELD],
+            "socket": {"notes": ["its triangles looked away from the tissue and were turned"]},
+            "parameters_from": "identified",
+            "balance_percent": 0.01,
+        }
+    )
+    out = " ".join(capsys.readouterr().out.split())
+    assert "socket: its triangles looked away from the tissue and were turned" in out
+    assert "settled by 9.0 mm (95 %: 8.0 to 10.0, mostly from skin c 80 %)" in out
+    assert "28.0 to 32.0 skin c 80 %" in out
+
+
+@pytest.mark.parametrize("finding", FINDINGS, ids=lambda finding: finding.source)
+def test_every_finding_is_told_of_its_regions_with_its_source(finding):
+    rows = published([*finding.regions, "another"])
+    assert finding.source in {row["source"] for row in rows}
+    table, _ = published_blocks({"published": rows})
+    assert any(finding.found in {cell.text for cell in row.cells} for row in table.rows)
+    assert all(set(row["regions"]) <= {*finding.regions, WHOLE} for row in rows)

@@ -1,0 +1,234 @@
+"""Layers seen by ultrasound through the indenter: from the file to the prediction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from limbfit.report.sections.layers import layer_figure
+
+import layered
+from layered import layered_block, store_blocks
+from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import layered_block as block_of
+from limbfit.errors import ProblemError, TraceError
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
+from limbfit.mesh import gauges_along, write_vtu
+from limbfit.phantom.record import Ramp, record, write_ultrasound
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
+from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.stages.laboratory import Laboratory, linearised
+from limbfit.pipeline.stages.predict import run_predict
+from limbfit.report.store import load_store
+from limbfit.study import SolverTable, Study, load_study
+from limbfit.traces import Layers, read_layers, thinnings
+
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (2.3, -4.1)], ids=["on an edge", "inside"])
+@pytest.mark.parametrize("kind", ["hex8", "tet10"])
+def test_a_gauge_follows_the_interfaces(kind: str, place: tuple[float, float]) -> None:
+    """Displacements that the elements represent exactly: what the layers lose is known."""
+    mesh = block_of(kind, 6)
+    found = {one.region: one for one in gauges_along(mesh, np.array([*place, 0.0]), DOWN)}
+    assert {name: one.thickness_mm for name, one in found.items()} == pytest.approx(
+        {"skin": 3.0, "muscle": 27.0}
+    )
+    x, _, z = mesh.points.T
+    down = -0.1 * z + 0.01 * x
+    for name, one in found.items():
+        assert one.weights @ down[one.nodes] == pytest.approx(-0.1 * found[name].thickness_mm, rel=1e-9)
+
+
+def test_quadratic_faces_are_followed_by_their_own_functions() -> None:
+    mesh = block_of("tet10", 6)
+    skin, muscle = gauges_along(mesh, np.array([2.3, -4.1, 0.0]), DOWN)
+    sunk = 0.02 * mesh.points[:, 0] ** 2 * (mesh.points[:, 2] > -1.0)  # of the top alone
+    assert skin.weights @ sunk[skin.nodes] == pytest.approx(0.02 * 2.3**2, rel=1e-9)
+    assert muscle.weights @ sunk[muscle.nodes] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_what_lies_on_the_other_side_is_not_counted() -> None:
+    """Skin above and below muscle: ultrasound sees the near one."""
+    mesh = layered_block((3.0, 9.0, 2.0), ("skin", "muscle", "far"), 12.0, 4, 3.0)
+    mesh = replace(mesh, regions=np.where(mesh.regions == 2, 0, mesh.regions))
+    found = gauges_along(mesh, np.array([1.0, 2.0, 0.0]), DOWN)
+    assert {one.region: one.thickness_mm for one in found} == pytest.approx({"skin": 3.0, "muscle": 9.0})
+
+
+def test_no_tissue_under_the_axis_is_told() -> None:
+    with pytest.raises(ProblemError, match="no tissue lies under the indenter's axis"):
+        gauges_along(block_of("hex8", 4), np.array([100.0, 0.0, 0.0]), DOWN)
+
+
+@pytest.mark.slow
+def test_compressions_follow_the_parameters(tmp_path: Path) -> None:
+    """Together the layers lose about the indenter's depth (elements of 6 mm); slopes beside differences."""
+    mesh = layered_block((3.0, 4.0, 9.0), half_mm=12.0, divisions=4, height_mm=4.0)
+    steps = SolverTable(load_steps=3, unload_steps=2, penalty_per_mm=400.0)
+    model = replace(block_site("a", tmp_path / "a.vtu", mesh, 2.0, steps), layers=("fat", "muscle", "skin"))
+    tissues, vector = layered.TISSUES, to_vector(layered.TRUTH, layered.TISSUES)
+    times = tuple(np.linspace(0.2, 3.5, 12))
+    found = simulate(SimulationJob(model, tissues, tuple(vector), times))
+    assert found.compression_mm.shape == (3, 12)
+    assert found.compression_jacobian is not None
+    depth = np.interp(times, model.knots_s, model.knots_mm)
+    loading = np.array(times) < 2.0
+    assert found.compression_mm.sum(axis=0)[loading] == pytest.approx(depth[loading], rel=0.08)
+    assert (found.compression_mm[0] > 0.0).any()
+    for i in (0, 4, 9):  # the skin's and the fat's modulus, the muscle's exponent
+        step = 1e-3 * vector[i] * np.eye(len(vector))[i]
+        ends = [
+            simulate(SimulationJob(model, tissues, tuple(vector + s), times, False)) for s in (step, -step)
+        ]
+        slope = (ends[0].compression_mm - ends[1].compression_mm) / (2e-3 * vector[i])
+        assert found.compression_jacobian[:, :, i] == pytest.approx(slope, abs=5e-3 * np.abs(slope).max())
+
+
+def table(folder: Path, head: str, rows: np.ndarray) -> Path:
+    np.savetxt(folder / "u.csv", rows, delimiter=",", header=head, comments="")
+    return folder / "u.csv"
+
+
+def test_readings_become_compressions_with_their_noise(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    time = np.arange(0.0, 10.0, 0.02)
+    true = np.interp(time, [1.0, 5.0, 9.0], [0.0, 2.0, 0.0])
+    rows = np.column_stack([time, 20.0 - true + rng.normal(0.0, 0.1, time.size), 2.0 + 0.0 * time])
+    layers = read_layers(table(tmp_path, "time_s,muscle_mm,skin_mm", rows), "time_s")
+    muscle, skin = thinnings(layers, 1.0, 9.0, 0.1)
+    assert (muscle.tissue, skin.tissue) == ("muscle", "skin")
+    assert muscle.is_seen
+    assert not skin.is_seen
+    assert muscle.thickness_mm == pytest.approx(20.0, abs=0.05)
+    assert len(muscle.time_s) <= 81
+    assert muscle.samples.sum() == np.sum((time >= 1.0) & (time <= 9.0))
+    off = muscle.compression_mm - np.interp(muscle.time_s + 1.0, time, true)
+    assert np.sqrt(off @ np.linalg.solve(muscle.covariance, off) / len(off)) == pytest.approx(1.0, abs=0.25)
+
+
+WRONG = {
+    "no tissue": ("time_s,depth", [[0.0, 1.0], [1.0, 2.0]], "no thickness of a tissue"),
+    "no time": ("t,fat_mm", [[0.0, 1.0], [1.0, 2.0]], "no column 'time_s'"),
+    "metres": ("time_s,fat_mm", [[0.0, 0.01], [1.0, 0.01]], "is no tissue's thickness"),
+    "order": ("time_s,fat_mm", [[1.0, 5.0], [0.0, 5.0]], "time does not increase"),
+    "a gap": ("time_s,fat_mm", [[0.0, 5.0], [1.0, np.nan]], "nan in sample 2"),
+}
+
+
+@pytest.mark.parametrize(("head", "rows", "told"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_with_a_file_is_told(tmp_path: Path, head: str, rows: list, told: str) -> None:
+    with pytest.raises(TraceError, match=told):
+        read_layers(table(tmp_path, head, np.array(rows)), "time_s")
+
+
+def test_readings_must_begin_before_and_last_into_contact() -> None:
+    layers = Layers(np.linspace(2.0, 3.0, 20), {"fat": np.full(20, 5.0)})
+    with pytest.raises(TraceError, match="no reading before touch-down"):
+        thinnings(layers, 1.0, 9.0, 0.1)
+    with pytest.raises(TraceError, match="only 1 readings in contact"):
+        thinnings(layers, 2.98, 9.0, 0.1)
+
+
+BLOCK = (3.0, 9.0)
+TRUTH = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
+TEXT = """
+[study]
+name = "a block"
+[surfaces]
+skin = "skin.stl"
+[indenter]
+width_mm = 10.0
+edge_radius_mm = 2.0
+[solver]
+load_steps = 8
+unload_steps = 8
+penalty_per_mm = 100.0
+[mesh.coarse]
+edge_near_mm = 6.0
+[calibration]
+max_iterations = 2
+corrections = 1
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+"""
+
+
+def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
+    """A study of a block, whose record and ultrasound come from the same mesh and element."""
+    mesh = layered_block(BLOCK, ("skin", "muscle"), 12.0, 6, 3.0)
+
+    def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+        write_vtu(mesh, folder / "truth.vtu")
+        model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", layers=study.tissues)
+        model = replace(model, element=study.mesh.element)
+        times = np.linspace(0.0, model.knots_s[-1], 201)
+        job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
+        found = simulate(job)
+        made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
+        made.write(study.path(Path("a.csv")))
+        layers = {
+            tissue: (thick, lambda t, lost=lost: np.interp(t, times, lost))
+            for tissue, thick, lost in zip(study.tissues, BLOCK, found.compression_mm, strict=True)
+        }
+        write_ultrasound(folder / "a-layers.csv", made, layers, random)
+
+    monkeypatch.setattr(layered, "_write_record", write)
+    for name in ("skin.stl", "a.csv", "a-layers.csv"):
+        (folder / name).touch()
+    (folder / "study.toml").write_text(TEXT + more)
+    study = load_study(folder)
+    store = store_blocks(study, {"a": (BLOCK, 3.0, True)}, TRUTH, 4, coarse=4)
+    for place in (store["mesh"], store["mesh"] / COARSE):
+        write_vtu(mesh, place / "a.vtu")
+    return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+@pytest.mark.slow
+def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
+    """Beside one ramp: nothing is off at the truth, and every interval is narrower than by force alone."""
+    widths = []
+    for name, more in (("force", ""), ("both", 'ultrasound = "a-layers.csv"\n')):
+        (tmp_path / name).mkdir()
+        context = stored(tmp_path / name, monkeypatch, more)
+        study = context.study
+        laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
+        at = laboratory.anchored(study.vector(TRUTH))
+        known = linearised(study, laboratory.records, study.vector(TRUTH), at)
+        widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
+    assert [one.name for one in laboratory.records] == ["a", "a+skin", "a+muscle"]
+    assert [one.unit for one in laboratory.measured] == ["N", "mm", "mm"]
+    for one, response, noise in zip(
+        laboratory.records[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
+    ):
+        off = response.force_N - one.compared
+        assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.0
+    assert laboratory.simulated == 1
+    assert (widths[1] < widths[0]).all()
+    for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
+        context.store[stage].mkdir()
+        run(context, context.store[stage])
+    found = context.store.read("calibrate", "calibration.json")
+    assert list(found["contact"]) == ["a"]
+    assert found["uncertainty"]["residuals"]["sites"]["a+muscle"]["unit"] == "mm"
+    last = found["stages"][-1]["iterations"][-1]
+    assert list(last["error_percent_by_site"]) == ["a", "a+skin", "a+muscle"]
+    (row,) = context.store.read("predict", "predict.json")["sites"]
+    assert {one["tissue"]: one["thickness_mm"] for one in row["layers"]} == pytest.approx(
+        {"skin": 3.0, "muscle": 9.0}, abs=0.1
+    )
+    assert (context.store["predict"] / "a+muscle.csv").is_file()
+    figure = layer_figure(load_store(study.results), fitted=True)
+    assert figure is not None
+    assert "a, muscle" in figure.markup
