@@ -46,7 +46,9 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         found, rounds_of[number] = laboratory.identify(start, stages)
         return found
 
-    tried = multistart(run, unknowns(study), table.starts, table.seed)
+    with laboratory.meshing(folder / "coarser") as meshed:
+        tried = multistart(run, unknowns(study), table.starts, table.seed)
+        meshed()
     found = tried.best
     known = laboratory.uncertainty(found, stages[-1], folder / "coarser")
     rounds = rounds_of[tried.number]

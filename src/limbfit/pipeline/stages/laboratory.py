@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ...anatomy.meshing.meshing import MeshSettings
 from ...errors import RunError
 from ...identify.fit.calibration import calibrate
 from ...identify.fit.correction import CoarseToFine
@@ -19,7 +21,7 @@ from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, s
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
 from ...identify.uncertainty.intervals import Kept, further_evaluations, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
-from ...indentation import Simulation, SimulationJob
+from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Study
 from ...study.meshing import MeshTable
 from ..shared.context import Context
@@ -28,7 +30,7 @@ from ..shared.simulations import SimulationCache
 from .doubted import Doubted
 from .mesh import mesh_settings
 from .record_noise import site_noise
-from .remesh import meshed_models, scaled_edges
+from .remesh import meshed_meanwhile, meshed_models, scaled_edges
 from .traces import SiteRecord, all_compared, as_searched, site_record
 
 Array = NDArray[np.float64]
@@ -192,11 +194,27 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
         return sampled
 
+    @contextmanager
+    def meshing(self, folder: Path) -> Iterator[Callable[[], None]]:
+        """The coarser meshes that `uncertainty` will want in ``folder``, made beside the block; it is given a
+        function that waits for them."""
+        if self.context.study.mesh.coarse is not None:
+            yield lambda: None
+            return
+        with meshed_meanwhile(self.context, folder, self._models, self._coarser_edges) as wait:
+            yield wait
+
+    @property
+    def _models(self) -> list[SiteModel]:
+        return [record.model for record in self.records]
+
+    @property
+    def _coarser_edges(self) -> MeshSettings:
+        return scaled_edges(mesh_settings(self.context.study), COARSER)
+
     def _coarser(self, folder: Path) -> list[SiteRecord]:
         """The records on coarser meshes than the study's own, which are made in ``folder``."""
-        settings = scaled_edges(mesh_settings(self.context.study), COARSER)
-        own = [record.model for record in self.records]
-        models = meshed_models(self.context, folder, own, settings, self.title)
+        models = meshed_models(self.context, folder, self._models, self._coarser_edges, self.title)
         return [replace(record, model=model) for record, model in zip(self.records, models, strict=True)]
 
     def _mesh_error(

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from ...anatomy.meshing.meshing import MeshSettings
+from ...execution import meanwhile
 from ...indentation import SiteModel
 from ..shared.context import Context
 from ..shared.store import file_digest
-from .mesh import is_meshed, make_mesh, mesh_job
+from .mesh import MeshJob, is_meshed, make_mesh, mesh_job
 
 
 def meshed_models(
@@ -20,17 +23,50 @@ def meshed_models(
 
     ``title`` is the stage or experiment that is told of progress.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = [
-        mesh_job(context, model.site, model.position, model.axis, settings, folder / f"{model.site}.vtu")
-        for model in models
-    ]
-    missing = [job for job in dict.fromkeys(jobs) if not is_meshed(job.file)]
+    jobs = _jobs(context, folder, models, settings)
+    missing = _missing(jobs)
     for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
     return [
         replace(model, mesh=job.file, mesh_digest=file_digest(job.file)) for model, job in zip(models, jobs)
     ]
+
+
+@contextmanager
+def meshed_meanwhile(
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
+) -> Iterator[Callable[[], None]]:
+    """Makes the meshes of `meshed_models` beside the block, while a core is idle; with one worker none is.
+
+    The block is given a function that waits for them.
+    """
+    missing = _missing(_jobs(context, folder, models, settings))
+    if not missing or context.executor.workers < 2:
+        yield lambda: None
+        return
+    with meanwhile(_mesh_idly, missing) as wait:
+        yield wait
+
+
+def _mesh_idly(jobs: Sequence[MeshJob]) -> None:
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(19)
+    for job in jobs:
+        make_mesh(job)
+
+
+def _jobs(
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
+) -> list[MeshJob]:
+    folder.mkdir(parents=True, exist_ok=True)
+    return [
+        mesh_job(context, model.site, model.position, model.axis, settings, folder / f"{model.site}.vtu")
+        for model in models
+    ]
+
+
+def _missing(jobs: Sequence[MeshJob]) -> list[MeshJob]:
+    return [job for job in dict.fromkeys(jobs) if not is_meshed(job.file)]
 
 
 def scaled_edges(settings: MeshSettings, factor: float) -> MeshSettings:
