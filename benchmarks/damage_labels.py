@@ -88,14 +88,14 @@ def limb_holes(random: Random, whole: Whole, folder: Path) -> Inputs:
     return written(random, whole, folder, whole.labels.with_array(array))
 
 
-@kind("labels", "refused", "another grid")
+@kind("labels", "refused", "a different grid")
 def labels_shifted(random: Random, whole: Whole, folder: Path) -> Inputs:
     shift = random.uniform(0.1, 0.9, 3)
     moved = replace(whole.labels, origin=whole.labels.index_to_point(shift))
     return written(random, whole, folder, moved)
 
 
-@kind("labels", "refused", "another grid")
+@kind("labels", "refused", "a different grid")
 def labels_stretched(random: Random, whole: Whole, folder: Path) -> Inputs:
     stretched = replace(whole.labels, spacing=whole.labels.spacing * random.uniform(1.01, 1.5))
     return written(random, whole, folder, stretched)
@@ -265,7 +265,7 @@ def dicom_seg_cut(random: Random, whole: Whole, folder: Path) -> Inputs:
     return given(folder, whole, "labels.dcm")
 
 
-@kind("labels", "refused", "another grid")
+@kind("labels", "refused", "a different grid")
 def dicom_seg_shifted(random: Random, whole: Whole, folder: Path) -> Inputs:
     moved = replace(whole.labels, origin=whole.labels.index_to_point(random.uniform(0.1, 0.9, 3)))
     write_seg(folder / "labels.dcm", moved, random)

@@ -221,7 +221,7 @@ def test_an_interrupt_ends_a_run_soon_even_where_nobody_listens(how):
         assert "KeyboardInterrupt" in errors, errors
     else:
         assert run.returncode == 130
-        assert "go on" in errors, errors
+        assert "run the same command again to continue" in errors, errors
 
 
 def test_a_lent_executor_takes_the_limits_of_whoever_uses_it():

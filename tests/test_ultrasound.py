@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from limbfit.report.sections.layers import layer_figure
+from limbfit.report.drawing.layer_figures import layer_figure
 
 import layered
 from layered import layered_block, store_blocks
