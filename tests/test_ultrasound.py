@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from limbfit.report.drawing.layer_figures import layer_figure
 
 import layered
 from layered import layered_block, store_blocks
@@ -23,6 +22,7 @@ from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
+from limbfit.report.drawing.layer_figures import layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study, load_study
 from limbfit.traces import Layers, read_layers, thinnings
