@@ -86,36 +86,16 @@ def run_protocol(
     """
     study = context.study
     known = unknowns(study)
-    strange = [name for name in determine if name not in known.names]
-    if strange:
-        raise InputError(
-            f"no parameter is named {strange[0]!r}",
-            place="--determine",
-            remedy=f"use {', '.join(known.names)}",
-        )
-    centre = study.vector(parameters)
-    tissues = drawn(known, centre, draws, seed)
+    which = _wanted(known, determine)
+    tissues = drawn(known, study.vector(parameters), draws, seed)
     planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, ultrasound_sd_mm is not None)
     noises = Noises(NoiseModel(**noise), _of_ultrasound(noise, ultrasound_sd_mm))
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     budget = Budget(60.0 * minutes, setup_s)
-    which = tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
     wanted = Wanted(bounds_information(known), which, "A" if criterion == "A" else "D")
-    plans = _plans(found, options, budget, wanted)
-    told_by = dict.fromkeys(plans, options)
-    if ultrasound_sd_mm is not None and DESIGNED in plans:
-        unseen = _plans(found, blind, budget, wanted)
-        plans[UNSEEN] = unseen[DESIGNED]
-        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
-    if DESIGNED not in plans:
-        least = min(seconds_of(options, [i], budget) for i in range(len(options)))
-        raise InputError(
-            f"no record fits into {minutes:g} min: the shortest takes {least / 60:.1f} min, set-up included",
-            place="--minutes",
-            remedy="allow more time",
-        )
+    plans, told_by = _plans_told(found, options, None if ultrasound_sd_mm is None else blind, budget, wanted)
     rows = [
         _row(name, chosen, told_by[name], budget, wanted, known.names, len(tissues))
         for name, chosen in plans.items()
@@ -141,6 +121,42 @@ def run_protocol(
     _write_tables(folder, content)
     _write_records(folder / "records.toml", content["records"], ultrasound_sd_mm)
     return {}
+
+
+def _wanted(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
+    """Numbers of the parameters to be determined: all where none is named."""
+    strange = [name for name in determine if name not in known.names]
+    if strange:
+        raise InputError(
+            f"no parameter is named {strange[0]!r}",
+            place="--determine",
+            remedy=f"use {', '.join(known.names)}",
+        )
+    return tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
+
+
+def _plans_told(
+    found: Sequence[Planned],
+    options: Sequence[Option],
+    blind: Sequence[Option] | None,
+    budget: Budget,
+    wanted: Wanted,
+) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[Option]]]:
+    """The plans by name, and what their records tell; ``blind``: without ultrasound, where there is any."""
+    plans = _plans(found, options, budget, wanted)
+    if DESIGNED not in plans:
+        least = min(seconds_of(options, [i], budget) for i in range(len(options)))
+        minutes = budget.seconds / 60.0
+        raise InputError(
+            f"no record fits into {minutes:g} min: the shortest takes {least / 60:.1f} min, set-up included",
+            place="--minutes",
+            remedy="allow more time",
+        )
+    told_by: dict[str, Sequence[Option]] = dict.fromkeys(plans, options)
+    if blind is not None:
+        plans[UNSEEN] = _plans(found, blind, budget, wanted)[DESIGNED]
+        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
+    return plans, told_by
 
 
 def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
