@@ -62,8 +62,8 @@ class Factor:
         self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
         moving = system.bodies is not None and system.bodies.free > 0
         suits = not moving and system.cells.shape[1] == 10
-        pays = (system.unknowns >= FEWEST_MULTIGRID and not lasting) or factors_are_dear()
-        if name == "auto" and suits and pays:
+        many = system.unknowns >= FEWEST_MULTIGRID and not lasting
+        if name == "auto" and suits and (many or factors_are_dear()):
             self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]
         self._shear: Array | None = None
