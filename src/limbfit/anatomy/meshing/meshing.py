@@ -2,9 +2,9 @@
 
 The recipe
 ----------
-1. A base mesh of the muscle, once per anatomy: a tetrahedral grid under the proximal cut plane, cut along the
-   layer (level set of depth at the skin's thickness), along the bones, and along the regions inside the core,
-   whose both sides are kept.
+1. A base mesh of the muscle, once per anatomy: a tetrahedral grid under the proximal cut plane, finer at thin
+   bones and regions, cut along the layer (level set of depth at the skin's thickness), along the bones, and
+   along the regions inside the core, whose both sides are kept.
 2. Per site, a mesher adapts the base to the site's size field; it keeps the faces between regions.
 3. Nodes of layer, bones and regions are put on their smooth surfaces; the skin layer is extruded from the
    interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
@@ -43,6 +43,7 @@ from .regions import (
     thickness,
 )
 from .smoothing import polished
+from .thinbones import refined_at_bones
 from .untangling import inverted, narrowest, repaired, unrepaired, untangled
 
 Array = NDArray[np.float64]
@@ -133,7 +134,8 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | No
     low = fields.skin.points.min(axis=0) - spacing
     high = fields.skin.points.max(axis=0) + spacing
     check_regions(fields, settings.edge_near_mm)
-    grid = refined_at_regions(background.box_grid(low, np.array([*high[:2], 0.0]), spacing), fields)
+    grid = background.box_grid(low, np.array([*high[:2], 0.0]), spacing)
+    grid = refined_at_bones(refined_at_regions(grid, fields), fields)
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
         grid = grid.kept(positive)

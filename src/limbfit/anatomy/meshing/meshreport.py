@@ -14,6 +14,7 @@ from ..surfaces.surfaces import Anatomy, Surface
 from .layered import inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
 from .regions import interfaces, region_level
+from .thinbones import bone_warnings
 from .untangling import Repair
 
 Array = NDArray[np.float64]
@@ -103,7 +104,7 @@ def mesh_report(
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
-        warnings=mesh_warnings(mesh, found, volume_error, near),
+        warnings=mesh_warnings(mesh, found, volume_error, near) + bone_warnings(mesh, fields, near),
     )
 
 
