@@ -60,7 +60,10 @@ class FidelitySettings:
 
 @dataclass
 class _Model:
-    """The corrected coarse model; remembers coarse responses, which the anchors need again."""
+    """The corrected coarse model; remembers coarse responses, which the anchors need again.
+
+    What folds in a coarse mesh is that mesh's own and corrected with the rest: no trial is refused for it.
+    """
 
     coarse: Simulate
     correction: CoarseToFine | None = None
@@ -69,7 +72,7 @@ class _Model:
     def plain(self, parameters: Array) -> tuple[SiteResponse, ...]:
         key = parameters.tobytes()
         if key not in self._known:
-            self._known[key] = tuple(self.coarse(parameters))
+            self._known[key] = tuple(replace(one, folded="") for one in self.coarse(parameters))
         return self._known[key]
 
     def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
