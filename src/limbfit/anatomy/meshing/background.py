@@ -74,10 +74,10 @@ def refined(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spacing: 
     edge = grid.spacing
     while edge > spacing:
         for length in edge * np.sqrt([3.0, 2.0, 1.0]):
-            ends = np.unique(np.sort(grid.tets[:, TET_EDGES].reshape(-1, 2), axis=1), axis=0)
-            a, b = grid.points[ends[:, 0]], grid.points[ends[:, 1]]
-            long = np.linalg.norm(b - a, axis=1) > 0.95 * length
-            edges = ends[long][near((a[long] + b[long]) / 2)]
+            ends = np.sort(grid.tets[:, TET_EDGES].reshape(-1, 2), axis=1)
+            a, b = np.moveaxis(grid.points[ends], 1, 0)
+            ends = _unique(ends[np.linalg.norm(b - a, axis=1) > 0.95 * length], len(grid.points))
+            edges = ends[near(grid.points[ends].mean(axis=1))]
             grid = _divided(grid, edges, np.full(len(edges), 0.5), 0)
         edge /= 2
     return grid
@@ -152,9 +152,13 @@ def banded(field: Field, points: Array, band: float, spacing: float, slack: floa
 def _crossed_edges(tets: Ints, values: Array) -> Ints:
     """Unique edges (k, 2), smaller node first and sorted, whose ends differ strictly in sign."""
     ends = np.sort(tets[:, TET_EDGES].reshape(-1, 2), axis=1)
-    ends = ends[values[ends[:, 0]] * values[ends[:, 1]] < 0]
-    keys = np.unique(ends[:, 0] * len(values) + ends[:, 1])
-    return np.stack(np.divmod(keys, max(len(values), 1)), axis=1)
+    return _unique(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
+
+
+def _unique(edges: Ints, count: int) -> Ints:
+    """Each of some edges (k, 2) between ``count`` points once, sorted."""
+    keys = np.unique(edges[:, 0] * count + edges[:, 1])
+    return np.stack(np.divmod(keys, max(count, 1)), axis=1)
 
 
 def _roots(points: Array, edges: Ints, values: Array, field: Field) -> Array:
