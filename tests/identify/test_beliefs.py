@@ -33,9 +33,9 @@ def test_a_parameter_that_does_not_move_has_no_share():
     assert (share[1], wider[1]) == (0.0, 1.0)
 
 
-def told(unknowns):
-    """Logarithms of the answer and what is known of it, as a run states it."""
-    kept, data = Kept(), records(0.03, sites=THIN)
+def told(unknowns, seed=0):
+    """Logarithms of the answer and what is known of it, as a run states it, for a draw of noise."""
+    kept, data = Kept(), records(0.03, seed=seed, sites=THIN)
 
     def simulate(parameters):
         return [site.respond(parameters) for site in THIN]
@@ -62,10 +62,14 @@ def test_priors_of_people_narrow_what_records_leave_open_and_let_stand_what_they
     assert np.abs(helped - alone)[shown].max() < 0.02
     assert half_widths(with_people)[shown] == pytest.approx(half_widths(without)[shown], rel=0.2)
     assert with_people.prior_share[shown].max() < 0.02
-    c, m = NAMES.index("skin.c_kPa"), NAMES.index("skin.m")
-    assert half_widths(with_people)[c] < 0.7 * half_widths(without)[c]
-    assert half_widths(with_people)[m] < 0.85 * half_widths(without)[m]
-    assert with_people.prior_share[[c, m]].min() > 0.2
-    assert with_people.wider_without[[c, m]].min() > 1.2
+    skin = [NAMES.index("skin.c_kPa"), NAMES.index("skin.m")]
+    assert with_people.prior_share[skin].min() > 0.2
+    assert with_people.wider_without[skin].min() > 1.2
     low, high = with_people.intervals_95.T
     assert np.all((low < TRUTH) & (high > TRUTH))
+    # The width of an open parameter hangs on the noise: 0.5 to 1.2 times that without, one draw by another.
+    narrowed = [half_widths(with_people)[skin] / half_widths(without)[skin]]
+    for seed in (1, 2):
+        both = [told(unknowns, seed)[1] for unknowns in (replace(PAPER, priors=PEOPLE), PAPER)]
+        narrowed.append(half_widths(both[0])[skin] / half_widths(both[1])[skin])
+    assert np.exp(np.log(narrowed).mean(axis=0)).max() < 0.85

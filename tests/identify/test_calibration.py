@@ -244,7 +244,7 @@ def test_the_papers_stopping_rule_stops_earlier():
     assert loose.converged
     assert "0.01" in loose.stages[0].reason
     assert loose.evaluations < tight.evaluations
-    assert loose.cost >= tight.cost
+    assert loose.cost >= tight.cost * (1 - 1e-6)  # the tolerance of the other
 
 
 def test_the_limit_of_iterations_is_not_called_convergence():

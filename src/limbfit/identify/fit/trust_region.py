@@ -17,7 +17,7 @@ from scipy.optimize import lsq_linear
 
 Array = NDArray[np.float64]
 
-FIRST_RADIUS = 1.0
+FIRST_RADIUS = 0.5  # in logarithms: first steps twice as long were refused on phantom and OpenLimb
 NO_CHANGE = "the forces would hardly change"
 AT_THE_FLOOR = "the error falls by no more than the noise of the simulations"
 _LARGEST_RADIUS = 2.0
