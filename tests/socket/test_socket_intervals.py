@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from limbfit.fe import Doubt
-from limbfit.pipeline.experiments.socket_intervals import Z95, Spread, spread_facts
+from limbfit.identify.uncertainty.uncertainty import NORMAL_95
+from limbfit.pipeline.experiments.socket_intervals import Spread, spread_facts
 from limbfit.pipeline.experiments.socket_limb import warning
 
 NAMES = ("skin.c_kPa", "skin.tau_s", "liner.c_kPa")
@@ -19,7 +20,7 @@ def test_interval_and_shares_are_those_of_drawn_parameters():
     interval, shares, changes = spread.told(50.0, SLOPES)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), COVARIANCE, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
-    assert (interval[1] - interval[0]) / 2 == pytest.approx(Z95 * values.std(), rel=0.01)
+    assert (interval[1] - interval[0]) / 2 == pytest.approx(NORMAL_95 * values.std(), rel=0.01)
     for i, name in enumerate(NAMES[:2]):
         left = values - np.polyval(np.polyfit(draws[:, i], values, 1), draws[:, i])
         assert shares[name] == pytest.approx(100.0 * (1.0 - left.var() / values.var()), abs=0.5)

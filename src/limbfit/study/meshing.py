@@ -57,7 +57,8 @@ def _edges(near: float, far: float, radius: float, growth: float, flatness: floa
 
 
 # What ``mesh.accuracy`` stands for: a site's own mesh, and a coarse one where that is much cheaper. Edges far
-# from the indenter, where tissue hardly strains, cost unknowns and change the force little (docs/convergence.md).
+# from the indenter, where tissue hardly strains, cost unknowns and change the force little
+# (docs/convergence.md).
 ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
     "fast": (_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
     "standard": (_edges(3.5, 30.0, 14.0, 0.9, 1.6), None),

@@ -22,6 +22,7 @@ from scipy.linalg import solve_toeplitz
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import Unknowns
+from ..uncertainty.uncertainty import NORMAL_95
 
 Array = NDArray[np.float64]
 Criterion = Literal["D", "A"]
@@ -112,7 +113,7 @@ class Design:
     @property
     def factors_95(self) -> Array:
         """(p,) the factor f of the expected 95 % interval [value / f, value x f]."""
-        return np.exp(np.minimum(1.96 * np.sqrt(np.diag(self.covariance)), 50.0))
+        return np.exp(np.minimum(NORMAL_95 * np.sqrt(np.diag(self.covariance)), 50.0))
 
 
 def evaluate(candidates: Sequence[Candidate], chosen: Sequence[int], prior: Array) -> Design:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError
+from ..uncertainty.uncertainty import NORMAL_95
 from .design import Criterion
 
 Array = NDArray[np.float64]
@@ -68,7 +69,7 @@ class Wanted:
 def factors_95(covariances: Array) -> Array:
     """(d, p) the factor f of the expected 95 % interval [value / f, value x f] at each draw."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
-    return np.asarray(np.exp(1.96 * np.sqrt(np.minimum(variances, _LARGEST_VARIANCE))))
+    return np.asarray(np.exp(NORMAL_95 * np.sqrt(np.minimum(variances, _LARGEST_VARIANCE))))
 
 
 def seconds_of(options: Sequence[Option], chosen: Sequence[int], budget: Budget) -> float:

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import LAWS, OGDEN, TissueLaw
 from ...study import Study
 
 Array = NDArray[np.float64]
 
-Z95 = 1.96
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
 
 
@@ -63,7 +63,7 @@ class Spread:
         own = slopes[list(self.identified)]
         along = self.covariance @ own
         variance = float(own @ along)
-        half = Z95 * np.sqrt(max(variance, 0.0))
+        half = NORMAL_95 * np.sqrt(max(variance, 0.0))
         scale = np.maximum(np.diag(self.covariance) * variance, np.finfo(float).tiny)
         shares = 100.0 * along**2 / scale
         found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-shares)}

@@ -21,6 +21,7 @@ from ...identify.uncertainty.sources import Gain
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
+    NORMAL_95,
     UNDETERMINED,
     Uncertainty,
     product_text,
@@ -34,7 +35,6 @@ from .uncertainty_sources import Change
 
 Array = NDArray[np.float64]
 
-NORMAL_95 = 1.959964
 _DRAWS = 1500  # written
 _SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "noise", "misfit")}
 _MOST_OFF = 0.5  # of the rise that ends an interval: differences beyond it are told
