@@ -25,9 +25,10 @@ import numpy as np
 
 import limbfit
 from limbfit.execution import SerialExecutor
+from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
-from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT, Z95
+from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, quiet
 from limbfit.pipeline.shared.socket_shape import socket_of
@@ -68,7 +69,7 @@ class Bench:
         if known:
             high = {one["region"]: one["interval_kPa"][1] for one in load["regions"]}
             high[SETTLING] = load["settling_interval_mm"][1]
-            row["sd"] = {name: (high[name] - value) / Z95 for name, value in row["values"].items()}
+            row["sd"] = {name: (high[name] - value) / NORMAL_95 for name, value in row["values"].items()}
             row["from"] = {one["region"]: one["interval_from"] for one in load["regions"]}
             row["from"][SETTLING] = load["settling_interval_from"]
             row["change"] = {one["region"]: one["change_kPa"] for one in load["regions"]}
@@ -103,8 +104,8 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
                 "sd": sd,
                 "sd_drawn": float(sample.std(ddof=1)) if len(sample) > 1 else None,
                 "off_linear": float(np.sqrt(np.mean((sample - linear) ** 2))) if len(sample) else None,
-                "within": int((np.abs(sample - value) <= Z95 * sd).sum()),
-                "within_linear": int((np.abs(linear - value) <= Z95 * sd).sum()),
+                "within": int((np.abs(sample - value) <= NORMAL_95 * sd).sum()),
+                "within_linear": int((np.abs(linear - value) <= NORMAL_95 * sd).sum()),
                 "draws": len(sample),
                 "mostly_from": f"{first} {percent:.0f} %",
                 "liner_c": centre["change"][name].get("liner.c_kPa"),
