@@ -91,9 +91,6 @@ def curved_target(mesh: Mesh, fields: LimbFields) -> Array:
 
 def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callable[[Array], Level]]]:
     corners, layers = mesh.cells[:, :4].max() + 1, len(fields.depths)
-    faces = boundary_faces(mesh)
-    on_plane = (mesh.points[faces[:, :3], 2] == 0.0).all(axis=1)
-    bone = faces[~on_plane & np.isin(faces[:, :3], mesh.node_sets["fixed_bone"]).all(axis=1)]
     regions = [
         (_mid_nodes(found, corners), region_level(fields, number))
         for number, found in enumerate(interfaces(mesh, layers))
@@ -102,13 +99,20 @@ def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callab
         *regions,
         (_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
         (_mid_nodes(inner_faces(mesh, layers - 1), corners), fields.layer),
-        (_mid_nodes(bone, corners), fields.void),
+        (_mid_nodes(bone_faces(mesh), corners), fields.void),
     ]
 
 
 def _mid_nodes(faces: Ints, corners: int) -> Ints:
     nodes = np.unique(faces)
     return nodes[nodes >= corners]
+
+
+def bone_faces(mesh: Mesh) -> Ints:
+    """Outward faces on bone of a mesh in the limb frame."""
+    faces = boundary_faces(mesh)
+    on_plane = (mesh.points[faces[:, :3], 2] == 0.0).all(axis=1)
+    return faces[~on_plane & np.isin(faces[:, :3], mesh.node_sets["fixed_bone"]).all(axis=1)]
 
 
 def inner_faces(mesh: Mesh, layer: int) -> Ints:

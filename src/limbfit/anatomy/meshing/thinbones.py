@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...mesh import Mesh, boundary_faces
+from ...mesh import Mesh
 from .background import LONGEST_EDGE, TetGrid, refined
+from .layered import bone_faces
 from .layers import LimbFields, signed_distance
 
 Array = NDArray[np.float64]
@@ -60,10 +61,7 @@ def bone_warnings(mesh: Mesh, fields: LimbFields, near: tuple[Array, float] | No
     }
     if not bones:
         return ()
-    on_bone = np.zeros(len(mesh.points), dtype=bool)
-    on_bone[mesh.node_sets["fixed_bone"]] = True
-    faces = boundary_faces(mesh)[:, :3]
-    faces = faces[on_bone[faces].all(axis=1)]
+    faces = bone_faces(mesh)[:, :3]
     warnings = []
     for name, places in bones.items():
         squared = igl.point_mesh_squared_distance(places, mesh.points, faces)[0] if len(faces) else np.inf
