@@ -19,11 +19,12 @@ from .contact.pose import Pose
 from .contact.rigid import RigidShape
 from .contact.tool import Distances, Tool
 from .kernel.elements import Element
-from .motion import Drives, RigidBody
+from .motion import Drives, Motion, RigidBody
 from .pattern import Pattern, places_of, positions
 from .problem import Problem, ProblemError
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int32]
 
 
 # Stiffness that holds a coordinate while a displacement drives it which a force drives at other times, over
@@ -31,6 +32,8 @@ Array = NDArray[np.float64]
 HOLDING = 100.0
 # Stiffness of a coordinate whose body touches nothing, over that of the tissue against a body of its width.
 GROUNDING = 0.1
+# Gap over a body's width up to which it may touch what is beside its way.
+NEAR = 0.05
 
 
 @dataclass(frozen=True)
@@ -271,20 +274,46 @@ class Bodies:
         """What forces (c, 3, p) on the points ask of the first body along its axis (p,), N."""
         return -np.einsum("i,cip->p", self.first.frame[2], forces[self.first.points])
 
-    def at_springs(self, forces: Array) -> Array:
-        """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns."""
-        out = np.asarray(self._spread @ forces.reshape(-1, *forces.shape[2:]))
+    def shares_of(self, unknowns: Index) -> sp.csr_matrix:
+        """Shares (m, 3 c) of some unknowns in the contact points, for `at_springs` and `springs_of`; where
+        bodies are free, their coordinates are the last of these unknowns."""
+        return self._spread[unknowns]
+
+    def at_springs(self, forces: Array, shares: sp.csr_matrix | None = None) -> Array:
+        """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns, or of some."""
+        shares = self._spread if shares is None else shares
+        out = np.asarray(shares @ forces.reshape(-1, *forces.shape[2:]))
         if self.free:
             out[-self.free :] += np.einsum("cik,ci...->k...", self.levers, forces)
         return out
 
-    def springs_of(self, x: Array) -> Array:
-        """Values (c, 3, ...) of a vector (or matrix) of the unknowns at the contact points, relative to the
-        bodies."""
-        out = np.asarray(self._spread.T @ x).reshape(-1, 3, *x.shape[1:])
+    def springs_of(self, x: Array, shares: sp.csr_matrix | None = None) -> Array:
+        """Values (c, 3, ...) of a vector (or matrix) of the unknowns, or of some, at the contact points,
+        relative to the bodies."""
+        shares = self._spread if shares is None else shares
+        out = np.asarray(shares.T @ x).reshape(-1, 3, *x.shape[1:])
         if self.free:
             out += np.einsum("cik,k...->ci...", self.levers, x[-self.free :])
         return out
+
+    def swept(self, motions: Sequence[Motion]) -> Index:
+        """Unknowns at contact points that bodies driven by displacements come near to where they rest."""
+        rest, under = np.zeros((self.rows, 3)), np.zeros(self.count, dtype=bool)
+        for body, motion in zip(self.all, motions):
+            for t in motion.times:
+                value, forced, growth = motion.at(t)
+                tool = body.tool(rest, np.where(forced, 0.0, value), growth)
+                under[body.points] |= tool.gaps.ravel() < NEAR * body.start.width
+        touched = np.diff(self._spread[:, np.repeat(under, 3)].indptr) > 0
+        touched[self.unknowns - self.free :] = touched.any()
+        return np.flatnonzero(touched).astype(np.int32)
+
+    def standing_on(self, unknowns: Index) -> NDArray[np.bool_]:
+        """Contact points (c,) that move with these unknowns alone."""
+        others = np.ones(self.unknowns)
+        others[unknowns] = 0.0
+        alone = (self._spread.T @ others).reshape(-1, 3) == 0.0
+        return alone.all(axis=1) & (self.free == 0 or len(unknowns) > 0)
 
     def driven(self, u: Array, drives: Drives, penalty: float) -> tuple[float, Loads]:
         """Energy of what drives the free coordinates at ``u (r, 3)``, and its derivative."""

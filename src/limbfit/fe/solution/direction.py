@@ -130,8 +130,8 @@ def _foresee(
         return x, touch.closed
     bodies = touching(system)
     before = bodies.springs_of(x[:, 0])
-    y = factor.apply(b - factor.product(at.tangent, x) if x.any() else b)
-    moved = bodies.springs_of(y[:, 0])
+    y = factor.forward(b - factor.product(at.tangent, x) if x.any() else b)
+    moved = factor.columns.moved(y, closed | touch.closed)
     part = None
     for _ in range(SWEEPS):
         blocks, change = touch.under(closed)
@@ -145,7 +145,7 @@ def _foresee(
             break
     if part is None:
         return x, touch.closed
-    return x + y + factor.columns.Z[:, : len(part)] @ part[:, None].astype(np.float32), kept
+    return x + factor.backward(factor.columns.pushed(y, part[:, None])), kept
 
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 from ..system import System
 from .convexity import body_stiffness, shear_stiffness
 from .linear import (
+    NONE,
+    Index,
     LinearSolver,
     NotPositiveDefiniteError,
     factors_are_dear,
@@ -57,9 +60,11 @@ class Factor:
     """
 
     def __init__(
-        self, system: System, moduli: Array, name: str = "auto", threads: int = 1, lasting: bool = False
-    ) -> None:
+        self, system: System, moduli: Array, name: str = "auto", threads: int = 1, lasting: bool = False,
+        last: Index = NONE,
+    ) -> None:  # fmt: skip
         self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
+        self._last = last
         moving = system.bodies is not None and system.bodies.free > 0
         suits = not moving and system.cells.shape[1] == 10
         many = system.unknowns >= FEWEST_MULTIGRID and not lasting
@@ -72,7 +77,6 @@ class Factor:
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._shift = self._next_shift = 0.0
         self._costs = [0.0]
-        self.columns = SpringColumns(system, self.apply)
         self.ready = False
         self._use(single=True)
 
@@ -80,6 +84,7 @@ class Factor:
         started = time.perf_counter()
         self._solver = self._made(single)
         self._single = single
+        self.columns = SpringColumns(self._system, self)
         self.counts["double_precision"] = int(not single)
         self.seconds["factor"] += time.perf_counter() - started
 
@@ -87,7 +92,7 @@ class Factor:
         system, threads = self._system, self._threads
         if self._choice == Multigrid.name:
             return Multigrid(system, threads)
-        return linear_solver(system.indptr, system.indices, self._choice, threads, single)
+        return linear_solver(system.indptr, system.indices, self._choice, threads, single, self._last)
 
     def _give_up_multigrid(self) -> None:
         """From here on with a factor."""
@@ -97,6 +102,14 @@ class Factor:
     @property
     def name(self) -> str:
         return self._solver.name
+
+    @property
+    def transposed(self) -> bool:
+        return self._solver.transposed
+
+    @property
+    def last(self) -> Index:
+        return self._solver.last
 
     @property
     def shifted(self) -> bool:
@@ -180,11 +193,23 @@ class Factor:
 
     def apply(self, b: Array) -> Array:
         """The factor's solution for ``b (n,)`` or ``(n, r)``."""
+        return self._timed(self._solver.solve, b, 1.0)
+
+    def forward(self, b: Array, last: bool = False) -> Array:
+        """The first half of `apply`, as in `LinearSolver`."""
+        return self._timed(lambda b: self._solver.forward(b, last), b, 0.0 if last else 0.5)
+
+    def backward(self, y: Array, last: bool = False) -> Array:
+        """The second half of `apply`, as in `LinearSolver`."""
+        return self._timed(lambda y: self._solver.backward(y, last), y, 0.0 if last else 0.5)
+
+    def _timed(self, half: Callable[[Array], Array], b: Array, share: float) -> Array:
+        """What a solver does to ``b``, which costs a ``share`` of a solution."""
         started = time.perf_counter()
-        x = self._solver.solve(b)
-        self.counts["solves"] += 1
+        x = half(b)
+        self.counts["half_solves"] += int(2.0 * share)
         # Columns share the reading of the factor: eight cost less than three times one.
-        self._costs[-1] += 0.75 + 0.25 * (1 if b.ndim == 1 else b.shape[1])
+        self._costs[-1] += share * (0.75 + 0.25 * (1 if b.ndim == 1 else b.shape[1]))
         self.seconds["solve"] += time.perf_counter() - started
         return x
 
@@ -279,5 +304,6 @@ class Factor:
 
     def precondition(self, r: Array, springs: SpringChange | None) -> Array:
         """The factor's solution (n, k) for ``r (n, k)``, corrected for the changed springs."""
-        y = self.apply(r)
-        return y if springs is None else springs.correct(y)
+        if springs is None:
+            return self.apply(r)
+        return self.backward(springs.correct(self.forward(r)))

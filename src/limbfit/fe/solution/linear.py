@@ -30,9 +30,13 @@ Index = NDArray[np.int32]
 
 # An environment variable: with any value, PARDISO counts as not installed.
 WITHOUT_PARDISO = "LIMBFIT_WITHOUT_PARDISO"
-# Dense operations of a factorisation run about this many times faster than those of a solution, which waits
-# for memory (measured with PARDISO on matrices of 10,000 to 200,000 unknowns).
-OPERATIONS_PER_ENTRY = 45.0
+# A factorisation costs as many solutions as its entries in a row, to the power 4/3, over this: a quarter as
+# many operations for each entry (15 % off for tetrahedra and hexahedra of 1,000 to 50,000 unknowns), 45 times
+# as fast as those of a solution, which waits for memory (PARDISO, 10,000 to 200,000 unknowns).
+ROW_PER_SOLUTION = 180.0
+# Places of PARDISO's parameters: solutions among marked unknowns alone; a factorisation for many threads.
+PARTIAL, MANY_THREADS = 30, 23
+COLUMNS = 16  # of right-hand sides among the marked unknowns at once
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -44,19 +48,44 @@ class LinearSolver(Protocol):
 
     ``lasting``: whether a factorisation is worth keeping for other matrices; ``dear``: whether multigrid wins
     at any size; ``worth``: its cost over that of one solution and one product with the matrix, estimated from
-    the factor's operations and entries (not timed: a run must be repeatable).
+    the factor's entries (not timed: a run must be repeatable); ``transposed``: whether
+    `backward` is the transpose of `forward`; ``last``: unknowns that are eliminated last, so that halves of
+    solutions among them alone cost next to nothing.
     """
 
     name: str
     lasting: bool
     dear: bool
     worth: float
+    transposed: bool
+    last: Index
 
     def factorise(self, data: Array) -> None:
         """Factorise the matrix with these entries; raises `NotPositiveDefiniteError`."""
 
     def solve(self, b: Array) -> Array:
         """Solution (n,) or (n, r) for right-hand sides of that shape."""
+
+    def forward(self, b: Array, last: bool = False) -> Array:
+        """The first half of `solve`; ``last``: of the unknowns ``last`` only, beyond which ``b`` is zero."""
+
+    def backward(self, y: Array, last: bool = False) -> Array:
+        """The second half of `solve`; ``last``: of the unknowns ``last`` only."""
+
+
+NONE: Index = np.zeros(0, dtype=np.int32)
+
+
+class Whole(LinearSolver):
+    """Halves of solutions for solvers that know none: the first is all of it."""
+
+    transposed, last = False, NONE
+
+    def forward(self, b: Array, last: bool = False) -> Array:
+        return self.solve(b)
+
+    def backward(self, y: Array, last: bool = False) -> Array:
+        return y
 
 
 class Pardiso:
@@ -66,20 +95,29 @@ class Pardiso:
     """
 
     name = "pardiso"
-    lasting, dear = True, False
+    lasting, dear, transposed = True, False, True
 
-    def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
+    def __init__(
+        self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
+    ) -> None:
         self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)
         self._indices = np.ascontiguousarray(indices, dtype=np.int32)
         self._n = ctypes.c_int32(len(indptr) - 1)
         self._type: Any = np.float32 if single else np.float64
         self._threads = threads
         self._data = np.ones(len(indices), dtype=self._type)
+        self._room: Array | None = None
         self._handle = np.zeros(64, dtype=np.int64)
         self._parameters = np.zeros(64, dtype=np.int32)
-        # no defaults, METIS, count entries and operations, single precision, zero-based rows
-        for position, value in {0: 1, 1: 2, 9: 13, 17: -1, 18: -1, 20: 1, 27: int(single), 34: 1}.items():
+        # no defaults, METIS, count entries, single precision, zero-based rows
+        for position, value in {0: 1, 1: 2, 9: 13, 17: -1, 20: 1, 27: int(single), 34: 1}.items():
             self._parameters[position] = value
+        self.last, self._marks = last, np.zeros(len(indptr) - 1, dtype=np.int32)
+        self._marks[last] = 1
+        # Of the analysis: what is marked goes to the end.  Solutions would be serial then, unless the
+        # factorisation is the one for many threads.
+        self._parameters[PARTIAL] = int(len(last) > 0)
+        self._parameters[MANY_THREADS] = int(len(last) > 0 and threads > 1)
         if os.environ.get(WITHOUT_PARDISO):
             raise ImportError(f"PARDISO is left out: {WITHOUT_PARDISO} is set")
         self._mkl = _mkl()
@@ -87,8 +125,8 @@ class Pardiso:
         self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
         self._checked(self._call(11, np.zeros(1), np.zeros(1), 1))
         quiet_openmp()  # loaded by the first call
-        entries, operations = float(self._parameters[17]), 1e6 * float(self._parameters[18])
-        self.worth = max(operations / max(entries, 1.0) / OPERATIONS_PER_ENTRY, 2.0)
+        self._parameters[PARTIAL] = 0
+        self.worth = max((float(self._parameters[17]) / self._n.value) ** (4 / 3) / ROW_PER_SOLUTION, 2.0)
 
     def factorise(self, data: Array) -> None:
         self._data = np.array(data, dtype=self._type)
@@ -98,10 +136,36 @@ class Pardiso:
         self._checked(code)
 
     def solve(self, b: Array) -> Array:
+        return self._solved(33, b, False).astype(np.float64)
+
+    def forward(self, b: Array, last: bool = False) -> Array:
+        return self._solved(331, b, last)
+
+    def backward(self, y: Array, last: bool = False) -> Array:
+        return self._solved(333, y, last).astype(np.float64)
+
+    def _solved(self, phase: int, b: Array, last: bool) -> Array:
+        if last:
+            return self._among_last(phase, b)
         right = np.asfortranarray(b, dtype=self._type)
         x = np.zeros_like(right, order="F")
-        self._checked(self._call(33, right, x, 1 if b.ndim == 1 else b.shape[1]))
-        return x.astype(np.float64)
+        self._checked(self._call(phase, right, x, 1 if b.ndim == 1 else b.shape[1]))
+        return x
+
+    def _among_last(self, phase: int, b: Array) -> Array:
+        """A half of solutions (m, r) among the unknowns ``last``."""
+        if self._room is None:
+            self._room = np.zeros((2, self._n.value * COLUMNS), dtype=self._type)
+        right, x = (room.reshape(-1, COLUMNS, order="F") for room in self._room)
+        out = np.empty(b.shape, dtype=self._type)
+        self._parameters[PARTIAL] = 1
+        for at in range(0, b.shape[1], COLUMNS):
+            part = b[:, at : at + COLUMNS]
+            right[self.last, : part.shape[1]] = part
+            self._checked(self._call(phase, right, x, part.shape[1]))
+            out[:, at : at + COLUMNS] = x[self.last, : part.shape[1]]
+        self._parameters[PARTIAL] = 0
+        return out
 
     @staticmethod
     def _checked(code: int) -> None:
@@ -112,7 +176,7 @@ class Pardiso:
         self._mkl.MKL_Set_Num_Threads(self._threads)
         return _pardiso(
             self._mkl, self._handle, self._parameters, self._n, phase,
-            self._data, self._indptr, self._indices, b, x, count,
+            self._data, self._indptr, self._indices, self._marks, b, x, count,
         )  # fmt: skip
 
 
@@ -138,6 +202,7 @@ def _pardiso(
     data: NDArray,
     indptr: Index,
     indices: Index,
+    marks: Index,
     b: Array,
     x: Array,
     count: int,
@@ -152,7 +217,7 @@ def _pardiso(
     positive_definite = 2
     mkl["pardiso"](
         address(handle), number(1), number(1), number(positive_definite), number(phase), ctypes.byref(n),
-        address(data), address(indptr), address(indices), address(np.zeros(1, dtype=np.int32)), number(count),
+        address(data), address(indptr), address(indices), address(marks), number(count),
         address(parameters), number(0), address(b), address(x), ctypes.byref(error),
     )  # fmt: skip
     return error.value
@@ -160,17 +225,19 @@ def _pardiso(
 
 def _release(mkl: Any, handle: NDArray[np.int64], parameters: Index, n: ctypes.c_int32) -> None:
     empty, none = np.zeros(1), np.zeros(1, dtype=np.int32)
-    _pardiso(mkl, handle, parameters, n, -1, empty, none, none, empty, empty, 1)
+    _pardiso(mkl, handle, parameters, n, -1, empty, none, none, none, empty, empty, 1)
 
 
-class Cholmod:
+class Cholmod(Whole):
     """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
 
     name = "cholmod"
     lasting, dear = True, False
     worth = 20.0
 
-    def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
+    def __init__(
+        self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
+    ) -> None:
         self._cholmod = importlib.import_module("sksparse.cholmod")
         self._pattern = (np.asarray(indices), np.asarray(indptr))
         self._factor = self._cholmod.analyze(self._lower(np.ones(len(indices))), mode="supernodal")
@@ -189,14 +256,16 @@ class Cholmod:
         return self._factor(b)
 
 
-class SuperLU:
+class SuperLU(Whole):
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
     lasting, dear = True, True
     worth = 40.0
 
-    def __init__(self, indptr: Index, indices: Index, threads: int = 1, single: bool = False) -> None:
+    def __init__(
+        self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
+    ) -> None:
         self._pattern = (np.asarray(indices), np.asarray(indptr))
         self._factor: Any = None
 
@@ -218,15 +287,17 @@ SOLVERS: dict[str, type] = {solver.name: solver for solver in (Pardiso, Cholmod,
 
 
 def linear_solver(
-    indptr: Index, indices: Index, name: str = "auto", threads: int = 1, single: bool = False
-) -> LinearSolver:
+    indptr: Index, indices: Index, name: str = "auto", threads: int = 1, single: bool = False,
+    last: Index = NONE,
+) -> LinearSolver:  # fmt: skip
     """The named solver of `SOLVERS`, or the first that works on this machine.
 
-    ``single``: a factor in single precision will do; only PARDISO makes use of that, and of ``threads``.
+    ``single``: a factor in single precision will do; ``last``: unknowns to be eliminated last.  Only PARDISO
+    makes use of them, and of ``threads``.
     """
     for candidate in SOLVERS if name == "auto" else (name,):
         try:
-            return SOLVERS[candidate](indptr, indices, threads, single)
+            return SOLVERS[candidate](indptr, indices, threads, single, last)
         except (ImportError, OSError, AttributeError):
             if candidate == name:
                 raise
@@ -235,8 +306,7 @@ def linear_solver(
 
 def factors_are_dear() -> bool:
     """Whether the only factorisations of this machine are much slower than multigrid."""
-    one = np.zeros(1, dtype=np.int32)
-    return linear_solver(np.arange(2, dtype=np.int32), one).dear
+    return linear_solver(np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32)).dear
 
 
 def symmetric_product(indptr: Index, indices: Index, data: Array, x: Array, threads: int = 1) -> Array:

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from ...mesh import TET10_EDGES
 from ..pattern import node_graph, place_of, upper_pattern
 from ..system import System
-from .linear import Index, NotPositiveDefiniteError, linear_solver
+from .linear import Index, NotPositiveDefiniteError, Whole, linear_solver
 
 Array = NDArray[np.float64]
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.
 _TURNED, _BOTH = 1, 2
 
 
-class Multigrid:
+class Multigrid(Whole):
     """A peer of the solvers in `linear`, but its solutions are only near: they have to be iterated upon.
 
     For any of the quadratic tetrahedra in the element table.

@@ -40,6 +40,7 @@ class NewtonControl:
     """Tolerance of the residual relative to the reactions, limits, and the damping to begin with.
 
     ``bearable``: penetration (mm) that near equilibrium ends the search, for the penalty is too small.
+    ``tangent``: whether the tangent is wanted at the equilibrium.
     """
 
     tolerance: float = 3e-5
@@ -47,6 +48,7 @@ class NewtonControl:
     max_backtracks: int = 12
     damping: float = 0.0
     bearable: float = np.inf
+    tangent: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,8 @@ def equilibrate(
             return Equilibrium(u, here, iteration, "the residual is not finite")
         if here.data is None:
             here = evaluate(u)
-        forcing = min(0.02, max(0.1 * norm / scale, 0.3 * control.tolerance * scale / norm))
+        sufficient = 0.3 * control.tolerance * scale / norm
+        forcing = min(0.02, max(0.1 * norm / scale, sufficient))
         try:
             direction = newton_direction(system, here, factor, forcing, damping)
         except NotPositiveDefiniteError:
@@ -103,7 +106,8 @@ def equilibrate(
         last = norm
         if norm <= NEAR * scale:
             evaluate.exactly()
-        found = _line_search(evaluate, u, here, direction, control)
+        going_on = control.tangent or forcing > sufficient
+        found = _line_search(evaluate, u, here, direction, control.max_backtracks, going_on)
         if found is None:
             if norm <= LOOSE * control.tolerance * scale:
                 return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
@@ -165,19 +169,20 @@ class _Evaluator:
 
 
 def _line_search(
-    evaluate: _Evaluator, u: Array, here: Evaluation, direction: Array, control: NewtonControl
+    evaluate: _Evaluator, u: Array, here: Evaluation, direction: Array, max_backtracks: int, going_on: bool
 ) -> tuple[Array, Evaluation, float] | None:
     """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005).
 
-    The displacement, its evaluation and the step along ``direction``.
+    The displacement, its evaluation (with the tangent after a full step, if the search is ``going_on``) and
+    the step along ``direction``.
     """
     slope = float((here.residual * direction).sum())
     if not slope < 0.0:
         return None
     noise = 1e-11 * abs(here.energy)
     step = 1.0
-    for _ in range(control.max_backtracks):
-        there = evaluate(u + step * direction, tangent=step == 1.0)
+    for _ in range(max_backtracks):
+        there = evaluate(u + step * direction, tangent=going_on and step == 1.0)
         if not np.isfinite(there.energy):
             step *= 0.4
             continue

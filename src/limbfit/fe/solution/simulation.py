@@ -30,6 +30,7 @@ from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reac
 from .pace import Pace
 from .schedule import foresee
 from .sensitivity import Explicit, MemoryDerivative
+from .springs import touched
 
 Array = NDArray[np.float64]
 
@@ -67,12 +68,15 @@ class Simulation:
         self.system = _system(problem, warm_start, system, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self.factor = Factor(self.system, self.laws.moduli, control.linear_solver, control.threads)
+        moduli, threads, last = self.laws.moduli, control.threads, touched(self.system, problem)
+        self.factor = Factor(self.system, moduli, control.linear_solver, threads, last=last)
         # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
         apart = sensitivities and not self.factor.lasting and not factors_are_dear()
         self.slopes = self.factor
         if apart:
-            self.slopes = Factor(self.system, self.laws.moduli, threads=control.threads, lasting=True)
+            self.slopes = Factor(
+                self.system, self.laws.moduli, threads=control.threads, lasting=True, last=last
+            )
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
@@ -153,7 +157,7 @@ class Simulation:
             )  # fmt: skip
             control = replace(
                 self.control.newton, damping=self.damping, max_iterations=patience,
-                bearable=TOO_DEEP * self.deepest if may_rise else np.inf,
+                bearable=TOO_DEEP * self.deepest if may_rise else np.inf, tangent=self.slope is not None,
             )  # fmt: skip
             found, increment = self._settle(increment, u, control)
             if found.reason:
@@ -208,16 +212,9 @@ class Simulation:
         found = Equilibrium(guess, Evaluation(np.inf, guess, guess), 0, "")
         for tried in (guesses, guesses[1:]):
             found = equilibrate(
-                self.system,
-                self.laws,
-                increment,
-                tried,
-                self.factor,
-                control,
-                self.floor,
-                self.deepest,
+                self.system, self.laws, increment, tried, self.factor, control, self.floor, self.deepest,
                 self.seconds,
-            )
+            )  # fmt: skip
             self.counts["newton_iterations"] += found.iterations
             if not found.reason or found.iterations >= control.max_iterations:
                 break  # from elsewhere it would take as many

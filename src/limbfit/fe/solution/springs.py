@@ -1,41 +1,84 @@
 """Contact springs that changed since a factorisation, taken into its solutions exactly.
 
 With ``F`` the factored matrix, ``N`` unit forces at the changed springs and ``D`` the change of their
-stiffness, ``(F + N D N^T)^-1 = F^-1 - Z D (I + S D)^-1 N^T F^-1``, ``Z = F^-1 N``, ``S = N^T Z``
-(Sherman, Morrison and Woodbury).  All that contact does to a solution thus happens in a small dense space.
+stiffness, ``(F + N D N^T)^-1 = F^-1 - F^-1 N D (I + S D)^-1 N^T F^-1``, ``S = N^T F^-1 N`` (Sherman, Morrison
+and Woodbury).  All that contact does to a solution thus happens in a small dense space.
+
+With ``F^-1 = B A``, the halves of a solution, it happens between them: ``W = A N`` and ``P = B^T N`` give
+``S = P^T W`` and ``B (I - W D (I + S D)^-1 P^T) A``.  Of a Cholesky factor ``P`` is ``W``, and where the
+indenter will touch is eliminated last, so that ``W`` is small and costs nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..problem import Problem
 from ..system import System
+from .linear import NONE, Index
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 # Smaller changes, relative to the stiffest spring, are left to the iteration.
 NOTABLE = 0.03
+# More columns than this make the dense solutions dear.
+MOST_COLUMNS = 500
+# Share of the unknowns beyond which eliminating them last makes the factor itself dear.
+MOST_LAST = 0.1
+
+
+def touched(system: System, problem: Problem) -> Index:
+    """Unknowns where bodies will touch, for the factor to eliminate last; none where they are too many."""
+    if system.bodies is None:
+        return NONE
+    found = system.bodies.swept([body.motion for body in problem.rigid_bodies])
+    return found if len(found) <= MOST_LAST * system.unknowns else NONE
+
+
+class Halves(Protocol):
+    """The halves of a factor's solutions, as in `LinearSolver`."""
+
+    @property
+    def transposed(self) -> bool: ...
+
+    @property
+    def last(self) -> Index: ...
+
+    def forward(self, b: Array, last: bool = False) -> Array: ...
+
+    def backward(self, y: Array, last: bool = False) -> Array: ...
 
 
 class SpringColumns:
-    """Solutions of a factor for unit forces at contact points, made when first needed and kept.
+    """First halves ``W`` of solutions for unit forces at contact points, made when first needed and kept.
 
-    ``apply (n, r) -> (n, r)`` is the factor's solution.
+    ``inner (c,)``: points whose columns cost nothing, since they stand on unknowns that are eliminated last.
+    ``rows``: unknowns beyond which ``W (rows, k)`` is zero.  ``at_points (c, 3, k)``: how the forces move the
+    points; 0 where that is not known for nothing.
     """
 
-    def __init__(self, system: System, apply: Callable[[Array], Array]) -> None:
-        self._bodies, self._unknowns, self._apply = system.bodies, system.unknowns, apply
+    def __init__(self, system: System, halves: Halves) -> None:
+        self._bodies, self._unknowns, self._halves = system.bodies, system.unknowns, halves
+        self.inner = np.zeros(0, dtype=bool)
+        if system.bodies is not None:
+            self.inner = system.bodies.standing_on(halves.last)
+            self._shares = system.bodies.shares_of(halves.last)
         self.clear(None)
 
     def clear(self, blocks: Array | None) -> None:
         """Forget the columns: there is a new factor, whose springs are ``blocks (c, 3, 3)``."""
         self.blocks = blocks
         self.keys: dict[tuple[int, int], int] = {}
+        self.rows: Index | slice = self._halves.last if self.inner.any() else slice(None)
         # In single precision like the factor: they only precondition.
-        self.Z = np.empty((self._unknowns, 0), dtype=np.float32, order="F")
+        rows = len(self._halves.last) if self.inner.any() else self._unknowns
+        self.W: Single = np.empty((rows, 0), dtype=np.float32)
+        self.P = self.W
+        self.S = np.empty((0, 0))
         count = 0 if blocks is None else len(blocks)
         self.at_points = np.empty((count, 3, 0))
 
@@ -53,58 +96,103 @@ class SpringColumns:
         wanted |= touched[:, None] & (np.abs(np.einsum("cij,cj->ci", frames, normals)) > 0.2)
         if not self._complete(wanted, most):
             return None
-        points, axes = np.array(list(self.keys), dtype=int).reshape(-1, 2).T
-        together = points[:, None] == points
-        D = np.where(together, change[points[:, None], axes[:, None], axes], 0.0)
-        return SpringChange(self, points, frames[points, axes], D)
+        return SpringChange(self, np.array(list(self.keys), dtype=int).reshape(-1, 2), frames, change,
+                            0.1 * NOTABLE * typical)  # fmt: skip
 
-    def moved(self, x: Array) -> Array:
-        """Values (c, 3, ...) at the contact points of the unknowns ``x (n, ...)``."""
+    def moved(self, y: Array, closed: Bools) -> Array:
+        """Displacements (c, 3) of the contact points by the half solution ``y (n, 1)``.
+
+        Where only inner points are ``closed (c,)``, the others are taken to stay.
+        """
         assert self._bodies is not None
-        return self._bodies.springs_of(x)
+        if not self.inner.any() or (closed & ~self.inner).any():
+            return self._bodies.springs_of(self._halves.backward(y))[..., 0]
+        x = self._halves.backward(y[self._halves.last], True)
+        return np.where(self.inner[:, None], self._bodies.springs_of(x, self._shares)[..., 0], 0.0)
+
+    def pushed(self, y: Array, coefficients: Array) -> Array:
+        """Half solutions ``y (n, r)`` with the columns added, ``coefficients (k, r)`` times."""
+        y = y.copy()
+        y[self.rows] += self.W[:, : len(coefficients)] @ coefficients.astype(np.float32)
+        return y
 
     def _complete(self, wanted: Bools, most: int) -> bool:
         """Make the columns that are missing, unless they would be too many in all."""
         new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
-        if len(self.keys) + len(new) > most:
+        dear = sum(not self.inner[point] for point, _ in (*self.keys, *new))
+        if dear > most or len(self.keys) + len(new) > max(most, MOST_COLUMNS):
             return False
-        if new:
-            assert self._bodies is not None
-            self.keys.update({key: len(self.keys) + i for i, key in enumerate(new)})
-            points, axes = np.array(new).T
-            unit = np.zeros((len(wanted), 3, len(new)))
-            unit[points, :, np.arange(len(new))] = self._bodies.frames[points, axes]
-            Z = self._apply(self._bodies.at_springs(unit))
-            self.Z = np.concatenate([self.Z.T, Z.T.astype(np.float32)]).T
-            self.at_points = np.concatenate([self.at_points, self._bodies.springs_of(Z)], axis=2)
+        for inner in (True, False):
+            self._add([key for key in new if self.inner[key[0]] == inner], inner)
         return True
+
+    def _add(self, new: list[tuple[int, int]], inner: bool) -> None:
+        if not new:
+            return
+        assert self._bodies is not None
+        self.keys.update({key: len(self.keys) + i for i, key in enumerate(new)})
+        points, axes = np.array(new).T
+        unit = np.zeros((len(self.inner), 3, len(new)))
+        unit[points, :, np.arange(len(new))] = self._bodies.frames[points, axes]
+        shares = self._shares if inner else None
+        N = self._bodies.at_springs(unit, shares)
+        W = self._halves.forward(N, inner)
+        at_points = self._bodies.springs_of(self._halves.backward(W, inner), shares)
+        if inner:
+            at_points[~self.inner] = 0.0
+        elif not isinstance(self.rows, slice):
+            self.W, self.rows = self._widened(self.W), slice(None)
+        narrow = inner and isinstance(self.rows, slice)
+        self.W = np.hstack([self.W, self._widened(W) if narrow else W.astype(np.float32)])
+        self.P = self.W if self._halves.transposed else np.hstack([self.P, N.astype(np.float32)])
+        self.S = (self.P.T @ self.W).astype(float)
+        self.at_points = np.concatenate([self.at_points, at_points], axis=2)
+
+    def _widened(self, W: Array | Single) -> Single:
+        """Columns (m, k) of the unknowns that are eliminated last, as those of all (n, k)."""
+        out = np.zeros((self._unknowns, W.shape[1]), dtype=np.float32)
+        out[self._halves.last] = W
+        return out
 
 
 class SpringChange:
-    """One set of changed springs: ``points (k,)``, ``directions (k, 3)`` and ``D (k, k)``."""
+    """One set of changed springs: of all columns ``points (k,)`` and ``directions (k, 3)``; of those
+    ``stiffer (j,)`` whose stiffness changed, ``D (j, j)``.
+
+    ``keys (k, 2)``: point and axis of the columns; ``change (c, 3, 3)`` of stiffness in the points'
+    ``frames``, N/mm, of which less than ``little`` is none.
+    """
 
     def __init__(
-        self, columns: SpringColumns, points: NDArray[np.int64], directions: Array, D: Array
+        self, columns: SpringColumns, keys: NDArray[np.int64], frames: Array, change: Array, little: float
     ) -> None:
-        self._columns, self._points, self._directions, self._D = columns, points, directions, D
-        self._S = np.einsum("ki,kil->kl", directions, columns.at_points[points])
-        self._inverse = np.linalg.inv(np.eye(len(D)) + self._S @ D)
+        self._columns, (self._points, axes) = columns, keys.T
+        self._directions = frames[self._points, axes]
+        self._stiffer = np.flatnonzero((np.abs(change[self._points]) > little).any(axis=(1, 2)))
+        points, axes = self._points[self._stiffer], axes[self._stiffer]
+        D = np.where(points[:, None] == points, change[points[:, None], axes[:, None], axes], 0.0)
+        S = columns.S[np.ix_(self._stiffer, self._stiffer)]
+        self._answer = D @ np.linalg.inv(np.eye(len(D)) + S @ D)
 
     def project(self, values: Array) -> Array:
         """Components (k, ...) along the springs of vectors (c, 3, ...) at the contact points."""
         return np.einsum("ki,ki...->k...", self._directions, values[self._points])
 
     def correct(self, y: Array) -> Array:
-        """Solutions (n, r) of the changed matrix from solutions ``y (n, r)`` of the factor."""
-        if not len(self._points):
+        """First halves of solutions (n, r) of the changed matrix from those ``y (n, r)`` of the factor."""
+        if not len(self._stiffer):
             return y
-        moved = self._inverse @ self.project(self._columns.moved(y))
-        return y - self._columns.Z @ (self._D @ moved).astype(np.float32)
+        moved = (self._columns.P.T @ y[self._columns.rows].astype(np.float32))[self._stiffer]
+        coefficients = np.zeros((len(self._points), y.shape[1]))
+        coefficients[self._stiffer] = -(self._answer @ moved)
+        return self._columns.pushed(y, coefficients)
 
     def coefficients(self, moved: Array, forces: Array) -> Array:
         """What to add (k,) of each column, for displacements of the factor's solution and forces (c, 3)."""
-        f = self.project(forces)
-        return f - self._D @ (self._inverse @ (self.project(moved) + self._S @ f))
+        out = self.project(forces)
+        at = self._stiffer
+        out[at] -= self._answer @ (self.project(moved) + self._columns.S @ out)[at]
+        return out
 
     def at_points(self, coefficients: Array) -> Array:
         """The combination of columns at the contact points (c, 3)."""

@@ -163,7 +163,7 @@ def _statistics(run: Simulation, seconds: float, sunk_steps: int) -> dict[str, A
         "newton_iterations": run.counts["newton_iterations"],
         "factorisations": sum(factor.counts["factorisations"] for factor in used),
         "multigrids": run.factor.counts["multigrids"],
-        "solves": sum(factor.counts["solves"] for factor in used),
+        "solves": sum(factor.counts["half_solves"] for factor in used) // 2,
         "double_precision": any(factor.counts["double_precision"] for factor in used),
         "linear_solver": run.factor.name,
         "element": run.system.element.name,
