@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bodies import Bodies, Contacts, extra_rows
+from .checking import check
 from .contact.contact import ContactSurface, Touch
 from .contact.grip import Grip
 from .contact.indenter import Indenter
@@ -25,7 +26,7 @@ from .kernel.laws import Laws
 from .motion import Drives
 from .pattern import Pattern, bordered, node_graph, positions, upper_pattern
 from .pressure import Pressures
-from .problem import Problem, ProblemError, check
+from .problem import Problem, ProblemError
 from .threads import thread_pool
 
 Array = NDArray[np.float64]

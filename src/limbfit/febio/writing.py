@@ -135,7 +135,13 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
 
 
 def check_element(problem: Problem, program: str) -> None:
-    """Raise `ProblemError` where another program has no such element."""
+    """Raise `ProblemError` where another program has no such element, or no such beginning."""
+    if problem.touch_down_s:
+        raise ProblemError(
+            f"an indenter that touches the limb after clamps or tensed muscle have moved it is not written for "
+            f"{program}",
+            remedy="leave them out of the study",
+        )
     name = problem.formulation.name
     if name not in _QUADRATURE:
         known = ", ".join(_QUADRATURE)
