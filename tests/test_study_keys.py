@@ -181,6 +181,13 @@ ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
     "geometry.regions.0.name": ("mesh", "tendon"),
     "geometry.regions.0.surface": ("surfaces", "tibia.stl"),
     "calibration.objective": ("calibrate", "paper"),
+    "clamps": ("calibrate", {"force_N": 15.0}),
+    "clamps.force_N": ("calibrate", 14.0),
+    "clamps.angles_degrees": ("calibrate", [90.0, -90.0]),
+    "clamps.levels_mm": ("calibrate", [10.0]),
+    "clamps.width_mm": ("mesh", 15.0),
+    "clamps.clamping_s": ("calibrate", 1.0),
+    "clamps.settling_s": ("calibrate", 9.0),
     "indenter": ("calibrate", {"shape": "stl", "file": "other.stl"}),
     "sites.0.position": ("sites", [0.0, -51.0, 10.0]),
     "sites.1.depth_mm": ("design", 7.0),
@@ -281,6 +288,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (GIVEN, {"calibration.force_error_percent": 2.0}, "calibration.force_error_percent"),
     (GIVEN, {"calibration.prior_tissues": {"skin": "none"}}, "calibration.prior_tissues"),
     (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
+    (GIVEN, {"clamps.force_N": 9.0, "calibration.search_radius_mm": 50.0}, "calibration.search_radius_mm"),
     *[
         (
             GIVEN,

@@ -99,6 +99,15 @@ class History:
         """What the indenter does: loads, holds, unloads, in any number."""
         return find_phases(self.times, self.driver)
 
+    def later(self, seconds: float) -> History:
+        """The same after a rest of so many seconds."""
+        if not seconds:
+            return self
+        values = {"displacement" if self.force is None else "force": np.append(self.driver[0], self.driver)}
+        if self.across is not None:
+            values["across"] = np.concatenate([self.across[:1], self.across])
+        return History(np.append(0.0, self.times + seconds), **values)
+
     @property
     def kinks(self) -> NDArray[np.float64]:
         """Times where phases begin or end, or a move across the axis turns, s, both ends among them."""

@@ -138,8 +138,7 @@ def check_element(problem: Problem, program: str) -> None:
     """Raise `ProblemError` where another program has no such element, or no such beginning."""
     if problem.touch_down_s:
         raise ProblemError(
-            f"an indenter that touches the limb after clamps or tensed muscle have moved it is not written for "
-            f"{program}",
+            f"an indenter that touches a limb that clamps or muscle have moved is not written for {program}",
             remedy="leave them out of the study",
         )
     name = problem.formulation.name

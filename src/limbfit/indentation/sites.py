@@ -21,7 +21,8 @@ from ..fe import Fibred, History, Indenter, Material, OgdenQLV, Problem, RigidSu
 from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
-from ..study import IndenterTable, SolverTable, Vector
+from ..study import ClampsTable, IndenterTable, SolverTable, Vector
+from .clamps import clamped
 from .fibres import Direction, fibre_field
 from .neighbourhood import held_cut, neighbourhood
 
@@ -61,6 +62,8 @@ class SiteModel:
     site: str = ""
     knots_N: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
+    clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
+    along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally
 
     @property
     def forced(self) -> bool:
@@ -68,8 +71,18 @@ class SiteModel:
         return bool(self.knots_N)
 
     @property
+    def waits_s(self) -> float:
+        """How long the limb is held before the indenter touches it, s: a result's times are later by that."""
+        return 0.0 if self.clamps is None else self.clamps.begun_s
+
+    @property
+    def bare(self) -> SiteModel:
+        """The site where nothing moves the limb but the indenter."""
+        return replace(self, clamps=None)
+
+    @property
     def history(self) -> History:
-        """The advance of the indenter, or the force that presses it."""
+        """The advance of the indenter from touch-down, or the force that presses it."""
         if self.forced:
             return History(np.array(self.knots_s), force=np.array(self.knots_N))
         return History(np.array(self.knots_s), np.array(self.knots_mm))
@@ -107,7 +120,8 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     """The site's boundary-value problem: node sets ``fixed_*`` held, skin in contact with the indenter.
 
     Only skin near the indenter enters the contact: what it cannot reach costs time for nothing. Where the
-    model goes no farther than ``within_mm``, so is the cut below the indenter.
+    model goes no farther than ``within_mm``, so is the cut below the indenter. What holds the limb before
+    comes first, for `SiteModel.waits_s`.
     """
     load_extensions(model.extensions)
     cut, fibres = np.empty(0, dtype=np.int64), fibre_field(model.fibres, mesh)
@@ -122,17 +136,19 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     faces = mesh.face_sets["skin"]
     reach = indenter.width * 0.71 + max(model.knots_mm) + 8.0
     near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
-    return Problem(
+    problem = Problem(
         mesh=mesh,
         materials=materials_of(model, parameters),
         fixed=np.union1d(mesh.held, cut),
         contact_faces=faces[near],
         indenter=indenter,
-        history=model.history,
+        history=model.history.later(model.waits_s),
         friction=model.indenter.friction,
         element=model.element,
         fibres=fibres,
+        touch_down_s=model.waits_s,
     )
+    return problem if model.clamps is None else clamped(problem, np.array(model.along), model.clamps)
 
 
 def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:

@@ -104,3 +104,24 @@ class MaterialTable(TomlTable):
                 if not lower[name] < upper[name]:
                     raise ValueError(f"{place}lower.{name} is not below upper.{name}")
         return self
+
+    def check_tissues(self, tissues: tuple[str, ...]) -> None:
+        """Raise `ValueError` where a tissue is named that is not among the model's, or bounds do not meet."""
+        unknown = [tissue for tissue in self.tissues if tissue not in tissues]
+        if unknown:
+            known = ", ".join(tissues)
+            raise ValueError(
+                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
+            )
+        for tissue in self.fibres:
+            if tissue not in tissues:
+                known = ", ".join(tissues)
+                raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
+        for name in self.keys:
+            lower = max(self.of(tissue, "lower")[name] for tissue in tissues)
+            upper = min(self.of(tissue, "upper")[name] for tissue in tissues)
+            if not lower < upper:
+                raise ValueError(
+                    f"material: the tissues' bounds of {name} have no range in common, "
+                    "and the stage of one material needs one; widen them"
+                )

@@ -144,10 +144,15 @@ VAIN: tuple[Vain, ...] = (
         "give calibration.starts, or leave it out",
     ),
     Vain(
+        ("calibration.search_radius_mm",),
+        lambda s: s.clamps is not None,
+        "[clamps] press all around the limb, so parameters are searched on whole meshes",
+    ),
+    Vain(
         ("calibration.corrections", "calibration.correction_tolerance_percent"),
         lambda s: not s.is_searched_apart,
         "parameters are searched on the meshes themselves, so nothing is corrected",
-        "give calibration.search_radius_mm, or leave it out",
+        "give calibration.search_radius_mm or [mesh.coarse], or leave it out",
     ),
     Vain(
         tuple(f"uncertainty.{key}" for key in _SOURCES),

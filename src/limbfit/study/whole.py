@@ -25,6 +25,7 @@ from ..laws import (
 )
 from ..priors import of_tissues
 from .acquisition import AcquireTable
+from .clamps import ClampsTable
 from .material import MaterialTable
 from .meshing import MeshTable
 from .records import Indentation, Record, RecordTable, Site, records_of
@@ -60,6 +61,7 @@ class Study(TomlTable):
     mesh: MeshTable = MeshTable()
     indenter: IndenterTable = IndenterTable()
     indenters: dict[str, IndenterTable] = Field(default={})
+    clamps: ClampsTable | None = None
     traces: TracesTable = TracesTable()
     markups: MarkupsTable | None = None
     sites: tuple[Site, ...]
@@ -190,7 +192,7 @@ class Study(TomlTable):
     @property
     def within_mm(self) -> float | None:
         """How far from a site its mesh counts where parameters are searched; None: as far as it goes."""
-        return self.calibration.search_radius_mm or None
+        return None if self.clamps is not None else self.calibration.search_radius_mm or None
 
     @property
     def is_searched_apart(self) -> bool:
@@ -306,6 +308,13 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
+    def _held_under_displacement(self) -> Study:
+        forced = [record.name for record in self.recorded if record.forced]
+        if self.clamps is not None and forced:
+            raise ValueError(f'clamps: {forced[0]} has control = "force"; leave it or the clamps out')
+        return self
+
+    @model_validator(mode="after")
     def _indenters_of_records(self) -> Study:
         named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
         named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]
@@ -317,25 +326,7 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _materials_of_tissues(self) -> Study:
-        material, tissues = self.material, self.tissues
-        unknown = [tissue for tissue in material.tissues if tissue not in tissues]
-        if unknown:
-            known = ", ".join(tissues)
-            raise ValueError(
-                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
-            )
-        for tissue in material.fibres:
-            if tissue not in tissues:
-                known = ", ".join(tissues)
-                raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
-        for name in material.keys:
-            lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
-            upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
-            if not lower < upper:
-                raise ValueError(
-                    f"material: the tissues' bounds of {name} have no range in common, "
-                    "and the stage of one material needs one; widen them"
-                )
+        self.material.check_tissues(self.tissues)
         return self
 
     @model_validator(mode="after")
