@@ -221,6 +221,7 @@ OTHER_NAMES = {
     "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
     "geometry.regions.label": "geometry.regions.surface",  # instead of it
     "indenter.file": "indenter",
+    **dict.fromkeys(("material.activation.time_s", "material.activation.share"), "material.activation"),
     "indenters.file": "indenters.ball",
     "calibration.prior.median": "calibration.prior.skin.c_kPa.median",
     "calibration.prior.factor": "calibration.prior.skin.c_kPa.factor",
@@ -360,6 +361,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         "sites.indenter",
     ),
     (GIVEN, {"material.fibres": {"muscle": "axis"}}, "material.fibres"),
+    (GIVEN, {"material.activation": {"time_s": [0.0, 1.0], "share": [1.0, 0.5]}}, "material.activation"),
     (GIVEN, {"sites.1.control": "force"}, "sites.control"),
     (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),

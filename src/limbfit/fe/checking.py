@@ -158,5 +158,5 @@ def _check_touch_down(problem: Problem) -> None:
             "a later touch-down is that of an indenter driven by displacement that starts touching",
             remedy="leave touch_down_s out",
         )
-    if history.at(at) != 0.0 or history.driver[history.times < at].any():
+    if np.ptp(np.append(history.driver[history.times < at], history.at(at))) > 0.0:
         raise ProblemError(f"the indenter advances before its touch-down at {at:g} s")

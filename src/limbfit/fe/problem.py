@@ -172,7 +172,7 @@ class Problem:
     activation : how much of the active stress of `Contractile` materials acts, over time.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     touch_down_s : when it does so, s; until then it is clear of the tissue, which bodies, pressures or
-        activation may have moved.  Its displacement is 0 until then, and counts from there.
+        activation may have moved.  Its displacement does not change until then, and counts from there.
     """
 
     mesh: Mesh

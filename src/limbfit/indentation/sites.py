@@ -17,7 +17,18 @@ from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from ..errors import ProblemError, SurfaceError
 from ..extensions import load_extensions
-from ..fe import Fibred, History, Indenter, Material, OgdenQLV, Problem, RigidSurface, StepControl
+from ..fe import (
+    Activation,
+    Contractile,
+    Fibred,
+    History,
+    Indenter,
+    Material,
+    OgdenQLV,
+    Problem,
+    RigidSurface,
+    StepControl,
+)
 from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
@@ -27,6 +38,7 @@ from .fibres import Direction, fibre_field
 from .neighbourhood import held_cut, neighbourhood
 
 Array = NDArray[np.float64]
+RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
 ROUGHLY = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
 
 
@@ -64,6 +76,7 @@ class SiteModel:
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
     clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
     along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally
+    course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
 
     @property
     def forced(self) -> bool:
@@ -73,12 +86,35 @@ class SiteModel:
     @property
     def waits_s(self) -> float:
         """How long the limb is held before the indenter touches it, s: a result's times are later by that."""
-        return 0.0 if self.clamps is None else self.clamps.begun_s
+        return self._rise_s + self._rest_s
+
+    @property
+    def _rise_s(self) -> float:
+        """How long what holds and tenses the limb takes to rise, s."""
+        if self.clamps is not None:
+            return self.clamps.clamping_s
+        return RISE_S if self.course else 0.0
+
+    @property
+    def _rest_s(self) -> float:
+        """How long it then acts before the indenter touches, s."""
+        if self.clamps is not None:
+            return self.clamps.settling_s
+        return REST_S if self.course else 0.0
+
+    @property
+    def activation(self) -> Activation | None:
+        """The share of the active stress: what it is at touch-down rises first, and rests."""
+        if not self.course:
+            return None
+        times, shares = zip(*self.course, strict=True)
+        late = [self.waits_s + t for t in times]
+        return Activation([0.0, self._rise_s, *late], [0.0, shares[0], *shares])
 
     @property
     def bare(self) -> SiteModel:
         """The site where nothing moves the limb but the indenter."""
-        return replace(self, clamps=None)
+        return replace(self, clamps=None, course=())
 
     @property
     def history(self) -> History:
@@ -104,9 +140,13 @@ def materials(
             found[tissue] = stated.material(**own, kappa_ratio=kappa_ratio)
             continue
         fibre = {name: own.pop(name) for name in ("k1", "k2") if name in own}
+        active = own.pop("active", None)
         c, m, *relaxation = own.values()
         ground = OgdenQLV(c, m, relaxation[::2], relaxation[1::2], kappa_ratio)
-        found[tissue] = Fibred(ground, **fibre) if fibre and tissue in fibred else ground
+        found[tissue] = ground
+        if fibre and tissue in fibred:
+            passive = Fibred(ground, **fibre)
+            found[tissue] = passive if active is None else Contractile(passive, active)
     return found
 
 
@@ -146,6 +186,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         friction=model.indenter.friction,
         element=model.element,
         fibres=fibres,
+        activation=model.activation,
         touch_down_s=model.waits_s,
     )
     return problem if model.clamps is None else clamped(problem, np.array(model.along), model.clamps)

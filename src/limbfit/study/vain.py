@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StudyError
-from ..laws import FIBRED
+from ..laws import ACTIVE, FIBRED, has_fibres
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
 from .records import Site
@@ -166,9 +166,15 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("material.fibres",),
-        lambda s: s.material.law != FIBRED,
+        lambda s: not has_fibres(s.material.law),
         "the tissues' law has no fibres",
         f'give material.law = "{FIBRED}", or leave it out',
+    ),
+    Vain(
+        ("material.activation",),
+        lambda s: s.material.law != ACTIVE,
+        "the tissues' law has no active stress",
+        f'give material.law = "{ACTIVE}", or leave it out',
     ),
     Vain(
         tuple(f"socket.{key}" for key in _SHAPE),

@@ -13,12 +13,12 @@ from pydantic import Field, field_validator, model_validator
 from ..errors import InputError, StudyError
 from ..laws import (
     FIBRE_KEYS,
-    FIBRED,
     LAWS,
     OGDEN,
     Parameters,
     TissueLaw,
     flat_names,
+    has_fibres,
     is_ogden,
     to_parameters,
     to_vector,
@@ -120,17 +120,17 @@ class Study(TomlTable):
     @property
     def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:
         """Direction of the fibres in the tissues that have some: the limb's axis in the core by default."""
-        if self.material.law != FIBRED:
+        if not has_fibres(self.material.law):
             return {}
         return self.material.fibres or {self.geometry.core: "axis"}
 
     @property
     def fixed(self) -> tuple[str, ...]:
         """The parameters that stay at their start: those stated, and of fibres that a tissue has not."""
-        if self.material.law != FIBRED:
+        if not has_fibres(self.material.law):
             return self.calibration.fixed
         bare = [tissue for tissue in self.tissues if tissue not in self.fibres]
-        without = (f"{tissue}.{key}" for tissue in bare for key in FIBRE_KEYS)
+        without = (f"{tissue}.{key}" for tissue in bare for key in FIBRE_KEYS if key in self.law.keys)
         return tuple(dict.fromkeys((*self.calibration.fixed, *without)))
 
     @property
@@ -310,8 +310,9 @@ class Study(TomlTable):
     @model_validator(mode="after")
     def _held_under_displacement(self) -> Study:
         forced = [record.name for record in self.recorded if record.forced]
-        if self.clamps is not None and forced:
-            raise ValueError(f'clamps: {forced[0]} has control = "force"; leave it or the clamps out')
+        why = "the clamps" if self.clamps is not None else "contraction" if self.material.course else ""
+        if why and forced:
+            raise ValueError(f'{forced[0]} has control = "force", which goes without {why}; leave one out')
         return self
 
     @model_validator(mode="after")

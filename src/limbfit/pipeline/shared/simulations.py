@@ -209,6 +209,7 @@ def site_model(
         layers=tuple(layers),
         clamps=study.clamps,
         along=limb_axis(context),
+        course=study.material.course,
     )
 
 
