@@ -30,6 +30,7 @@ def check(problem: Problem) -> None:
             raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
     _check_cells(problem)
     _check_fibres(problem)
+    _check_prestretch(problem)
     _check_bodies(problem)
     _check_touch_down(problem)
     if not len(problem.fixed) and not problem.supports:
@@ -112,6 +113,23 @@ def _check_fibres(problem: Problem) -> None:
         )
     if not (np.isfinite(given).all() and (np.linalg.norm(np.atleast_2d(given), axis=1) > 0.0).all()):
         raise ProblemError("a direction of the fibres is zero or not finite")
+
+
+def _check_prestretch(problem: Problem) -> None:
+    if problem.prestretch is None:
+        return
+    given, cells = np.asarray(problem.prestretch, dtype=float), len(problem.mesh.cells)
+    if given.shape not in ((3, 3), (cells, 3, 3)):
+        raise ProblemError(
+            f"a pre-stretch has shape {given.shape}", remedy=f"give (3, 3), or ({cells}, 3, 3)"
+        )
+    if not (np.isfinite(given).all() and (np.linalg.det(given) > 0.0).all()):
+        raise ProblemError("a pre-stretch is not finite, or its determinant is not positive")
+    if problem.indenter is not None and problem.start == "touching" and problem.history.forced:
+        raise ProblemError(
+            "an indenter that touches pre-strained tissue is driven by displacement",
+            remedy='state where it starts, start="as-given"',
+        )
 
 
 def _check_bodies(problem: Problem) -> None:

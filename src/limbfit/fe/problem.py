@@ -171,6 +171,8 @@ class Problem:
         material is `Fibred`.
     activation : how much of the active stress of `Contractile` materials acts, over time.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
+    prestretch : elastic deformation of the tissue where the mesh is, one (3, 3) or one for each cell (m, 3,
+        3), such as `isochoric_stretch`; the body is in equilibrium with it, long since, before time begins.
     touch_down_s : when it does so, s; until then it is clear of the tissue, which bodies, pressures or
         activation may have moved.  Its displacement does not change until then, and counts from there.
     """
@@ -191,6 +193,7 @@ class Problem:
     pressures: tuple[Pressure, ...] = ()
     fibres: ArrayLike | None = None
     activation: Activation | None = None
+    prestretch: ArrayLike | None = None
     touch_down_s: float = 0.0
     name: str = field(default="", compare=False)
 

@@ -136,6 +136,8 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
 
 def check_element(problem: Problem, program: str) -> None:
     """Raise `ProblemError` where another program has no such element, or no such beginning."""
+    if problem.prestretch is not None:
+        raise ProblemError(f"a pre-stretch is not written for {program}", remedy="leave it out of the study")
     if problem.touch_down_s:
         raise ProblemError(
             f"an indenter that touches a limb that clamps or muscle have moved is not written for {program}",

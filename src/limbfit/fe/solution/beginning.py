@@ -10,12 +10,20 @@ from numpy.typing import NDArray
 from ..contact.friction import LAWS_OF_STICKING
 from ..contact.grip import Grip
 from ..contact.sticky import Anchors
+from ..history import Memory
+from ..kernel.laws import Laws
 from ..motion import Drives
 from ..problem import Problem
-from ..result import Result
+from ..result import Result, State
 from ..system import System
 
 Array = NDArray[np.float64]
+
+
+def elastic_residual(system: System, laws: Laws, state: State) -> float:
+    """Norm of the nodal forces of elastic tissue in a state, N."""
+    still = Memory.rest(system, laws).increment(system, laws, 0.0, 1.0, state.displacement, 0.0, state.drives)
+    return float(np.linalg.norm(system.evaluate(state.rows, laws, still, tangent=False).residual))
 
 
 def travel(system: System, modulus: float) -> float:

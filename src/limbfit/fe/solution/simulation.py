@@ -18,7 +18,7 @@ from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
 from ..threads import single_threaded_numpy
-from .beginning import begun, grips_of, system_of, travel
+from .beginning import begun, elastic_residual, grips_of, system_of, travel
 from .control import StepControl, schedule
 from .coupling import Coupling, couple, renewed, solve_coupled
 from .direction import renew
@@ -49,6 +49,8 @@ MOST_DEEPER = 3.0
 # Contact pressure over the mean shear modulus from which a rounded edge is flat in the tangents far from
 # equilibrium: over the radius it is a negative stiffness, there beside that of the tissue.
 STEEP_PRESSURE = 3.0
+# How long ago tissue was strained before a simulation begins, s: by now it has relaxed.
+LONG_SINCE = 1e9
 
 
 class Simulation:
@@ -103,6 +105,8 @@ class Simulation:
         planned = schedule(self.problem.history, self.control, self.problem.turns)
         targets = list(planned)
         pace, why = Pace(self.control.max_iterations), ""
+        if len(self.system.prestretch) and not self._rested():
+            return
         times, forces = [0.0], [0.0]
         while targets:
             now, spent = self.states[-1].time, self._spent()
@@ -132,13 +136,25 @@ class Simulation:
                     targets = foresee(self.problem.history, planned, targets, times, forces)
             yield found
 
-    def _attempt(self, t: float, patience: int) -> Step | str:
+    def _rested(self) -> bool:
+        """Whether pre-strained tissue is brought to the equilibrium that it has had long since."""
+        strained = elastic_residual(self.system, self.laws, self.states[0])
+        self.floor = max(self.floor, 1e-2 * strained)  # it may be left without any stress
+        with single_threaded_numpy():
+            found = self._attempt(0.0, self.control.max_iterations, LONG_SINCE)
+        if isinstance(found, str):
+            self.reason = f"the pre-strained tissue found no equilibrium: {found}"
+        self.states = self.states[-1:]
+        return not self.reason
+
+    def _attempt(self, t: float, patience: int, takes: float | None = None) -> Step | str:
         """The step to time ``t``, or why there is none; nothing is changed unless it is accepted.
 
-        ``patience``: iterations that are allowed for one equilibrium.
+        ``patience``: iterations that are allowed for one equilibrium; ``takes``: another duration than the
+        time since the last state, s.
         """
-        before = self.states[-1]
-        history, dt = self.problem.history, t - before.time
+        history = self.problem.history
+        dt = t - self.states[-1].time if takes is None else takes
         displacement, drives = history.displacement_at(t), self.touch.drives(self.problem.drives(t))
         stiffness, u = self.stiffness, self._predict(t)
         pressures = tuple(pressure.at(t) for pressure in self.problem.pressures)

@@ -39,7 +39,8 @@ class TouchDown:
     @classmethod
     def of(cls, problem: Problem) -> TouchDown:
         """That with which a simulation begins."""
-        if problem.indenter is None or not problem.touch_down_s:
+        meets = problem.touch_down_s > 0.0 or (problem.prestretch is not None and problem.start == "touching")
+        if problem.indenter is None or not meets:
             return cls()
         return cls(True, -CLEAR * problem.indenter.width)
 
