@@ -147,5 +147,5 @@ def test_a_record_under_force_is_not_clamped(tmp_path):
     text = "[clamps]\n[[records]]\nsite = '1'\nname = 'creep'\ntrace = '1.csv'\ncontrol = 'force'\n"
     study = small_limb(tmp_path, f"{COARSE}{text}") / "study.toml"
     study.write_text(study.read_text().replace("depth_mm = 3.0\n", ""))
-    with pytest.raises(StudyError, match='1-creep has control = "force", which goes without the clamps'):
+    with pytest.raises(StudyError, match='1-creep has control = "force", which goes without clamps'):
         load_study(tmp_path)

@@ -181,6 +181,7 @@ ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
     "geometry.regions.0.name": ("mesh", "tendon"),
     "geometry.regions.0.surface": ("surfaces", "tibia.stl"),
     "calibration.objective": ("calibrate", "paper"),
+    "material.prestretch": ("calibrate", {"skin": 1.1}),
     "clamps": ("calibrate", {"force_N": 15.0}),
     "clamps.force_N": ("calibrate", 14.0),
     "clamps.angles_degrees": ("calibrate", [90.0, -90.0]),

@@ -36,6 +36,7 @@ from ..study import ClampsTable, IndenterTable, SolverTable, Vector
 from .clamps import clamped
 from .fibres import Direction, fibre_field
 from .neighbourhood import held_cut, neighbourhood
+from .prestretch import prestretch_field
 
 Array = NDArray[np.float64]
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
@@ -77,6 +78,7 @@ class SiteModel:
     clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
     along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally
     course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
+    prestretch: tuple[tuple[str, float], ...] = ()  # of tissues at rest
 
     @property
     def forced(self) -> bool:
@@ -114,7 +116,7 @@ class SiteModel:
     @property
     def bare(self) -> SiteModel:
         """The site where nothing moves the limb but the indenter."""
-        return replace(self, clamps=None, course=())
+        return replace(self, clamps=None, course=(), prestretch=())
 
     @property
     def history(self) -> History:
@@ -165,11 +167,13 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     """
     load_extensions(model.extensions)
     cut, fibres = np.empty(0, dtype=np.int64), fibre_field(model.fibres, mesh)
+    strained = prestretch_field(model.prestretch, mesh, fibres, dict(model.fibres))
     if model.within_mm is not None:
         centre, axis = np.array(model.position), np.array(model.axis)
         part = neighbourhood(mesh, centre, model.within_mm)
         mesh, cut = part.mesh, held_cut(part, centre, axis)
         fibres = None if fibres is None else fibres[part.cells]
+        strained = None if strained is None else strained[part.cells]
         if not len(cut) and not len(mesh.held):  # nothing else carries it
             cut = part.cut
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
@@ -187,6 +191,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         element=model.element,
         fibres=fibres,
         activation=model.activation,
+        prestretch=strained,
         touch_down_s=model.waits_s,
     )
     return problem if model.clamps is None else clamped(problem, np.array(model.along), model.clamps)

@@ -46,6 +46,7 @@ class MaterialTable(TomlTable):
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).  ``fibres``: their direction in the tissues
     that have some: a vector, that of the limb's axis, or a flow from the proximal cut to the bone's end.
     ``activation``: how much of their active stress acts, all of it where it is not stated.
+    ``prestretch``: how far tissues are stretched at rest, along fibres or in the plane of a layer.
     """
 
     law: str = OGDEN
@@ -56,6 +57,7 @@ class MaterialTable(TomlTable):
     tissues: dict[str, TissueRange] = Field(default={})
     fibres: dict[str, Literal["axis", "flow"] | Vector] = Field(default={})
     activation: ActivationTable | None = None
+    prestretch: dict[str, Annotated[float, Field(ge=0.7, le=1.5)]] = Field(default={})
 
     @property
     def course(self) -> tuple[tuple[float, float], ...]:
@@ -132,8 +134,9 @@ class MaterialTable(TomlTable):
                     raise ValueError(f"{place}lower.{name} is not below upper.{name}")
         return self
 
-    def check_tissues(self, tissues: tuple[str, ...]) -> None:
-        """Raise `ValueError` where a tissue is named that is not among the model's, or bounds do not meet."""
+    def check_tissues(self, tissues: tuple[str, ...], stretched: tuple[str, ...]) -> None:
+        """Raise `ValueError` where a tissue is named that the model has not, or that cannot
+        be ``stretched`` at rest, or where bounds do not meet."""
         unknown = [tissue for tissue in self.tissues if tissue not in tissues]
         if unknown:
             known = ", ".join(tissues)
@@ -144,6 +147,12 @@ class MaterialTable(TomlTable):
             if tissue not in tissues:
                 known = ", ".join(tissues)
                 raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
+        for tissue in self.prestretch:
+            if tissue not in stretched:
+                raise ValueError(
+                    f"material.prestretch.{tissue}: no layer, and no tissue with fibres; those are "
+                    f"{', '.join(stretched)}"
+                )
         for name in self.keys:
             lower = max(self.of(tissue, "lower")[name] for tissue in tissues)
             upper = min(self.of(tissue, "upper")[name] for tissue in tissues)

@@ -145,8 +145,8 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("calibration.search_radius_mm",),
-        lambda s: s.clamps is not None,
-        "[clamps] press all around the limb, so parameters are searched on whole meshes",
+        lambda s: s.clamps is not None or bool(s.material.prestretch),
+        "the whole limb is clamped or pre-stretched, so parameters are searched on whole meshes",
     ),
     Vain(
         ("calibration.corrections", "calibration.correction_tolerance_percent"),

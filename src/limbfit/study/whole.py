@@ -192,7 +192,8 @@ class Study(TomlTable):
     @property
     def within_mm(self) -> float | None:
         """How far from a site its mesh counts where parameters are searched; None: as far as it goes."""
-        return None if self.clamps is not None else self.calibration.search_radius_mm or None
+        whole = self.clamps is not None or self.material.prestretch  # of which parts do not keep what it is
+        return None if whole else self.calibration.search_radius_mm or None
 
     @property
     def is_searched_apart(self) -> bool:
@@ -310,9 +311,20 @@ class Study(TomlTable):
     @model_validator(mode="after")
     def _held_under_displacement(self) -> Study:
         forced = [record.name for record in self.recorded if record.forced]
-        why = "the clamps" if self.clamps is not None else "contraction" if self.material.course else ""
+        material = self.material
+        states = {"clamps": self.clamps, "contraction": material.course, "pre-stretch": material.prestretch}
+        why = [name for name, stated in states.items() if stated]
         if why and forced:
-            raise ValueError(f'{forced[0]} has control = "force", which goes without {why}; leave one out')
+            raise ValueError(f'{forced[0]} has control = "force", which goes without {why[0]}; leave one out')
+        return self
+
+    @model_validator(mode="after")
+    def _stretched_unseen(self) -> Study:
+        seen = [record.name for record in self.recorded if record.ultrasound is not None]
+        if self.material.prestretch and seen:
+            raise ValueError(
+                f"material.prestretch: {seen[0]} has ultrasound, which sees no pre-stretch; leave it out"
+            )
         return self
 
     @model_validator(mode="after")
@@ -327,7 +339,8 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _materials_of_tissues(self) -> Study:
-        self.material.check_tissues(self.tissues)
+        layers = [layer.name for layer in self.geometry.model_layers]
+        self.material.check_tissues(self.tissues, tuple(dict.fromkeys((*layers, *self.fibres))))
         return self
 
     @model_validator(mode="after")

@@ -66,13 +66,13 @@ class SocketLimb:
     def of(cls, context: Context, name: str) -> SocketLimb:
         """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
         study, surfaces = context.study, context.store["surfaces"]
-        if study.material.course:
-            raise InputError(
-                "the limb in a socket is at rest, and this study's muscle contracts",
-                file=study.file,
-                place="material.law",
-                remedy=f'give a study of its own with the law "{FIBRED}"',
-            )
+        for place, states, remedy in (
+            ("material.law", study.material.course, f'give a study of its own with the law "{FIBRED}"'),
+            ("material.prestretch", study.material.prestretch, "give a study of its own without it"),
+        ):
+            if states:
+                what = "the limb in a socket is at rest, without contraction and pre-stretch"
+                raise InputError(what, file=study.file, place=place, remedy=remedy)
         anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
         outer, depth = anatomy, stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:

@@ -210,6 +210,7 @@ def site_model(
         clamps=study.clamps,
         along=limb_axis(context),
         course=study.material.course,
+        prestretch=tuple(sorted(study.material.prestretch.items())),
     )
 
 
