@@ -20,10 +20,11 @@ import numpy as np
 from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.fe import History, Indenter, Problem, StepControl, solve
 from limbfit.indentation import materials
-from limbfit.indentation.clamps import Clamps, clamped
+from limbfit.indentation.clamps import clamped
 from limbfit.mesh import Mesh
 from limbfit.phantom import TrueSite, make_limb, true_parameters, true_sites
 from limbfit.phantom.surfaces import true_anatomy
+from limbfit.study import ClampsTable
 
 SEED, INDENTER_MM, EDGE_MM, KAPPA_RATIO = 0, 20.0, 2.0, 100.0
 # Coarse at the site, and finer away from it than for an indentation alone: the pins press all around.
@@ -53,21 +54,26 @@ def compare(site: TrueSite, mesh: Mesh, along: Any, force: float) -> dict[str, A
     started = time.process_time()
     problem, control = site_problem(site, mesh), StepControl()
     bare = solve(problem, control)
-    held = clamped(problem, along, Clamps(force_N=force), control)
-    found = solve(held.problem, control)
+    table = ClampsTable(force_N=force)
+    begun = table.begun_s
+    later = replace(problem, history=problem.history.later(begun), touch_down_s=begun)
+    found = solve(clamped(later, along, table), control)
     for result in (bare, found):
         if not result.completed:
             raise SystemExit(f"site {site.name}: {result.reason}")
     peak = float(problem.history.times[1])
     shares = np.linspace(0.1, 1.0, 10)
-    free, tight = bare.force_at(shares * peak), found.force_at(held.started_s + shares * peak)
+    free, tight = bare.force_at(shares * peak), found.force_at(begun + shares * peak)
+    met = int(np.argmax(found.times > begun * (1.0 + 1e-9)))
+    moved = found.coordinates[met, 0, 2] - found.displacement[met]
+    sunk = found.coordinates[met, 1:, 2]
     return {
         "site": site.name,
         "region": site.region,
         "depth_mm": site.depth,
-        "pins": len(held.sunk_mm),
-        "pins_in_mm": [float(held.sunk_mm.min()), float(held.sunk_mm.max())],
-        "skin_moved_mm": held.moved_mm,
+        "pins": len(sunk),
+        "pins_in_mm": [float(sunk.min()), float(sunk.max())],
+        "skin_moved_mm": float(moved),
         "peak_free_N": float(free[-1]),
         "peak_clamped_N": float(tight[-1]),
         "peak_change_percent": float(100.0 * (tight[-1] / free[-1] - 1.0)),

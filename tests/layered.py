@@ -101,6 +101,7 @@ def store_blocks(
                 layered_block(thickness, tissues, divisions=coarse), store["mesh"] / COARSE / f"{name}.vtu"
             )
         model = replace(model, indenter=study.indenter, law=study.material.law, extensions=study.extensions)
+        model = replace(model, course=study.material.course)
         model = replace(model, fibres=fibres_of(Context(study, store, SerialExecutor(), lambda event: None)))
         _write_record(study, model, truth, np.random.default_rng(i))
         places.append(

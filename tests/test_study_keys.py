@@ -181,6 +181,14 @@ ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
     "geometry.regions.0.name": ("mesh", "tendon"),
     "geometry.regions.0.surface": ("surfaces", "tibia.stl"),
     "calibration.objective": ("calibrate", "paper"),
+    "material.prestretch": ("calibrate", {"skin": 1.1}),
+    "clamps": ("calibrate", {"force_N": 15.0}),
+    "clamps.force_N": ("calibrate", 14.0),
+    "clamps.angles_degrees": ("calibrate", [90.0, -90.0]),
+    "clamps.levels_mm": ("calibrate", [10.0]),
+    "clamps.width_mm": ("mesh", 15.0),
+    "clamps.clamping_s": ("calibrate", 1.0),
+    "clamps.settling_s": ("calibrate", 9.0),
     "indenter": ("calibrate", {"shape": "stl", "file": "other.stl"}),
     "sites.0.position": ("sites", [0.0, -51.0, 10.0]),
     "sites.1.depth_mm": ("design", 7.0),
@@ -214,6 +222,7 @@ OTHER_NAMES = {
     "geometry.layers.thickness": "geometry.layers.0.thickness_mm",  # instead of it
     "geometry.regions.label": "geometry.regions.surface",  # instead of it
     "indenter.file": "indenter",
+    **dict.fromkeys(("material.activation.time_s", "material.activation.share"), "material.activation"),
     "indenters.file": "indenters.ball",
     "calibration.prior.median": "calibration.prior.skin.c_kPa.median",
     "calibration.prior.factor": "calibration.prior.skin.c_kPa.factor",
@@ -281,6 +290,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (GIVEN, {"calibration.force_error_percent": 2.0}, "calibration.force_error_percent"),
     (GIVEN, {"calibration.prior_tissues": {"skin": "none"}}, "calibration.prior_tissues"),
     (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
+    (GIVEN, {"clamps.force_N": 9.0, "calibration.search_radius_mm": 50.0}, "calibration.search_radius_mm"),
     *[
         (
             GIVEN,
@@ -352,6 +362,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         "sites.indenter",
     ),
     (GIVEN, {"material.fibres": {"muscle": "axis"}}, "material.fibres"),
+    (GIVEN, {"material.activation": {"time_s": [0.0, 1.0], "share": [1.0, 0.5]}}, "material.activation"),
     (GIVEN, {"sites.1.control": "force"}, "sites.control"),
     (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),

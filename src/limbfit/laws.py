@@ -22,6 +22,7 @@ KPA = 1e-3  # MPa
 UNITS = {"kPa": KPA, "s": 1.0}  # of parameters, in the solver's
 OGDEN = "ogden"  # the law of a study that names none
 FIBRED = "ogden-fibres"  # the law whose tissues may have fibres
+ACTIVE = "ogden-active"  # the law whose fibres may pull by themselves
 MOST_RELAXATIONS = 6  # terms, as FEBio
 
 
@@ -67,8 +68,8 @@ class TissueLaw:
     parameters : in the order of every flat vector.
     material : the class that the solver takes (`fe.Material`); its fields are the parameters' names and
         ``kappa_ratio``, the bulk modulus over the long-term shear modulus.  None: limbfit's own, `OgdenQLV`,
-        with as many relaxation terms as there are pairs of parameters after the first two, and fibres where
-        there are k1 and k2.
+        with as many relaxation terms as there are pairs of parameters after the first two, fibres where
+        there are k1 and k2, and their contraction where there is active.
     """
 
     name: str
@@ -148,6 +149,8 @@ _FIBRES = (
     Parameter("k1", 5.0, 0.05, 500.0, "kPa", "stiffness of the fibres"),
     Parameter("k2", 1.0, 0.01, 100.0, "", "stiffening of the fibres"),
 )
+# Living muscle tenses up to some 300 kPa; a limb that is indented is held as loose as can be.
+_TENSION = Parameter("active", 5.0, 0.05, 200.0, "kPa", "active stress along the fibres")
 
 
 def _fibred() -> TissueLaw:
@@ -158,14 +161,26 @@ def _fibred() -> TissueLaw:
     return TissueLaw(FIBRED, words, energy, (*plain.parameters, *_FIBRES))
 
 
-FIBRE_KEYS = tuple(parameter.key for parameter in _FIBRES)
+def _active() -> TissueLaw:
+    """The paper's law with fibres that contract."""
+    plain = _fibred()
+    energy = f"{plain.energy}; along them acts the active stress times the share s(t) of its activation"
+    return TissueLaw(ACTIVE, f"{plain.words} that contract", energy, (*plain.parameters, _TENSION))
+
+
+FIBRE_KEYS = tuple(parameter.key for parameter in (*_FIBRES, _TENSION))
 _OWN = {law.name: law for law in map(_ogden, range(1, MOST_RELAXATIONS + 1))}
-LAWS = Registry("tissue law", _OWN | {FIBRED: _fibred()})
+LAWS = Registry("tissue law", _OWN | {FIBRED: _fibred(), ACTIVE: _active()})
 
 
 def is_ogden(name: str) -> bool:
     """Whether a law is the paper's, with however many relaxation terms."""
     return name in _OWN
+
+
+def has_fibres(name: str) -> bool:
+    """Whether tissues of a law may have fibres."""
+    return name in (FIBRED, ACTIVE)
 
 
 def register_law(law: TissueLaw) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from blocks import boundary
@@ -10,8 +12,9 @@ from limbfit import History, Indenter, OgdenQLV, Problem
 from limbfit.bench.blocks import SIX_TETS, boxes, upright
 from limbfit.errors import ProblemError
 from limbfit.fe import StepControl, solve
-from limbfit.indentation.clamps import Clamps, clamped, clamping_pins
+from limbfit.indentation import clamped, clamping_pins
 from limbfit.mesh import Mesh
+from limbfit.study import ClampsTable
 
 INNER, OUTER, LENGTH = 15.0, 45.0, 100.0  # mm
 UP = np.array([0.0, 0.0, 1.0])
@@ -43,38 +46,70 @@ def site(mesh: Mesh, axis: tuple[float, float, float] = (-1.0, 0.0, 0.0)) -> Pro
     return Problem(mesh, tissue, mesh.held, faces[near], tool, history)
 
 
+def pins_of(problem: Problem) -> dict[str, Indenter]:
+    """The usual ones."""
+    assert problem.indenter is not None
+    skin = problem.mesh.face_sets["skin"]
+    return clamping_pins(problem.mesh.points, skin, problem.indenter, UP, ClampsTable())
+
+
 def test_eleven_of_fourteen_pins_clamp_all_around_but_beside_the_test_pin():
     problem = site(pipe())
-    pins = clamping_pins(problem.mesh, problem.indenter, UP, Clamps())
+    pins = pins_of(problem)
     assert len(pins) == 11
-    axes = np.array([pin.frame[2] for pin in pins])
+    axes = np.array([pin.frame[2] for pin in pins.values()])
     turns = np.degrees(np.arccos(axes @ [-1.0, 0.0, 0.0]))
     np.testing.assert_allclose(
         sorted(turns), sorted([360.0 / 14.0 * min(k, 14 - k) for k in range(2, 13)]), atol=1e-6
     )
     np.testing.assert_allclose(axes[:, 2], 0.0, atol=1e-12)
-    assert len(clamping_pins(problem.mesh, problem.indenter, UP, Clamps(pins=8, clear=2))) == 3
+
+
+def test_stated_pins_are_where_they_are_stated():
+    problem = site(pipe())
+    table = ClampsTable(angles_degrees=(90.0, -90.0), levels_mm=(20.0, -10.0))
+    bodies = clamped(problem, UP, table).bodies
+    centres = np.array([body.shape.centre for body in bodies])
+    apart = centres - [0.0, 0.0, 0.5 * LENGTH]
+    np.testing.assert_allclose(apart[:, 2], [20.0, -10.0], atol=1e-9)
+    np.testing.assert_allclose(apart[:, 1], [OUTER, -OUTER], atol=1.0)  # a polygon, not a circle
+    np.testing.assert_allclose(apart[:, 0], 0.0, atol=0.5)
+    assert [body.name for body in bodies] == ["clamp at 90 degrees", "clamp at -90 degrees"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "match"),
+    [
+        ({"angles_degrees": (12.0,)}, "clamp at 12 degrees would lie on the test pin, 9"),
+        ({"angles_degrees": (90.0,), "levels_mm": (80.0,)}, "80 mm along the limb, misses the skin"),
+        ({"levels_mm": (80.0,)}, "no clamping pin meets the skin"),
+    ],
+)
+def test_a_pin_that_cannot_be_placed_is_refused(stated, match):
+    with pytest.raises(ProblemError, match=f"clamps: .*{match}.*; give clamps.angles_degrees"):
+        clamped(site(pipe()), UP, ClampsTable(**stated))
 
 
 def test_a_test_pin_along_the_limb_has_no_ring():
     problem = site(pipe(), axis=(-0.1, 0.0, -1.0))
     with pytest.raises(ProblemError, match="points along the limb"):
-        clamping_pins(problem.mesh, problem.indenter, UP, Clamps())
+        pins_of(problem)
 
 
 @pytest.mark.slow
 def test_a_clamped_limb_bulges_between_the_pins_and_is_indented_from_there():
     problem, control = site(pipe()), StepControl(load_steps=4, unload_steps=3)
     bare = solve(problem, control)
-    held = clamped(problem, UP, Clamps(force_N=8.0, settling_s=2.0), control)
-    assert held.moved_mm < -0.1  # outwards: the tissue has to go somewhere
-    assert (held.sunk_mm > 0.2).all()
-    found = solve(held.problem, control)
+    table = ClampsTable(force_N=8.0, settling_s=2.0)
+    begun = table.begun_s
+    later = replace(problem, history=problem.history.later(begun), touch_down_s=begun)
+    found = solve(clamped(later, UP, table), control)
     assert found.completed, found.reason
-    after = found.times > held.started_s
+    after = found.times > begun * (1 + 1e-9)
+    assert not found.force[~after].any()
     np.testing.assert_allclose(found.reactions[after, 1:, 2], 8.0, rtol=1e-3)
-    peak = held.started_s + 4.0
-    assert np.abs(found.force[found.times < held.started_s - 1e-9]).max() == 0.0
-    # The skin creeps a little under the clamps while the test pin comes.
-    assert found.force_at([held.started_s])[0] < 0.02 * found.force_at([peak])[0]
-    assert found.force_at([peak])[0] == pytest.approx(bare.peak_force, rel=0.1)  # of tissue this stiff
+    moved = (found.coordinates[:, 0, 2] - found.displacement)[after]
+    np.testing.assert_allclose(moved, moved[0], atol=1e-9)
+    assert moved[0] < -0.1  # outwards: the tissue has to go somewhere
+    assert (found.coordinates[after, 1:, 2] > 0.2).all()
+    assert found.force_at([begun + 4.0])[0] == pytest.approx(bare.peak_force, rel=0.1)  # of tissue this stiff

@@ -19,6 +19,7 @@ from stored_results import SITES, add_fat, write_results
 from limbfit import compress_cube
 from limbfit.errors import InputError
 from limbfit.report import build_report
+from limbfit.report.formats import held
 from limbfit.web.arrays import unpack
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
@@ -403,6 +404,15 @@ def test_methods_say_what_was_done_and_name_nobody(results, report):
         assert f"{name} {version}" in text
     assert str(results) not in text
     assert "nan" not in text.lower().replace("nanometre", "")
+
+
+def test_methods_say_what_moved_the_limb_before():
+    assert held(None, {"law": "ogden", "prestretch": {}}) == ""
+    clamps = {"force_N": 15.0, "width_mm": 20.0, "clamping_s": 2.0, "settling_s": 5.0}
+    assert held(clamps, {"law": "ogden-active", "prestretch": {"skin": 1.1}}) == (
+        "Before the indenter touched the limb, pins of 20.0 mm clamped it with 15.0 N each for 7.0 s and "
+        "muscle contracted and tissue was pre-stretched (skin by 1.1)."
+    )
 
 
 @pytest.mark.slow

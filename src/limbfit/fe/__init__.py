@@ -42,6 +42,7 @@ from .materials import (
 )
 from .motion import Motion, RigidBody
 from .pressure import Pressure
+from .prestretch import isochoric_stretch
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .solution.compiling import are_compiled, compile_kernels
@@ -83,6 +84,7 @@ __all__ = [
     "Tractions",
     "are_compiled",
     "compile_kernels",
+    "isochoric_stretch",
     "iterate",
     "linear_solver",
     "solve",

@@ -1,4 +1,4 @@
-"""The mechanical problem, checked before anything is solved."""
+"""The mechanical problem."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from ..errors import ProblemError
 from ..mesh import Mesh
 from ..phases import Phase, boundaries, find_phases, loading_end
 from .activation import Activation
-from .contact.friction import LAWS_OF_STICKING
 from .contact.indenter import Indenter
-from .kernel.elements import ELEMENTS, Element, reference_gradients
+from .kernel.elements import ELEMENTS, Element
 from .materials import Material
 from .motion import Drives, Motion, RigidBody
 from .pressure import Pressure
@@ -100,6 +99,15 @@ class History:
         """What the indenter does: loads, holds, unloads, in any number."""
         return find_phases(self.times, self.driver)
 
+    def later(self, seconds: float) -> History:
+        """The same after a rest of so many seconds."""
+        if not seconds:
+            return self
+        values = {"displacement" if self.force is None else "force": np.append(self.driver[0], self.driver)}
+        if self.across is not None:
+            values["across"] = np.concatenate([self.across[:1], self.across])
+        return History(np.append(0.0, self.times + seconds), **values)
+
     @property
     def kinks(self) -> NDArray[np.float64]:
         """Times where phases begin or end, or a move across the axis turns, s, both ends among them."""
@@ -163,6 +171,10 @@ class Problem:
         material is `Fibred`.
     activation : how much of the active stress of `Contractile` materials acts, over time.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
+    prestretch : elastic deformation of the tissue where the mesh is, one (3, 3) or one for each cell (m, 3,
+        3), such as `isochoric_stretch`; the body is in equilibrium with it, long since, before time begins.
+    touch_down_s : when it does so, s; until then it is clear of the tissue, which bodies, pressures or
+        activation may have moved.  Its displacement does not change until then, and counts from there.
     """
 
     mesh: Mesh
@@ -181,6 +193,8 @@ class Problem:
     pressures: tuple[Pressure, ...] = ()
     fibres: ArrayLike | None = None
     activation: Activation | None = None
+    prestretch: ArrayLike | None = None
+    touch_down_s: float = 0.0
     name: str = field(default="", compare=False)
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
@@ -222,8 +236,10 @@ class Problem:
 
     @property
     def turns(self) -> NDArray[np.float64]:
-        """Times where what drives a further body, a pressure or the activation turns, s."""
+        """Times where what drives a further body, a pressure or the activation turns or contact begins, s."""
         knots = [np.asarray(one.times)[1:-1] for one in self.pressures]
+        if self.touch_down_s:
+            knots.append(np.array([self.touch_down_s]))
         if self.activation is not None:
             knots.append(np.asarray(self.activation.times)[1:])
         return np.unique(np.concatenate([np.zeros(0), *(body.motion.turns for body in self.bodies), *knots]))
@@ -246,139 +262,3 @@ class Problem:
     def parameters(self) -> NDArray[np.float64]:
         """Values in the order of `parameter_names`; mm, N, s, MPa."""
         return np.array([v for region in self.mesh.region_names for v in self.materials[region].parameters])
-
-
-def check(problem: Problem) -> None:
-    """Raise `ProblemError` where the problem is impossible as stated."""
-    _check_choices(problem)
-    mesh, n = problem.mesh, len(problem.mesh.points)
-    if not np.isfinite(mesh.points).all():
-        raise ProblemError("the mesh has points that are not finite")
-    if not len(mesh.cells):
-        raise ProblemError("the mesh has no cells")
-    indices = [("cells", mesh.cells), ("fixed nodes", problem.fixed)]
-    indices += [("contact faces", np.asarray(body.faces)) for body in problem.rigid_bodies]
-    indices += [("pressed faces", np.asarray(one.faces)) for one in problem.pressures]
-    indices += [("support nodes", support.nodes) for support in problem.supports]
-    for name, value in indices:
-        value = np.asarray(value)
-        if value.dtype == bool:
-            raise ProblemError(f"the {name} are a mask", remedy="give node numbers: numpy.flatnonzero(mask)")
-        if value.size and (value.min() < 0 or value.max() >= n):
-            raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
-    _check_cells(problem)
-    _check_fibres(problem)
-    _check_bodies(problem)
-    if not len(problem.fixed) and not problem.supports:
-        raise ProblemError("nothing is held in place", remedy="fix the bone and proximal nodes")
-
-
-def _check_choices(problem: Problem) -> None:
-    mesh = problem.mesh
-    name = problem.element or mesh.cell_type
-    if name not in ELEMENTS or ELEMENTS[name].cell_type != mesh.cell_type:
-        fitting = ", ".join(e.name for e in ELEMENTS.values() if e.cell_type == mesh.cell_type)
-        raise ProblemError(f"no element {name!r} for {mesh.cell_type} cells", remedy=f"use one of {fitting}")
-    missing = [region for region in mesh.region_names if region not in problem.materials]
-    if missing:
-        given = ", ".join(problem.materials) or "none"
-        raise ProblemError(
-            f"region {missing[0]!r} has no material", remedy=f"name it in materials; there are: {given}"
-        )
-    if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
-        raise ProblemError("the mesh has region indices without a name")
-    if problem.contact_rule not in ELEMENTS[name].face_rules:
-        rules = ", ".join(ELEMENTS[name].face_rules)
-        raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy=f"use one of {rules}")
-    if problem.start not in ("touching", "as-given"):
-        raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
-
-
-def _check_friction(friction: str | float, sticking: str) -> None:
-    if isinstance(friction, str):
-        known = friction in ("frictionless", "sticky")
-    else:
-        known = not isinstance(friction, bool) and 0.0 <= friction < np.inf
-    if not known:
-        raise ProblemError(
-            f"unknown friction {friction!r}", remedy="use 'frictionless', 'sticky' or a coefficient from 0 on"
-        )
-    if sticking not in LAWS_OF_STICKING:
-        raise ProblemError(
-            f"unknown law of sticking {sticking!r}", remedy=f"use {' or '.join(map(repr, LAWS_OF_STICKING))}"
-        )
-
-
-def _check_cells(problem: Problem) -> None:
-    mesh = problem.mesh
-    unique = np.unique(np.sort(mesh.cells, axis=1), axis=0)
-    if len(unique) != len(mesh.cells):
-        raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
-    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
-    upright = (weights > 0).all(axis=1)
-    # A quadratic map may be upright at its points and its corners not.
-    if mesh.kind.is_tetrahedron and len(mesh.kind.nodes) > mesh.kind.corners:
-        corners = mesh.points[mesh.corners]
-        upright &= np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
-    bad = np.flatnonzero(~upright)
-    if len(bad):
-        raise ProblemError(f"{len(bad)} cells are inverted or flat, the first is cell {bad[0]}")
-    used = np.zeros(len(mesh.points), dtype=bool)
-    used[mesh.cells] = True
-    if not used.all():
-        raise ProblemError(f"{(~used).sum()} nodes belong to no cell", remedy="drop them from the mesh")
-
-
-def _check_fibres(problem: Problem) -> None:
-    for region in problem.mesh.region_names:
-        if problem.activation is None and problem.materials[region].table().active > 0.0:
-            raise ProblemError(
-                f"the active stress of {region!r} acts at no stated time", remedy="state Problem.activation"
-            )
-    if problem.fibres is None:
-        for region in problem.mesh.region_names:
-            if problem.materials[region].table().has_fibres:
-                raise ProblemError(
-                    f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
-                )
-        return
-    given = np.asarray(problem.fibres, dtype=float)
-    if given.shape not in ((3,), (len(problem.mesh.cells), 3)):
-        raise ProblemError(
-            f"fibres have shape {given.shape}", remedy=f"give (3,), or ({len(problem.mesh.cells)}, 3)"
-        )
-    if not (np.isfinite(given).all() and (np.linalg.norm(np.atleast_2d(given), axis=1) > 0.0).all()):
-        raise ProblemError("a direction of the fibres is zero or not finite")
-
-
-def _check_bodies(problem: Problem) -> None:
-    width, bodies = problem.mesh.kind.faces.shape[1], problem.rigid_bodies
-    for i, body in enumerate(bodies):
-        faces, of = np.asarray(body.faces), f" of {body.name or f'body {i}'}" if len(bodies) > 1 else ""
-        if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
-            raise ProblemError(f"contact faces{of} have shape {faces.shape}, not (f, {width}) with f > 0")
-        _check_friction(body.friction, body.sticking)
-        if body.motion.grows and not body.shape.grows:
-            raise ProblemError(
-                f"the shape{of or ' of the body'} does not grow",
-                remedy="give a SmoothSurface with a clear shape, or a growth of 1",
-            )
-    for one in problem.pressures:
-        if np.asarray(one.faces).ndim != 2 or np.asarray(one.faces).shape[1] != width:
-            raise ProblemError(f"pressed faces have shape {np.asarray(one.faces).shape}, not (f, {width})")
-    end = problem.history.times[-1]
-    for i, body in enumerate(problem.bodies):
-        if np.isnan(body.motion.values[0]).any():
-            raise ProblemError(
-                f"the motion of {body.name or f'body {i}'} leaves open with which force it begins",
-                remedy="state it; only a coordinate that was held before may take over its force",
-            )
-        if body.motion.times[-1] < end * (1.0 - 1e-9):
-            raise ProblemError(
-                f"the motion of {body.name or f'body {i}'} ends at {body.motion.times[-1]:g} s, before the "
-                f"history does, at {end:g} s",
-                remedy="state it to the end",
-            )
-    moved = problem.indenter is None or any(support.factor for support in problem.supports)
-    if problem.history.forced and moved:
-        raise ProblemError("a history of force drives an indenter, not supports")

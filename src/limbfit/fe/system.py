@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bodies import Bodies, Contacts, extra_rows
+from .checking import check
 from .contact.contact import ContactSurface, Touch
 from .contact.grip import Grip
 from .contact.indenter import Indenter
@@ -25,7 +26,8 @@ from .kernel.laws import Laws
 from .motion import Drives
 from .pattern import Pattern, bordered, node_graph, positions, upper_pattern
 from .pressure import Pressures
-from .problem import Problem, ProblemError, check
+from .prestretch import prestretched
+from .problem import Problem, ProblemError
 from .threads import thread_pool
 
 Array = NDArray[np.float64]
@@ -112,6 +114,10 @@ class System:
             given = np.broadcast_to(np.asarray(problem.fibres, dtype=float), (len(self.cells), 3))
             self.fibres = np.ascontiguousarray(given / np.linalg.norm(given, axis=1, keepdims=True))
         self.gradients, self.weights = reference_gradients(self.element, self.points, mesh.cells)
+        self.prestretch = np.zeros((0, 3, 3))
+        if problem.prestretch is not None:
+            found = prestretched(problem.prestretch, self.gradients, self.weights)
+            self.prestretch, self.gradients, self.weights = found
         self._number_unknowns(problem)
         self._build_pattern(problem)
         self.bodies: Bodies | None = None
@@ -171,6 +177,7 @@ class System:
             and mine.bodies is problem.bodies
             and mine.pressures is problem.pressures
             and mine.fibres is problem.fibres
+            and mine.prestretch is problem.prestretch
             and mine.history.forced == problem.history.forced
             and mine.supports == problem.supports
             and (mine.element, mine.start, mine.contact_rule)
@@ -185,7 +192,7 @@ class System:
     def elements(self, cells: slice) -> Elements:
         """Some of the elements, as the kernels take them."""
         own = self.gradients[cells], self.weights[cells], self.regions[cells]
-        return self.cells[cells], *own, self.fibres[cells]
+        return self.cells[cells], *own, self.fibres[cells], self.prestretch[cells]
 
     def over_cells(self, work: Callable[[slice], T]) -> list[T]:
         """``work`` done on as many parts of the cells as there are threads, side by side."""

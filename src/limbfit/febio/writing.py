@@ -135,7 +135,10 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
 
 
 def check_element(problem: Problem, program: str) -> None:
-    """Raise `ProblemError` where another program has no such element."""
+    """Raise `ProblemError` where another program has no such element, or no such beginning."""
+    if problem.prestretch is not None or problem.touch_down_s:
+        what = f"a limb that clamps, contraction or pre-stretch move first is not written for {program}"
+        raise ProblemError(what, remedy="leave them out of the study")
     name = problem.formulation.name
     if name not in _QUADRATURE:
         known = ", ".join(_QUADRATURE)

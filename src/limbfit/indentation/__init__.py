@@ -1,6 +1,7 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
 from ..laws import Parameters, flat_names, to_parameters, to_vector
+from .clamps import clamped, clamping_pins
 from .fibres import Direction, fibre_field
 from .layers import compressions, layers_under
 from .neighbourhood import Extension, neighbourhood
@@ -23,6 +24,8 @@ __all__ = [
     "SimulationJob",
     "SiteModel",
     "build_problem",
+    "clamped",
+    "clamping_pins",
     "compressions",
     "fibre_field",
     "first_steps",

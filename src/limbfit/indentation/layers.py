@@ -44,7 +44,7 @@ def layers_under(model: SiteModel) -> tuple[str, ...]:
 
 
 def compressions(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:
-    """What each of the model's layers has lost of its thickness at times (n,), mm: (t, n).
+    """What each of the model's layers has lost of its thickness since touch-down at times (n,), mm: (t, n).
 
     And its derivatives (t, n, p) with respect to the solver's parameters, where the states have some. The
     result must hold all of its states (``store="all"``). Tissue that the indenter has left comes back by and
@@ -53,14 +53,15 @@ def compressions(result: Result, model: SiteModel, times_s: Array) -> tuple[Arra
     axis, states = np.array(model.axis), result.states
     gauges = layer_gauges(model, result.problem.mesh)
     steps = slice(len(states) + 1)
-    at = np.clip(times_s, result.times[0], result.times[-1])
+    at = np.clip(np.append(model.waits_s, times_s), result.times[0], result.times[-1])
 
     def between(values: list[Array]) -> Array:
-        """Values (t, ...) of the states at the wanted times, (t, n, ...); at rest all are zero."""
+        """Values (t, ...) of the states at the wanted times less those at touch-down, (t, n, ...)."""
         column = np.array([np.zeros_like(values[0]), *values])
         kinks = result.problem.history.kinks
         everywhere = np.ones(len(column))
-        return np.moveaxis(interpolate(result.times[steps], everywhere, kinks, column, at), 0, 1)
+        found = np.moveaxis(interpolate(result.times[steps], everywhere, kinks, column, at), 0, 1)
+        return found[:, 1:] - found[:, :1]
 
     def read(field: Array) -> Array:
         """What all gauges say of a nodal field (nodes, 3, ...)."""

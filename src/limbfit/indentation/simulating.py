@@ -138,8 +138,8 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
             within = _REFERENCE_MM + model.indenter.width_mm / 2.0
             if model.within_mm is not None:
                 within = min(within, model.within_mm)
-            # Under a stated force too it is driven by its displacement.
-            near = replace(model, knots_N=(), within_mm=within)
+            # Under a stated force too it is driven by its displacement; nothing else moves the limb.
+            near = replace(model.bare, knots_N=(), within_mm=within)
             allowed = _MARGIN * control.penetration
             penalty = max(_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
@@ -250,7 +250,7 @@ def simulate(job: SimulationJob) -> Simulation:
     that a job starts from is done again where this process has not kept it.
     """
     model, result = job.model, _result(job)
-    times = np.array(job.times_s)
+    times = np.array(job.times_s) + model.waits_s
     thinner, slopes = compressions(result, model, times) if model.layers else (np.zeros((0, 0)), None)
     return Simulation(
         site=model.name,

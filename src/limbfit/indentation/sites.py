@@ -17,15 +17,29 @@ from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from ..errors import ProblemError, SurfaceError
 from ..extensions import load_extensions
-from ..fe import Fibred, History, Indenter, Material, OgdenQLV, Problem, RigidSurface, StepControl
+from ..fe import (
+    Activation,
+    Contractile,
+    Fibred,
+    History,
+    Indenter,
+    Material,
+    OgdenQLV,
+    Problem,
+    RigidSurface,
+    StepControl,
+)
 from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
-from ..study import IndenterTable, SolverTable, Vector
+from ..study import ClampsTable, IndenterTable, SolverTable, Vector
+from .clamps import clamped
 from .fibres import Direction, fibre_field
 from .neighbourhood import held_cut, neighbourhood
+from .prestretch import prestretch_field
 
 Array = NDArray[np.float64]
+RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
 ROUGHLY = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
 
 
@@ -61,6 +75,10 @@ class SiteModel:
     site: str = ""
     knots_N: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
+    clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
+    along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally
+    course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
+    prestretch: tuple[tuple[str, float], ...] = ()  # of tissues at rest
 
     @property
     def forced(self) -> bool:
@@ -68,8 +86,41 @@ class SiteModel:
         return bool(self.knots_N)
 
     @property
+    def waits_s(self) -> float:
+        """How long the limb is held before the indenter touches it, s: a result's times are later by that."""
+        return self._rise_s + self._rest_s
+
+    @property
+    def _rise_s(self) -> float:
+        """How long what holds and tenses the limb takes to rise, s."""
+        if self.clamps is not None:
+            return self.clamps.clamping_s
+        return RISE_S if self.course else 0.0
+
+    @property
+    def _rest_s(self) -> float:
+        """How long it then acts before the indenter touches, s."""
+        if self.clamps is not None:
+            return self.clamps.settling_s
+        return REST_S if self.course else 0.0
+
+    @property
+    def activation(self) -> Activation | None:
+        """The share of the active stress: what it is at touch-down rises first, and rests."""
+        if not self.course:
+            return None
+        times, shares = zip(*self.course, strict=True)
+        late = [self.waits_s + t for t in times]
+        return Activation([0.0, self._rise_s, *late], [0.0, shares[0], *shares])
+
+    @property
+    def bare(self) -> SiteModel:
+        """The site where nothing moves the limb but the indenter."""
+        return replace(self, clamps=None, course=(), prestretch=())
+
+    @property
     def history(self) -> History:
-        """The advance of the indenter, or the force that presses it."""
+        """The advance of the indenter from touch-down, or the force that presses it."""
         if self.forced:
             return History(np.array(self.knots_s), force=np.array(self.knots_N))
         return History(np.array(self.knots_s), np.array(self.knots_mm))
@@ -91,9 +142,13 @@ def materials(
             found[tissue] = stated.material(**own, kappa_ratio=kappa_ratio)
             continue
         fibre = {name: own.pop(name) for name in ("k1", "k2") if name in own}
+        active = own.pop("active", None)
         c, m, *relaxation = own.values()
         ground = OgdenQLV(c, m, relaxation[::2], relaxation[1::2], kappa_ratio)
-        found[tissue] = Fibred(ground, **fibre) if fibre and tissue in fibred else ground
+        found[tissue] = ground
+        if fibre and tissue in fibred:
+            passive = Fibred(ground, **fibre)
+            found[tissue] = passive if active is None else Contractile(passive, active)
     return found
 
 
@@ -107,32 +162,39 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     """The site's boundary-value problem: node sets ``fixed_*`` held, skin in contact with the indenter.
 
     Only skin near the indenter enters the contact: what it cannot reach costs time for nothing. Where the
-    model goes no farther than ``within_mm``, so is the cut below the indenter.
+    model goes no farther than ``within_mm``, so is the cut below the indenter. What holds the limb before
+    comes first, for `SiteModel.waits_s`.
     """
     load_extensions(model.extensions)
     cut, fibres = np.empty(0, dtype=np.int64), fibre_field(model.fibres, mesh)
+    strained = prestretch_field(model.prestretch, mesh, fibres, dict(model.fibres))
     if model.within_mm is not None:
         centre, axis = np.array(model.position), np.array(model.axis)
         part = neighbourhood(mesh, centre, model.within_mm)
         mesh, cut = part.mesh, held_cut(part, centre, axis)
         fibres = None if fibres is None else fibres[part.cells]
+        strained = None if strained is None else strained[part.cells]
         if not len(cut) and not len(mesh.held):  # nothing else carries it
             cut = part.cut
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     faces = mesh.face_sets["skin"]
     reach = indenter.width * 0.71 + max(model.knots_mm) + 8.0
     near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
-    return Problem(
+    problem = Problem(
         mesh=mesh,
         materials=materials_of(model, parameters),
         fixed=np.union1d(mesh.held, cut),
         contact_faces=faces[near],
         indenter=indenter,
-        history=model.history,
+        history=model.history.later(model.waits_s),
         friction=model.indenter.friction,
         element=model.element,
         fibres=fibres,
+        activation=model.activation,
+        prestretch=strained,
+        touch_down_s=model.waits_s,
     )
+    return problem if model.clamps is None else clamped(problem, np.array(model.along), model.clamps)
 
 
 def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:

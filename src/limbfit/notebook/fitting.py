@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ProblemError
 from ..fe import Problem, StepControl, System
 from ..fe import solve as simulate
-from ..fe.problem import check
+from ..fe.checking import check
 from ..identify import (
     CalibrationSettings,
     Measured,

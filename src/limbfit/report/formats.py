@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..laws import split_key
+from ..laws import ACTIVE, split_key
 from .page import Cell
 
 NOTHING = "–"
@@ -71,6 +71,22 @@ def vector(values: Any) -> str:
 def friction(value: Any) -> str:
     """How contact is, by the study's key: a word, or a coefficient."""
     return value if isinstance(value, str) else f"with friction of coefficient {number(value)}"
+
+
+def held(clamps: dict[str, Any] | None, material: dict[str, Any]) -> str:
+    """What moved the limb before the indenter touched, by the study's tables; nothing where nothing did."""
+    parts = []
+    if clamps:
+        waited = clamps["clamping_s"] + clamps["settling_s"]
+        parts.append(
+            f"pins of {clamps['width_mm']} mm clamped it with {clamps['force_N']} N each for {waited} s"
+        )
+    if material.get("law") == ACTIVE:
+        parts.append("muscle contracted")
+    taut = ", ".join(f"{tissue} by {stretch}" for tissue, stretch in material.get("prestretch", {}).items())
+    if taut:
+        parts.append(f"tissue was pre-stretched ({taut})")
+    return f"Before the indenter touched the limb, {' and '.join(parts)}." if parts else ""
 
 
 def numeric(text: str, share: float | None = None) -> Cell:

@@ -5,6 +5,7 @@ Relative paths are relative to the study file and must stay inside its folder's 
 """
 
 from .acquisition import AcquireTable
+from .clamps import ClampsTable
 from .loading import load_study
 from .material import MaterialTable
 from .records import Indentation, Record, Site
@@ -13,6 +14,7 @@ from .whole import Study
 
 __all__ = [
     "AcquireTable",
+    "ClampsTable",
     "Indentation",
     "IndenterTable",
     "MaterialTable",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from ..errors import InputError
-from ..laws import LAWS, OGDEN
+from ..laws import ACTIVE, LAWS, OGDEN
 from .tables import Positive, TomlTable, Vector
 
 KAPPA_RATIO = (10.0, 1e4)
@@ -23,11 +24,29 @@ class TissueRange(TomlTable):
     upper: dict[str, Positive] = Field(default={})
 
 
+class ActivationTable(TomlTable):
+    """The share of the active stress that acts from touch-down on, piecewise linear; the last holds on."""
+
+    time_s: tuple[float, ...]
+    share: tuple[Annotated[float, Field(ge=0)], ...]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> ActivationTable:
+        times = self.time_s
+        if len(times) < 2 or len(times) != len(self.share):
+            raise ValueError("give two or more times in time_s, and as many shares")
+        if times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+            raise ValueError("time_s does not grow from 0, which is touch-down")
+        return self
+
+
 class MaterialTable(TomlTable):
     """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
 
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).  ``fibres``: their direction in the tissues
     that have some: a vector, that of the limb's axis, or a flow from the proximal cut to the bone's end.
+    ``activation``: how much of their active stress acts, all of it where it is not stated.
+    ``prestretch``: how far tissues are stretched at rest, along fibres or in the plane of a layer.
     """
 
     law: str = OGDEN
@@ -37,6 +56,16 @@ class MaterialTable(TomlTable):
     upper: dict[str, Positive] = Field(default={})
     tissues: dict[str, TissueRange] = Field(default={})
     fibres: dict[str, Literal["axis", "flow"] | Vector] = Field(default={})
+    activation: ActivationTable | None = None
+    prestretch: dict[str, Annotated[float, Field(ge=0.7, le=1.5)]] = Field(default={})
+
+    @property
+    def course(self) -> tuple[tuple[float, float], ...]:
+        """Times from touch-down, s, and shares of the active stress; none where tissues do not contract."""
+        if self.law != ACTIVE:
+            return ()
+        stated = self.activation
+        return ((0.0, 1.0),) if stated is None else tuple(zip(stated.time_s, stated.share, strict=True))
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -104,3 +133,31 @@ class MaterialTable(TomlTable):
                 if not lower[name] < upper[name]:
                     raise ValueError(f"{place}lower.{name} is not below upper.{name}")
         return self
+
+    def check_tissues(self, tissues: tuple[str, ...], stretched: tuple[str, ...]) -> None:
+        """Raise `ValueError` where a tissue is named that the model has not, or that cannot
+        be ``stretched`` at rest, or where bounds do not meet."""
+        unknown = [tissue for tissue in self.tissues if tissue not in tissues]
+        if unknown:
+            known = ", ".join(tissues)
+            raise ValueError(
+                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
+            )
+        for tissue in self.fibres:
+            if tissue not in tissues:
+                known = ", ".join(tissues)
+                raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
+        for tissue in self.prestretch:
+            if tissue not in stretched:
+                raise ValueError(
+                    f"material.prestretch.{tissue}: no layer, and no tissue with fibres; those are "
+                    f"{', '.join(stretched)}"
+                )
+        for name in self.keys:
+            lower = max(self.of(tissue, "lower")[name] for tissue in tissues)
+            upper = min(self.of(tissue, "upper")[name] for tissue in tissues)
+            if not lower < upper:
+                raise ValueError(
+                    f"material: the tissues' bounds of {name} have no range in common, "
+                    "and the stage of one material needs one; widen them"
+                )

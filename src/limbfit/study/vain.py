@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StudyError
-from ..laws import FIBRED
+from ..laws import ACTIVE, FIBRED, has_fibres
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
 from .records import Site
@@ -144,10 +144,15 @@ VAIN: tuple[Vain, ...] = (
         "give calibration.starts, or leave it out",
     ),
     Vain(
+        ("calibration.search_radius_mm",),
+        lambda s: s.clamps is not None or bool(s.material.prestretch),
+        "the whole limb is clamped or pre-stretched, so parameters are searched on whole meshes",
+    ),
+    Vain(
         ("calibration.corrections", "calibration.correction_tolerance_percent"),
         lambda s: not s.is_searched_apart,
         "parameters are searched on the meshes themselves, so nothing is corrected",
-        "give calibration.search_radius_mm, or leave it out",
+        "give calibration.search_radius_mm or [mesh.coarse], or leave it out",
     ),
     Vain(
         tuple(f"uncertainty.{key}" for key in _SOURCES),
@@ -161,9 +166,15 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("material.fibres",),
-        lambda s: s.material.law != FIBRED,
+        lambda s: not has_fibres(s.material.law),
         "the tissues' law has no fibres",
         f'give material.law = "{FIBRED}", or leave it out',
+    ),
+    Vain(
+        ("material.activation",),
+        lambda s: s.material.law != ACTIVE,
+        "the tissues' law has no active stress",
+        f'give material.law = "{ACTIVE}", or leave it out',
     ),
     Vain(
         tuple(f"socket.{key}" for key in _SHAPE),

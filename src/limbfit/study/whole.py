@@ -13,18 +13,19 @@ from pydantic import Field, field_validator, model_validator
 from ..errors import InputError, StudyError
 from ..laws import (
     FIBRE_KEYS,
-    FIBRED,
     LAWS,
     OGDEN,
     Parameters,
     TissueLaw,
     flat_names,
+    has_fibres,
     is_ogden,
     to_parameters,
     to_vector,
 )
 from ..priors import of_tissues
 from .acquisition import AcquireTable
+from .clamps import ClampsTable
 from .material import MaterialTable
 from .meshing import MeshTable
 from .records import Indentation, Record, RecordTable, Site, records_of
@@ -60,6 +61,7 @@ class Study(TomlTable):
     mesh: MeshTable = MeshTable()
     indenter: IndenterTable = IndenterTable()
     indenters: dict[str, IndenterTable] = Field(default={})
+    clamps: ClampsTable | None = None
     traces: TracesTable = TracesTable()
     markups: MarkupsTable | None = None
     sites: tuple[Site, ...]
@@ -118,17 +120,17 @@ class Study(TomlTable):
     @property
     def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:
         """Direction of the fibres in the tissues that have some: the limb's axis in the core by default."""
-        if self.material.law != FIBRED:
+        if not has_fibres(self.material.law):
             return {}
         return self.material.fibres or {self.geometry.core: "axis"}
 
     @property
     def fixed(self) -> tuple[str, ...]:
         """The parameters that stay at their start: those stated, and of fibres that a tissue has not."""
-        if self.material.law != FIBRED:
+        if not has_fibres(self.material.law):
             return self.calibration.fixed
         bare = [tissue for tissue in self.tissues if tissue not in self.fibres]
-        without = (f"{tissue}.{key}" for tissue in bare for key in FIBRE_KEYS)
+        without = (f"{tissue}.{key}" for tissue in bare for key in FIBRE_KEYS if key in self.law.keys)
         return tuple(dict.fromkeys((*self.calibration.fixed, *without)))
 
     @property
@@ -190,7 +192,8 @@ class Study(TomlTable):
     @property
     def within_mm(self) -> float | None:
         """How far from a site its mesh counts where parameters are searched; None: as far as it goes."""
-        return self.calibration.search_radius_mm or None
+        whole = self.clamps is not None or self.material.prestretch  # of which parts do not keep what it is
+        return None if whole else self.calibration.search_radius_mm or None
 
     @property
     def is_searched_apart(self) -> bool:
@@ -306,6 +309,25 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
+    def _held_under_displacement(self) -> Study:
+        forced = [record.name for record in self.recorded if record.forced]
+        material = self.material
+        states = {"clamps": self.clamps, "contraction": material.course, "pre-stretch": material.prestretch}
+        why = [name for name, stated in states.items() if stated]
+        if why and forced:
+            raise ValueError(f'{forced[0]} has control = "force", which goes without {why[0]}; leave one out')
+        return self
+
+    @model_validator(mode="after")
+    def _stretched_unseen(self) -> Study:
+        seen = [record.name for record in self.recorded if record.ultrasound is not None]
+        if self.material.prestretch and seen:
+            raise ValueError(
+                f"material.prestretch: {seen[0]} has ultrasound, which sees no pre-stretch; leave it out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _indenters_of_records(self) -> Study:
         named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
         named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]
@@ -317,25 +339,8 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _materials_of_tissues(self) -> Study:
-        material, tissues = self.material, self.tissues
-        unknown = [tissue for tissue in material.tissues if tissue not in tissues]
-        if unknown:
-            known = ", ".join(tissues)
-            raise ValueError(
-                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
-            )
-        for tissue in material.fibres:
-            if tissue not in tissues:
-                known = ", ".join(tissues)
-                raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
-        for name in material.keys:
-            lower = max(material.of(tissue, "lower")[name] for tissue in tissues)
-            upper = min(material.of(tissue, "upper")[name] for tissue in tissues)
-            if not lower < upper:
-                raise ValueError(
-                    f"material: the tissues' bounds of {name} have no range in common, "
-                    "and the stage of one material needs one; widen them"
-                )
+        layers = [layer.name for layer in self.geometry.model_layers]
+        self.material.check_tissues(self.tissues, tuple(dict.fromkeys((*layers, *self.fibres))))
         return self
 
     @model_validator(mode="after")

@@ -21,7 +21,7 @@ from .response import elastic_response, kirchhoff, pressures, weighted_moduli
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
-Elements = tuple[Indices, Array, Array, Indices, Array]
+Elements = tuple[Indices, Array, Array, Indices, Array, Array]
 
 
 def assemble(
@@ -41,7 +41,7 @@ def assemble(
     Parameters
     ----------
     elements : cells (m, k), gradients (m, q, 3, k) 1/mm, weights (m, q) mm^3, regions (m,), directions of
-        fibres (m, 3), or (0, 3) without.
+        fibres (m, 3), or (0, 3) without, and pre-stretches (m, 3, 3), or (0, 3, 3) without.
     mean : one volume ratio and pressure per element.
     tables : `Laws.tables`; scale (r,) : s.
     history (m, q, 6) : K, MPa.
@@ -50,7 +50,7 @@ def assemble(
 
     Returns infinity where an element is inverted; residual and data are then not to be used.
     """
-    cells, _, weights, _, _ = elements
+    cells, _, weights, *_ = elements
     nodes = cells.shape[1]
     *records, _ = workspace(nodes, weights.shape[1], tables[0].shape[1])
     places, past = (block_places(nodes), positions), (scale, history)
@@ -68,7 +68,7 @@ def _assemble(  # type: ignore[no-untyped-def]
     elements, mean, tables, past, u, tangent, places, residual, data, records
 ):
     """The kernel of `assemble`."""
-    cells, _, weights, regions, fibres = elements
+    cells, _, weights, regions, fibres, _ = elements
     entries, positions = places
     points, law, numbers, at_points, forces, element, blocks = records
     stiffness = blocks.view(np.float64)
@@ -116,7 +116,7 @@ def _assemble(  # type: ignore[no-untyped-def]
 @njit(**COMPILED)
 def _gather(elements, start, past, points, at_points):  # type: ignore[no-untyped-def]
     """Read weights, what is past and gradients of the elements from ``start`` on into lanes."""
-    cells, grads, weights, regions, _ = elements
+    cells, grads, weights, regions, _, _ = elements
     scale, history = past
     m, k = cells.shape
     for l in range(LANES):

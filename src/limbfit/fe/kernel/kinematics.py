@@ -36,6 +36,14 @@ def deform(p, l, nodes, grad, u):  # type: ignore[no-untyped-def]
     p.F[2, 0, l], p.F[2, 1, l], p.F[2, 2, l] = f20, f21, f22
 
 
+@njit(forceinline=True, **COMPILED)
+def strain(p, l, G):  # type: ignore[no-untyped-def]
+    """Put a pre-stretch ``G (3, 3)`` in the place of the identity in the F of a lane of a POINT."""
+    for i in range(3):
+        for j in range(3):
+            p.F[i, j, l] += G[i, j] - (1.0 if i == j else 0.0)
+
+
 @njit(**COMPILED)
 def invert(p):  # type: ignore[no-untyped-def]
     """Determinant, inverse transpose and ``b = F F^T`` of the deformation gradients of a POINT."""

@@ -12,7 +12,7 @@ from ..lanes import COMPILED, LANES, call_with_three, call_with_two, logarithm
 from ..materials.elastic import mean_exponential
 from ..materials.volumetric import volumetric
 from .fibres import pull
-from .kinematics import deform, invert, principal_axes
+from .kinematics import deform, invert, principal_axes, strain
 
 
 @njit(**COMPILED)
@@ -20,10 +20,11 @@ def elastic_response(elements, start, tables, u, points, law, numbers):  # type:
     """F, principal axes and `respond` at the points of the elements from ``start`` on; the last one again
     where there are no more.
 
-    ``elements``: cells (m, k), gradients (m, q, 3, k), weights, regions (m,), fibres (m, 3) or none.
+    ``elements``: cells (m, k), gradients (m, q, 3, k), weights, regions (m,), fibres (m, 3) or none,
+    pre-stretches (m, 3, 3) or none.
     Returns whether none is inverted.
     """
-    cells, grads, _, regions, fibres = elements
+    cells, grads, _, regions, fibres, prestretch = elements
     stated, addresses, fibre = tables[0], tables[3], tables[4]
     m = len(cells)
     for l in range(LANES):
@@ -38,6 +39,8 @@ def elastic_response(elements, start, tables, u, points, law, numbers):  # type:
                 law.fibre[i, l] = fibre[region, i]
         for q in range(points.shape[0]):
             deform(points[q], l, cells[el], grads[el, q], u)
+            if len(prestretch):
+                strain(points[q], l, prestretch[el])
     for q in range(points.shape[0]):
         p = points[q]
         invert(p)

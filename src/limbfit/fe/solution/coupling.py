@@ -52,6 +52,11 @@ class Coupling:
     def __bool__(self) -> bool:
         return self._rims is not None or self._blocks is not None
 
+    @property
+    def blocks(self) -> Array | float:
+        """(c, 3, 3) of the contact points, N/mm; 0 where nothing holds them."""
+        return 0.0 if self._blocks is None else self._blocks
+
     def __call__(self, x: Array) -> Array:
         """``C x (n, p)``."""
         out = np.zeros_like(x) if self._rims is None else self._rims @ x

@@ -197,7 +197,7 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
     earlier, ``d_past`` its derivative.  The elastic law is asked for `LANES` elements at once.  Rows of the
     work arrays hold three components of all parameters and are padded to whole vectors.
     """
-    cells, grads, weights, regions, fibres = elements
+    cells, grads, weights, regions, fibres, _ = elements
     points, law, numbers, element, rates = records
     d_numbers, bends, d_kappa, index, d_fibre = d_tables
     on_prony, on_elastic, on_before, d_on_prony, d_scale, d_back = coefficients

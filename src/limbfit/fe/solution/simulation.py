@@ -10,9 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact.friction import LAWS_OF_STICKING
 from ..contact.grip import Grip
-from ..contact.sticky import Anchors
 from ..history import Memory, elastic_stresses
 from ..kernel.laws import Laws
 from ..motion import Drives
@@ -20,6 +18,7 @@ from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
 from ..threads import single_threaded_numpy
+from .beginning import begun, elastic_residual, grips_of, system_of, travel
 from .control import StepControl, schedule
 from .coupling import Coupling, couple, renewed, solve_coupled
 from .direction import renew
@@ -31,6 +30,7 @@ from .pace import Pace
 from .schedule import foresee
 from .sensitivity import Explicit, MemoryDerivative
 from .springs import touched
+from .touchdown import TouchDown
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,8 @@ MOST_DEEPER = 3.0
 # Contact pressure over the mean shear modulus from which a rounded edge is flat in the tangents far from
 # equilibrium: over the radius it is a negative stiffness, there beside that of the tissue.
 STEEP_PRESSURE = 3.0
+# How long ago tissue was strained before a simulation begins, s: by now it has relaxed.
+LONG_SINCE = 1e9
 
 
 class Simulation:
@@ -65,7 +67,7 @@ class Simulation:
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
-        self.system = _system(problem, warm_start, system, control.threads)
+        self.system = system_of(problem, warm_start, system, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, touched(self.system, problem)
@@ -74,27 +76,26 @@ class Simulation:
         apart = sensitivities and not self.factor.lasting and not factors_are_dear()
         self.slopes = self.factor
         if apart:
-            self.slopes = Factor(
-                self.system, self.laws.moduli, threads=control.threads, lasting=True, last=last
-            )
+            self.slopes = Factor(self.system, moduli, threads=threads, lasting=True, last=last)
         self.counts: Counter[str] = Counter()
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
         self.damping = 0.0  # to begin a step with, after one that needed it
-        self.grips = _grips(self.system, self.laws.count if sensitivities else 0)
+        self.grips = grips_of(self.system, self.laws.count if sensitivities else 0)
         self.warm = Warm.of(problem, warm_start)
         widths = [body.shape.width for body in problem.rigid_bodies]
         width = min(widths, default=1.0)
         self.floor, self.pushing = NOTHING * self.laws.modulus * width**2, False
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
-        self.deepest = control.penetration * _travel(self.system, self.laws.modulus)
-        rest, drives = np.zeros((self.system.rows, 3)), problem.drives(0.0)
+        self.deepest = control.penetration * travel(self.system, self.laws.modulus)
+        self.touch = TouchDown.of(problem)
+        rest, drives = np.zeros((self.system.rows, 3)), self.touch.drives(problem.drives(0.0))
         if self.system.bodies is not None:
             rest = self.system.bodies.impose(rest, drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
         self.rest = self._coordinates(rest, drives)
         start = problem.history.displacement_at(0.0)
-        self.grips = _begun(self.system, self.grips, rest, drives)
+        self.grips = begun(self.system, self.grips, rest, drives)
         self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
         self.reason = ""
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
@@ -106,6 +107,8 @@ class Simulation:
         planned = schedule(self.problem.history, self.control, self.problem.turns)
         targets = list(planned)
         pace, why = Pace(self.control.max_iterations), ""
+        if len(self.system.prestretch) and not self._rested():
+            return
         times, forces = [0.0], [0.0]
         while targets:
             now, spent = self.states[-1].time, self._spent()
@@ -135,14 +138,26 @@ class Simulation:
                     targets = foresee(self.problem.history, planned, targets, times, forces)
             yield found
 
-    def _attempt(self, t: float, patience: int) -> Step | str:
+    def _rested(self) -> bool:
+        """Whether pre-strained tissue is brought to the equilibrium that it has had long since."""
+        strained = elastic_residual(self.system, self.laws, self.states[0])
+        self.floor = max(self.floor, 1e-2 * strained)  # it may be left without any stress
+        with single_threaded_numpy():
+            found = self._attempt(0.0, self.control.max_iterations, LONG_SINCE)
+        if isinstance(found, str):
+            self.reason = f"the pre-strained tissue found no equilibrium: {found}"
+        self.states = self.states[-1:]
+        return not self.reason
+
+    def _attempt(self, t: float, patience: int, takes: float | None = None) -> Step | str:
         """The step to time ``t``, or why there is none; nothing is changed unless it is accepted.
 
-        ``patience``: iterations that are allowed for one equilibrium.
+        ``patience``: iterations that are allowed for one equilibrium; ``takes``: another duration than the
+        time since the last state, s.
         """
-        before = self.states[-1]
-        history, dt = self.problem.history, t - before.time
-        displacement, drives = history.displacement_at(t), self.problem.drives(t)
+        history = self.problem.history
+        dt = t - self.states[-1].time if takes is None else takes
+        displacement, drives = history.displacement_at(t), self.touch.drives(self.problem.drives(t))
         stiffness, u = self.stiffness, self._predict(t)
         pressures = tuple(pressure.at(t) for pressure in self.problem.pressures)
         for raises in range(MOST_RAISES, -1, -1):
@@ -265,7 +280,8 @@ class Simulation:
         if self._turns(increment.time, at.force):
             after, self.slope = after.turned(), None if self.slope is None else self.slope.turned()
         tools = self.system.tools(u, increment)
-        self.grips = tuple(g and g.after(tool, du) for g, tool in zip(increment.grips, tools))
+        apart = [self.touch.beside(self.system, du), *[du] * len(tools)]
+        self.grips = tuple(g and g.after(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
         self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
@@ -278,6 +294,8 @@ class Simulation:
             increment.time, displacement, u, stiffness, du, after.turned(), increment.drives, increment.grips
         )
         self.states = [*self.states[-2:], state]
+        if self.touch.waits and increment.time >= self.problem.touch_down_s * (1.0 - 1e-9):
+            self.touch = self.touch.after(self.system, u, self.problem.drives(increment.time), du)
         if found.residual > self.control.tolerance:
             self.unbalanced.append((displacement, found.residual))
         if found.unsettled > self.control.tolerance:
@@ -311,7 +329,8 @@ class Simulation:
         """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
         contact began or ended."""
         met, self.pushing = (force > 0.0) != self.pushing, force > 0.0
-        if self.control.stress == "linear" or (met and len(self.states) > 1):
+        touched = self.states[-1].time > self.problem.touch_down_s * (1.0 + 1e-9)
+        if self.control.stress == "linear" or (met and touched):
             return True
         kinks = np.concatenate([self.problem.history.kinks, self.problem.turns])
         return bool(np.isclose(t, kinks, rtol=1e-9, atol=0.0).any())
@@ -327,12 +346,16 @@ class Simulation:
         for i, (grip, tool) in enumerate(zip(increment.grips, system.tools(u, increment))):
             if grip is None:
                 continue
-            pushed = (increment.penalty * tool.surface.areas)[..., None, None] * grip.explicit(tool)
-            change += tool.distributed(pushed)
+            held = (increment.penalty * tool.surface.areas)[..., None, None] * grip.explicit(tool)
+            change += tool.distributed(held)
             if i == 0:
-                d_reaction -= pushed[:, :, 2].sum(axis=(0, 1))
+                d_reaction -= held[:, :, 2].sum(axis=(0, 1))
         coupling = Coupling(system, increment, u)
         b = -change.reshape(-1, laws.count)[system.free]
+        pushed = self.touch.pushed(system, at, coupling)
+        if pushed is not None and system.bodies is not None:
+            b -= system.bodies.at_springs(pushed)
+            d_reaction += system.bodies.along(pushed)
         weights = self._foreseen(increment.time)
         guess = sum(w * s.slopes for w, s in zip(weights, self.states))
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
@@ -342,54 +365,3 @@ class Simulation:
         if self.problem.history.forced:  # the force is what is stated
             return du, np.zeros(laws.count)
         return du, at.force * d_penalty + d_reaction + d_force
-
-
-def _travel(system: System, modulus: float) -> float:
-    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
-    or how deep the tissue at rest lies in what a body grows to.
-
-    Where only forces drive bodies it is that of a flat punch on a half-space of the tissue's shear
-    ``modulus``, ``F / (4 mu w)``, and no more than half a width.
-    """
-    bodies = system.problem.rigid_bodies
-    if system.bodies is None:
-        return float(np.abs(system.problem.history.driver).max())
-    grown = [-one.surface.gaps_at_rest(one.start.grown(1.0)).min() for one in system.bodies.all
-             if one.stated.motion.grows]  # fmt: skip
-    if max(grown, default=0.0) > 0.0:
-        return float(max(grown))
-    sizes = [np.abs(np.nan_to_num(body.motion.values[:, :3])) for body in bodies]
-    ways = [np.where(body.motion.free[:3], 0.0, size).max() for body, size in zip(bodies, sizes)]
-    if max(ways) > 0.0:
-        return float(max(ways))
-    widths = [body.shape.width for body in bodies]
-    pushed = [float(size.max()) / (4.0 * modulus * width) for size, width in zip(sizes, widths)]
-    return max(min(way, width / 2) for way, width in zip(pushed, widths)) or max(widths) / 2
-
-
-def _grips(system: System, parameters: int) -> tuple[Grip | None, ...]:
-    """What holds the points of each body at first; None where nothing ever does."""
-    found: list[Grip | None] = []
-    for body in [] if system.bodies is None else system.bodies.all:
-        friction = body.stated.friction
-        if friction in ("frictionless", 0.0):
-            found.append(None)
-        elif isinstance(friction, str):
-            found.append(Anchors.none(body.surface, parameters))
-        else:
-            law = LAWS_OF_STICKING[body.stated.sticking]
-            found.append(law.none(float(friction), body.surface, parameters, body.stated.holding))
-    return tuple(found)
-
-
-def _begun(system: System, grips: Sequence[Grip | None], u: Array, drives: Drives) -> tuple[Grip | None, ...]:
-    """The grips with which a run begins, its bodies at rest where they start."""
-    tools = [] if system.bodies is None else system.bodies.tools(u, drives)
-    return tuple(grip and grip.begun(tool) for grip, tool in zip(grips, tools, strict=True))
-
-
-def _system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
-    for known in (system, warm_start.system if warm_start is not None else None):
-        if known is not None and known.fits(problem):
-            return known
-    return System(problem, threads)

@@ -45,7 +45,7 @@ class Experiment(Stage):
 
 
 _SIMULATED = ("sites", "traces", "mesh", "calibrate")
-_INDENTERS, _RECORD = ("indenter", "indenters"), ("site", "name", "indenter")
+_INDENTERS, _RECORD = ("indenter", "indenters", "clamps"), ("site", "name", "indenter")
 
 
 def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) -> Experiment:

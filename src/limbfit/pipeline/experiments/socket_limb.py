@@ -17,10 +17,11 @@ from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...donning import SETTLING, Donned, Fit, Held, Load, Patch, Row, don, socket_problem
 from ...donning.model import OUTER
-from ...errors import RunError
+from ...errors import InputError, RunError
 from ...fe import Doubt
 from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
+from ...laws import FIBRED
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
@@ -65,6 +66,13 @@ class SocketLimb:
     def of(cls, context: Context, name: str) -> SocketLimb:
         """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
         study, surfaces = context.study, context.store["surfaces"]
+        for place, states, remedy in (
+            ("material.law", study.material.course, f'give a study of its own with the law "{FIBRED}"'),
+            ("material.prestretch", study.material.prestretch, "give a study of its own without it"),
+        ):
+            if states:
+                what = "the limb in a socket is at rest, without contraction and pre-stretch"
+                raise InputError(what, file=study.file, place=place, remedy=remedy)
         anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
         outer, depth = anatomy, stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:

@@ -38,7 +38,7 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
     result = solve(problem, steps=steps_of(model), store="peak")
     return Simulation(
         site=model.name,
-        force_N=result.force_at(np.array(job.times_s)),
+        force_N=result.force_at(np.array(job.times_s) + model.waits_s),
         jacobian=None,
         completed=result.completed,
         reason=result.reason,

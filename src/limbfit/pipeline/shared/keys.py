@@ -35,7 +35,7 @@ class Stage:
         """What it reads of the tables of a study, by their names."""
         found = {table: stated[table] for table in self.tables}
         for table, _, key in (name.partition(".") for name in self.apart):
-            found[table] = {name: value for name, value in found[table].items() if name != key}
+            found[table] = {name: value for name, value in (found[table] or {}).items() if name != key}
         return found
 
 

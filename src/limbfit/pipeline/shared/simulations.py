@@ -14,7 +14,7 @@ from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
 from ...indentation import Direction, Simulation, SimulationJob, SiteModel, simulate
-from ...study import Indentation, Record, Site, Study
+from ...study import Indentation, Record, Site, Study, Vector
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
@@ -129,7 +129,8 @@ def job_digest(job: SimulationJob) -> str:
     """What decides a simulation, code included, wherever its mesh file happens to lie."""
     model = {key: value for key, value in vars(job.model).items() if key not in ("mesh", "extensions")}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
-    model |= {"indenter": indenter, "steps": job.model.steps.model_dump()}
+    clamps = None if job.model.clamps is None else job.model.clamps.model_dump()
+    model |= {"indenter": indenter, "steps": job.model.steps.model_dump(), "clamps": clamps}
     return digest(
         code_digest(simulate),
         model,
@@ -149,10 +150,19 @@ def fibres_of(context: Context) -> tuple[tuple[str, Direction], ...]:
         if stated == "flow":
             found.append((tissue, "flow"))
             continue
-        along = context.stored("surfaces", "surfaces.json")["cut_normal"] if stated == "axis" else stated
-        x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
+        if stated == "axis":
+            found.append((tissue, limb_axis(context)))
+            continue
+        x, y, z = (float(value) for value in np.array(stated) / np.linalg.norm(stated))
         found.append((tissue, (x, y, z)))
     return tuple(found)
+
+
+def limb_axis(context: Context) -> Vector:
+    """The limb's axis, proximally: the unit normal of its proximal cut."""
+    along = np.array(context.stored("surfaces", "surfaces.json")["cut_normal"])
+    x, y, z = (float(value) for value in along / np.linalg.norm(along))
+    return x, y, z
 
 
 def site_model(
@@ -197,6 +207,10 @@ def site_model(
         extensions=study.extensions,
         extensions_digest=extensions_digest(study.extensions),
         layers=tuple(layers),
+        clamps=study.clamps,
+        along=limb_axis(context),
+        course=study.material.course,
+        prestretch=tuple(sorted(study.material.prestretch.items())),
     )
 
 

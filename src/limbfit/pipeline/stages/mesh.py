@@ -94,7 +94,7 @@ def mesh_settings(study: Study) -> MeshSettings:
     return MeshSettings(
         element=table.cell_type,
         edge_near_mm=table.edge_near_mm,
-        edge_far_mm=table.edge_far_mm,
+        edge_far_mm=_far_mm(study, table.edge_far_mm),
         near_radius_mm=table.near_radius_mm,
         growth=table.growth,
         flatness=table.flatness,
@@ -113,7 +113,15 @@ def mesh_settings(study: Study) -> MeshSettings:
 def coarse_settings(study: Study) -> MeshSettings | None:
     """How the second, coarse meshes are made; None where the study wants none."""
     table = study.mesh.coarse
-    return None if table is None else replace(mesh_settings(study), **table.model_dump())
+    if table is None:
+        return None
+    coarse = replace(mesh_settings(study), **table.model_dump())
+    return replace(coarse, edge_far_mm=_far_mm(study, table.edge_far_mm))
+
+
+def _far_mm(study: Study, stated: float) -> float:
+    """Edge length far from the site: no longer than pins that press there are wide."""
+    return stated if study.clamps is None else min(stated, study.clamps.width_mm)
 
 
 def run_mesh(context: Context, folder: Path) -> dict[str, Any]:

@@ -8,8 +8,9 @@ import numpy as np
 
 from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
-from ...indentation import read_indenter
-from ...study import Study
+from ...errors import ProblemError
+from ...indentation import clamping_pins, read_indenter
+from ...study import ClampsTable, Study
 from ..shared.context import Listener, Progress, quiet
 from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
 from ..shared.store import Store
@@ -71,6 +72,8 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         )
     if "socket" in study.model_fields_set:
         facts += _socket_facts(study, anatomy)
+    if study.clamps is not None:
+        facts.append(_clamps_fact(study, study.clamps, placed, anatomy))
     flags = record_flags(study, records, steps, placed, anatomy)
     listener(Progress("check", 2, 2))
     return {
@@ -104,6 +107,30 @@ def _image_facts(study: Study) -> list[str]:
         facts.append("corrected labels: " + ", ".join(labels.names.values()))
         facts += [f"label map: {note}" for note in notes]
     return facts
+
+
+def _clamps_fact(
+    study: Study, clamps: ClampsTable, placed: dict[str, dict[str, Any]], anatomy: Anatomy | None
+) -> str:
+    """What ``[clamps]`` says; where the limb is known, how many of the pins hold it at each site."""
+    said = (
+        f"clamps: {len(clamps.angles)} pins of {clamps.force_N:g} N, {clamps.begun_s:g} s before touch-down"
+    )
+    if anatomy is None or not placed:
+        return f"{said}; they are placed after limbfit run --until sites"
+    held = []
+    for site in study.sites:
+        place, table = placed[site.name], study.indenters_at(site)[0]
+        at, axis = tuple(place["position_mm"]), tuple(place["axis"])
+        here = table if table.file is None else table.model_copy(update={"file": study.path(table.file)})
+        skin, tool = anatomy.skin, read_indenter(here, at, axis, site.edge)
+        try:
+            pins = clamping_pins(skin.points, skin.faces, tool, np.asarray(anatomy.cut_normal), clamps)
+        except ProblemError as error:
+            what = f"site {site.name}: {error.what}"
+            raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
+        held.append(f"{len(pins)} at site {site.name}")
+    return f"{said}; {', '.join(held)} meet the skin"
 
 
 def _socket_facts(study: Study, anatomy: Anatomy | None) -> list[str]:

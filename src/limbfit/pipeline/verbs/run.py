@@ -41,17 +41,24 @@ _UNSEEN: dict[str, Any] = {
     "ultrasound_sd_mm": 0.1,
 }
 _NAMED = ("site", "name")
+# How pins press; the mesh depends on how wide they are alone.
+_PRESSING = tuple(
+    f"clamps.{key}" for key in ("force_N", "angles_degrees", "levels_mm", "clamping_s", "settling_s")
+)
+
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation")),
     Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces")),
     Stage("sites", run_sites, ("surfaces",), ("indenter", "indenters"), _PLACE, (*_NAMED, "indenter")),
     Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD), (*_NAMED, *_RECORD)),
-    Stage("mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh"), ("name",)),
+    Stage(
+        "mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh", "clamps"), ("name",), apart=_PRESSING
+    ),
     Stage(
         "calibrate",
         run_calibrate,
         ("sites", "traces", "mesh"),
-        ("material", "calibration", "solver", "indenter", "indenters"),
+        ("material", "calibration", "solver", "indenter", "indenters", "clamps"),
         ("name", "fitted", "weight", "edge", "indenter"),
         (*_NAMED, "indenter"),
     ),

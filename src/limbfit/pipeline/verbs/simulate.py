@@ -112,7 +112,7 @@ def simulate_site(
         curve,
         time_s=times,
         displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
-        force_N=result.force_at(times),
+        force_N=result.force_at(times + model.waits_s),
     )
     summary = _summary(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
     files = {

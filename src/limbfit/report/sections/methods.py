@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 from ...laws import OGDEN
 from ...shapes import SHAPES
-from ..formats import fixed, friction, number, symbol, unit_of
+from ..formats import fixed, friction, held, number, symbol, unit_of
 from ..page import Prose, Section
 from ..site_tables import mean_and_deviation
 from ..store import Json, Results
@@ -199,10 +199,9 @@ def _law(store: Results) -> str:
 
 
 def _contact(store: Results) -> str:
-    indenter, solver = _settings(store, "indenter"), _settings(store, "solver")
+    indenter, penalty = _settings(store, "indenter"), _settings(store, "solver").get("penalty_per_mm")
     if not indenter:
         return ""
-    penalty = solver.get("penalty_per_mm")
     stiff = (
         f"a stiffness of {penalty} per mm times the mean instantaneous shear modulus"
         if penalty
@@ -220,6 +219,7 @@ def _contact(store: Results) -> str:
             f"{SHAPES[indenter['shape']].said(indenter)} starts where it just touches the skin and follows "
             f"the recorded displacement along its axis; contact is {friction(indenter.get('friction'))}, by "
             f"a penalty at the skin's quadrature points with {stiff}.",
+            held(_settings(store, "clamps"), _settings(store, "material")),
             f"Some records are of other indenters: {others}." if others else "",
             f"The largest penetration was {fixed(max(deepest), 3)} mm." if deepest else "",
         )

@@ -1,0 +1,180 @@
+"""What a problem must be before anything is solved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import ProblemError
+from .contact.friction import LAWS_OF_STICKING
+from .kernel.elements import ELEMENTS, reference_gradients
+from .problem import Problem
+
+
+def check(problem: Problem) -> None:
+    """Raise `ProblemError` where the problem is impossible as stated."""
+    _check_choices(problem)
+    mesh, n = problem.mesh, len(problem.mesh.points)
+    if not np.isfinite(mesh.points).all():
+        raise ProblemError("the mesh has points that are not finite")
+    if not len(mesh.cells):
+        raise ProblemError("the mesh has no cells")
+    indices = [("cells", mesh.cells), ("fixed nodes", problem.fixed)]
+    indices += [("contact faces", np.asarray(body.faces)) for body in problem.rigid_bodies]
+    indices += [("pressed faces", np.asarray(one.faces)) for one in problem.pressures]
+    indices += [("support nodes", support.nodes) for support in problem.supports]
+    for name, value in indices:
+        value = np.asarray(value)
+        if value.dtype == bool:
+            raise ProblemError(f"the {name} are a mask", remedy="give node numbers: numpy.flatnonzero(mask)")
+        if value.size and (value.min() < 0 or value.max() >= n):
+            raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
+    _check_cells(problem)
+    _check_fibres(problem)
+    _check_prestretch(problem)
+    _check_bodies(problem)
+    _check_touch_down(problem)
+    if not len(problem.fixed) and not problem.supports:
+        raise ProblemError("nothing is held in place", remedy="fix the bone and proximal nodes")
+
+
+def _check_choices(problem: Problem) -> None:
+    mesh = problem.mesh
+    name = problem.element or mesh.cell_type
+    if name not in ELEMENTS or ELEMENTS[name].cell_type != mesh.cell_type:
+        fitting = ", ".join(e.name for e in ELEMENTS.values() if e.cell_type == mesh.cell_type)
+        raise ProblemError(f"no element {name!r} for {mesh.cell_type} cells", remedy=f"use one of {fitting}")
+    missing = [region for region in mesh.region_names if region not in problem.materials]
+    if missing:
+        given = ", ".join(problem.materials) or "none"
+        raise ProblemError(
+            f"region {missing[0]!r} has no material", remedy=f"name it in materials; there are: {given}"
+        )
+    if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
+        raise ProblemError("the mesh has region indices without a name")
+    if problem.contact_rule not in ELEMENTS[name].face_rules:
+        rules = ", ".join(ELEMENTS[name].face_rules)
+        raise ProblemError(f"unknown contact rule {problem.contact_rule!r}", remedy=f"use one of {rules}")
+    if problem.start not in ("touching", "as-given"):
+        raise ProblemError(f"unknown start {problem.start!r}", remedy="use 'touching' or 'as-given'")
+
+
+def _check_friction(friction: str | float, sticking: str) -> None:
+    if isinstance(friction, str):
+        known = friction in ("frictionless", "sticky")
+    else:
+        known = not isinstance(friction, bool) and 0.0 <= friction < np.inf
+    if not known:
+        raise ProblemError(
+            f"unknown friction {friction!r}", remedy="use 'frictionless', 'sticky' or a coefficient from 0 on"
+        )
+    if sticking not in LAWS_OF_STICKING:
+        raise ProblemError(
+            f"unknown law of sticking {sticking!r}", remedy=f"use {' or '.join(map(repr, LAWS_OF_STICKING))}"
+        )
+
+
+def _check_cells(problem: Problem) -> None:
+    mesh = problem.mesh
+    unique = np.unique(np.sort(mesh.cells, axis=1), axis=0)
+    if len(unique) != len(mesh.cells):
+        raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
+    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
+    upright = (weights > 0).all(axis=1)
+    # A quadratic map may be upright at its points and its corners not.
+    if mesh.kind.is_tetrahedron and len(mesh.kind.nodes) > mesh.kind.corners:
+        corners = mesh.points[mesh.corners]
+        upright &= np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
+    bad = np.flatnonzero(~upright)
+    if len(bad):
+        raise ProblemError(f"{len(bad)} cells are inverted or flat, the first is cell {bad[0]}")
+    used = np.zeros(len(mesh.points), dtype=bool)
+    used[mesh.cells] = True
+    if not used.all():
+        raise ProblemError(f"{(~used).sum()} nodes belong to no cell", remedy="drop them from the mesh")
+
+
+def _check_fibres(problem: Problem) -> None:
+    for region in problem.mesh.region_names:
+        if problem.activation is None and problem.materials[region].table().active > 0.0:
+            raise ProblemError(
+                f"the active stress of {region!r} acts at no stated time", remedy="state Problem.activation"
+            )
+    if problem.fibres is None:
+        for region in problem.mesh.region_names:
+            if problem.materials[region].table().has_fibres:
+                raise ProblemError(
+                    f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
+                )
+        return
+    given = np.asarray(problem.fibres, dtype=float)
+    if given.shape not in ((3,), (len(problem.mesh.cells), 3)):
+        raise ProblemError(
+            f"fibres have shape {given.shape}", remedy=f"give (3,), or ({len(problem.mesh.cells)}, 3)"
+        )
+    if not (np.isfinite(given).all() and (np.linalg.norm(np.atleast_2d(given), axis=1) > 0.0).all()):
+        raise ProblemError("a direction of the fibres is zero or not finite")
+
+
+def _check_prestretch(problem: Problem) -> None:
+    if problem.prestretch is None:
+        return
+    given, cells = np.asarray(problem.prestretch, dtype=float), len(problem.mesh.cells)
+    if given.shape not in ((3, 3), (cells, 3, 3)):
+        raise ProblemError(
+            f"a pre-stretch has shape {given.shape}", remedy=f"give (3, 3), or ({cells}, 3, 3)"
+        )
+    if not (np.isfinite(given).all() and (np.linalg.det(given) > 0.0).all()):
+        raise ProblemError("a pre-stretch is not finite, or its determinant is not positive")
+    if problem.indenter is not None and problem.start == "touching" and problem.history.forced:
+        raise ProblemError(
+            "an indenter that touches pre-strained tissue is driven by displacement",
+            remedy='state where it starts, start="as-given"',
+        )
+
+
+def _check_bodies(problem: Problem) -> None:
+    width, bodies = problem.mesh.kind.faces.shape[1], problem.rigid_bodies
+    for i, body in enumerate(bodies):
+        faces, of = np.asarray(body.faces), f" of {body.name or f'body {i}'}" if len(bodies) > 1 else ""
+        if faces.ndim != 2 or faces.shape[1] != width or not len(faces):
+            raise ProblemError(f"contact faces{of} have shape {faces.shape}, not (f, {width}) with f > 0")
+        _check_friction(body.friction, body.sticking)
+        if body.motion.grows and not body.shape.grows:
+            raise ProblemError(
+                f"the shape{of or ' of the body'} does not grow",
+                remedy="give a SmoothSurface with a clear shape, or a growth of 1",
+            )
+    for one in problem.pressures:
+        if np.asarray(one.faces).ndim != 2 or np.asarray(one.faces).shape[1] != width:
+            raise ProblemError(f"pressed faces have shape {np.asarray(one.faces).shape}, not (f, {width})")
+    end = problem.history.times[-1]
+    for i, body in enumerate(problem.bodies):
+        if np.isnan(body.motion.values[0]).any():
+            raise ProblemError(
+                f"the motion of {body.name or f'body {i}'} leaves open with which force it begins",
+                remedy="state it; only a coordinate that was held before may take over its force",
+            )
+        if body.motion.times[-1] < end * (1.0 - 1e-9):
+            raise ProblemError(
+                f"the motion of {body.name or f'body {i}'} ends at {body.motion.times[-1]:g} s, before the "
+                f"history does, at {end:g} s",
+                remedy="state it to the end",
+            )
+    moved = problem.indenter is None or any(support.factor for support in problem.supports)
+    if problem.history.forced and moved:
+        raise ProblemError("a history of force drives an indenter, not supports")
+
+
+def _check_touch_down(problem: Problem) -> None:
+    at, history = problem.touch_down_s, problem.history
+    if not at:
+        return
+    if not 0.0 < at < history.times[-1]:
+        raise ProblemError(f"a touch-down at {at:g} s is not within the history, to {history.times[-1]:g} s")
+    if problem.indenter is None or problem.start != "touching" or history.forced:
+        raise ProblemError(
+            "a later touch-down is that of an indenter driven by displacement that starts touching",
+            remedy="leave touch_down_s out",
+        )
+    if np.ptp(np.append(history.driver[history.times < at], history.at(at))) > 0.0:
+        raise ProblemError(f"the indenter advances before its touch-down at {at:g} s")

@@ -1,0 +1,101 @@
+"""An indenter that touches tissue which has moved before: where, what it feels, and its derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import punch
+from test_fe_fibres import ASKEW, GROUND, TISSUE
+
+from limbfit import History, Indenter, Problem
+from limbfit.errors import ProblemError
+from limbfit.fe import Activation, Contractile, Motion, RigidBody, StepControl, solve
+
+HELD_S = 3.0
+COURSE = History(np.array([0.0, HELD_S, HELD_S + 5.0, HELD_S + 9.0]), np.array([0.0, 0.0, 5.0, 2.0]))
+CONTROL = StepControl(load_steps=4, unload_steps=4, tolerance=1e-11)
+
+
+def tensed(active: float = 0.006, **changes) -> Problem:
+    """A block whose muscle tenses before it is pressed."""
+    muscle = Contractile(TISSUE, active)
+    tense = Activation([0.0, 1.0], [0.0, 1.0])
+    changes = {"fibres": ASKEW, "activation": tense, "touch_down_s": HELD_S, "history": COURSE} | changes
+    return punch("tet10", 2, 1, materials={"skin": GROUND, "muscle": muscle}, **changes)
+
+
+def clamped(**changes) -> Problem:
+    """A block that a second punch presses beside the first one."""
+    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S, **changes)
+    end = float(COURSE.times[-1])
+    pin = Indenter("square", 16.0, 1.0, axis=(0, 0, -1), centre=(20.0, 18.0, 0.0))
+    motion = Motion.of([0.0, 1.0, end], force={"z": [0.0, 0.4, 0.4]})
+    return replace(problem, bodies=(RigidBody(pin, problem.contact_faces, motion, name="clamp"),))
+
+
+def slope_of(problem: Problem, tissue: str, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative of the force by a parameter: the simulation's, and that of central differences."""
+    centre = solve(problem, CONTROL, sensitivities=True, store="all")
+    assert centre.completed, centre.reason
+    material = problem.materials[tissue]
+    value, forces = dict(zip(material.parameter_names, material.parameters))[name], []
+    for sign in (1, -1):
+        changed = material.with_parameters({name: value * (1 + sign * 1e-4)})
+        moved = problem.with_materials({**problem.materials, tissue: changed})
+        forces.append(solve(moved, CONTROL, warm_start=centre).force)
+    column = list(centre.parameter_names).index((tissue, name))
+    assert centre.force_sensitivity is not None
+    return centre.force_sensitivity[:, column], (forces[0] - forces[1]) / (2e-4 * value)
+
+
+def test_it_touches_the_tissue_where_that_is_by_then():
+    problem = tensed()
+    result = solve(problem, CONTROL, store="all")
+    assert result.completed, result.reason
+    before = result.times <= HELD_S * (1 + 1e-9)
+    assert not result.force[before].any()
+    met = result.states[int(before.sum()) - 2]  # the first row is rest
+    skin = (problem.mesh.points + met.u)[np.unique(problem.contact_faces)]
+    own = skin[(np.abs(skin[:, :2]) < 9.0).all(axis=1), 2]
+    way = -result.coordinates[before.sum() :, 0, 2]  # height of the face
+    advance = result.displacement[before.sum() :]
+    np.testing.assert_allclose(np.diff(way), -np.diff(advance), atol=1e-9)
+    assert (way + advance)[0] == pytest.approx(own.max(), abs=0.15)  # touching points lie between nodes
+    assert abs(own.max()) > 0.3  # tensed tissue has moved
+    assert result.force[before.sum()] > 0.0
+
+
+def test_what_nothing_moves_is_touched_where_it_is():
+    """A block at rest that waits is indented as one that does not wait."""
+    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S)
+    later = solve(problem, CONTROL)
+    history = History(COURSE.times[1:] - HELD_S, np.asarray(COURSE.displacement)[1:])
+    at_once = solve(replace(problem, history=history, touch_down_s=0.0), CONTROL)
+    np.testing.assert_allclose(
+        later.force_at(HELD_S + at_once.times), at_once.force, atol=1e-4 * at_once.peak_force
+    )
+
+
+@pytest.mark.parametrize(("tissue", "name"), [("muscle", "active"), ("muscle", "c"), ("skin", "tau")])
+def test_derivatives_of_tensed_tissue(tissue, name):
+    slope, difference = slope_of(tensed(), tissue, name)
+    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("friction", ["frictionless", 0.3])
+def test_derivatives_beside_a_clamp(friction):
+    slope, difference = slope_of(clamped(friction=friction), "muscle", "c")
+    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+
+
+def test_what_cannot_be_is_refused():
+    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S)
+    for changes, match in (
+        ({"touch_down_s": 20.0}, "not within the history"),
+        ({"start": "as-given"}, "driven by displacement that starts touching"),
+        ({"touch_down_s": 4.0}, "advances before its touch-down"),
+    ):
+        with pytest.raises(ProblemError, match=match):
+            solve(replace(problem, **changes))

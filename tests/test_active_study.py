@@ -1,0 +1,140 @@
+"""Muscle that contracts in a study: its law, when it acts, what follows, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from layered import store_blocks
+from limbfit.errors import InputError, StudyError
+from limbfit.execution import SerialExecutor
+from limbfit.fe import Contractile, OgdenQLV
+from limbfit.indentation import SimulationJob, build_problem, materials, simulate
+from limbfit.mesh import read_vtu
+from limbfit.pipeline.experiments.socket_limb import SocketLimb
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import recorded_model
+from limbfit.pipeline.verbs.run import keys
+from limbfit.study import Study, load_study
+
+TEXT = """
+[study]
+name = "contraction"
+[surfaces]
+skin = "skin.stl"
+[mesh]
+element = "tet10"
+[material]
+law = "{law}"
+{stated}
+[solver]
+load_steps = 4
+unload_steps = 3
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+"""
+ALONG = "fibres = { muscle = [1.0, 0.0, 0.0] }\n"
+COURSE = "activation = { time_s = [0.0, 2.0], share = [0.5, 1.0] }\n"
+VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5, "k1_kPa": 3.0, "k2": 3.0, "active_kPa": 6.0}
+TRUTH = {"skin": VALUES | {"c_kPa": 9.0}, "muscle": VALUES}
+
+
+def study_of(folder: Path, stated: str = "", law: str = "ogden-active") -> Study:
+    for name in ("skin.stl", "a.csv"):
+        (folder / name).touch()
+    (folder / "study.toml").write_text(TEXT.format(stated=stated, law=law), encoding="utf-8")
+    return load_study(folder)
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory) -> Context:
+    study = study_of(tmp_path_factory.mktemp("active"), ALONG)
+    store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, TRUTH, 3)
+    return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+def test_the_core_contracts_and_no_other_tissue(tmp_path):
+    study = study_of(tmp_path)
+    assert study.fixed == ("skin.k1_kPa", "skin.k2", "skin.active_kPa")
+    made = materials(TRUTH, 100.0, study.law.name, study.fibres)
+    assert isinstance(made["skin"], OgdenQLV)
+    assert isinstance(made["muscle"], Contractile)
+    assert made["muscle"].active == pytest.approx(0.006)
+    assert study.material.course == ((0.0, 1.0),)
+    assert study_of(tmp_path, law="ogden-fibres").material.course == ()
+
+
+def test_its_course_decides_the_calibration(tmp_path):
+    before, after = keys(study_of(tmp_path)), keys(study_of(tmp_path, COURSE))
+    assert {stage for stage in before if before[stage] != after[stage]} == {"calibrate", "predict", "report"}
+
+
+def test_it_tenses_before_touch_down_and_as_stated_from_there(context):
+    model = replace(recorded_model(context, context.study.recorded[0]), course=((0.0, 0.5), (2.0, 1.0)))
+    problem = build_problem(model, read_vtu(model.mesh), TRUTH)
+    assert problem.touch_down_s == model.waits_s == 7.0
+    shares = [problem.activated(t) for t in (0.0, 1.0, 2.0, 7.0, 8.0, 9.0, 12.0)]
+    np.testing.assert_allclose(shares, [0.0, 0.25, 0.5, 0.5, 0.75, 1.0, 1.0])
+    assert problem.history.at(8.0) == pytest.approx(model.history.at(1.0))
+
+
+def test_force_follows_the_active_stress_by_its_derivative(context):
+    """And the tensed block is not as the passive one is."""
+    study, model = context.study, recorded_model(context, context.study.recorded[0])
+    flat, times = study.vector(TRUTH), (0.5 * model.knots_s[1], model.knots_s[1], 1.5 * model.knots_s[1])
+    names = [f"{tissue}.{key}" for tissue, key in study.parameters]
+
+    def job(values: np.ndarray, sensitivities: bool = False, of=model):
+        found = simulate(SimulationJob(of, study.tissues, tuple(values), times, sensitivities))
+        assert found.completed, found.reason
+        return found
+
+    found = job(flat, True)
+    assert found.jacobian is not None
+    passive = job(np.where([name.endswith("active_kPa") for name in names], 1e-9, flat))
+    assert np.abs(found.force_N - passive.force_N).max() > 0.02 * passive.force_N.max()
+    for name in ("muscle.active_kPa", "muscle.c_kPa"):
+        own = np.array([name == other for other in names])
+        ahead, back = (job(np.where(own, flat * (1.0 + sign * 2e-3), flat)).force_N for sign in (1, -1))
+        difference = (ahead - back) / (4e-3 * flat[own])
+        slope = found.jacobian[:, own][:, 0]
+        np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+    assert not found.jacobian[:, names.index("skin.active_kPa")].any()
+
+
+def test_a_socket_takes_no_muscle_that_contracts(context):
+    with pytest.raises(InputError, match=r"study.toml: material.law: the limb in a socket is at rest"):
+        SocketLimb.of(context, "socket")
+
+
+@pytest.mark.parametrize(
+    ("stated", "law", "what"),
+    [
+        (COURSE, "ogden-fibres", "material.activation: without effect: the tissues' law has no active"),
+        ("activation = { time_s = [0.0], share = [1.0] }", "ogden-active", "give two or more times"),
+        ("activation = { time_s = [0, 1], share = [1] }", "ogden-active", "as many shares"),
+        ("activation = { time_s = [1, 2], share = [1, 1] }", "ogden-active", "does not grow from 0"),
+        ("activation = { time_s = [0, 1], share = [1, -1] }", "ogden-active", "material.activation.share.1"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(tmp_path, stated, law, what):
+    with pytest.raises(StudyError) as caught:
+        study_of(tmp_path, stated, law)
+    told = str(caught.value)
+    assert what in told
+    assert "study.toml: material.activation" in told
+    assert "\n" not in told
+
+
+def test_a_record_under_force_takes_none(tmp_path):
+    study_of(tmp_path)
+    text = TEXT.format(stated="", law="ogden-active") + "control = 'force'\n"
+    (tmp_path / "study.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(StudyError, match='a has control = "force", which goes without contraction'):
+        load_study(tmp_path)

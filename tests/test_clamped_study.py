@@ -1,0 +1,151 @@
+"""Clamping pins in a study: what they decide, hold and change, and what of them is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbfit.errors import ProblemError, StudyError
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import SimulationJob, build_problem, simulate
+from limbfit.mesh import read_vtu
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import job_digest, planned_model
+from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
+from limbfit.pipeline.verbs.check import check_study
+from limbfit.pipeline.verbs.run import keys, run_study
+from limbfit.study import Study, load_study
+from small_limb import small_limb
+
+COARSE = "\n[mesh]\nedge_near_mm = 6.0\nelement = 'tet10'\n[solver]\nload_steps = 3\nunload_steps = 3\n"
+GENTLE = COARSE + "[clamps]\nforce_N = 4.0\n"
+
+
+def study_of(folder: Path, text: str) -> Study:
+    return load_study(small_limb(folder, text))
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory) -> Context:
+    study = study_of(tmp_path_factory.mktemp("clamped"), GENTLE)
+    run_study(study, until="mesh")
+    return Context(study, Store(study.results), SerialExecutor(), lambda event: None)
+
+
+def test_the_table_alone_turns_them_on(tmp_path):
+    assert study_of(tmp_path, COARSE).clamps is None
+    clamps = study_of(tmp_path, COARSE + "[clamps]\n").clamps
+    assert clamps is not None
+    assert clamps.force_N == 15.0
+    np.testing.assert_allclose(clamps.angles, 360.0 / 14.0 * np.arange(2, 13))
+
+
+def test_their_force_decides_simulations_and_their_width_the_mesh_too(tmp_path):
+    def decided(text: str) -> dict[str, str]:
+        return keys(study_of(tmp_path, COARSE + text))
+
+    without, plain = decided(""), decided("[clamps]\n")
+    later = {"calibrate", "predict", "report"}
+    assert {name for name in plain if plain[name] != without[name]} == {"mesh", *later}
+    for text, changed in (("force_N = 9.0", later), ("width_mm = 12.0", {"mesh", *later})):
+        other = decided(f"[clamps]\n{text}\n")
+        assert {name for name in plain if plain[name] != other[name]} == changed
+
+
+def test_the_mesh_is_no_coarser_than_they_are_wide_and_searched_as_a_whole(tmp_path):
+    study = study_of(tmp_path, COARSE + "[mesh.coarse]\nedge_near_mm = 9.0\n[clamps]\nwidth_mm = 15.0\n")
+    coarse = coarse_settings(study)
+    assert coarse is not None
+    assert mesh_settings(study).edge_far_mm == coarse.edge_far_mm == 15.0
+    assert study.within_mm is None
+
+
+@pytest.mark.slow
+def test_a_clamped_site_is_indented_from_where_its_skin_is_then(context):
+    """Force and its derivatives, which follow the place where the indenter touches too."""
+    study = context.study
+    model = planned_model(context, study.sites[0])
+    start = np.array([study.material.of(tissue, "start")[key] for tissue, key in study.parameters])
+    times = (0.0, 0.5 * model.knots_s[1], model.knots_s[1])  # the way in
+
+    def force(values: np.ndarray, sensitivities: bool = False, **changes):
+        job = SimulationJob(replace(model, **changes), study.tissues, tuple(values), times, sensitivities)
+        found = simulate(job)
+        assert found.completed, found.reason
+        return found
+
+    found = force(start, True)
+    assert found.force_N[0] == 0.0
+    bare = force(start, clamps=None)
+    assert np.abs(found.force_N - bare.force_N).max() > 0.03 * bare.force_N.max()
+    assert found.jacobian is not None
+    column = [f"{tissue}.{key}" for tissue, key in study.parameters].index("muscle.c_kPa")
+    step = 0.002 * start[column] * np.eye(len(start))[column]
+    difference = (force(start + step).force_N - force(start - step).force_N) / (2.0 * step[column])
+    slope = found.jacobian[:, column]
+    np.testing.assert_allclose(slope, difference, atol=5e-3 * np.abs(difference).max())
+
+
+def test_they_are_among_what_decides_a_kept_simulation(context):
+    model = planned_model(context, context.study.sites[0])
+    clamps = model.clamps
+    assert clamps is not None
+    others = [None, clamps.model_copy(update={"force_N": 5.0})]
+    jobs = [
+        SimulationJob(replace(model, clamps=one), ("muscle",), (1.0,), (0.0,)) for one in (clamps, *others)
+    ]
+    assert len({job_digest(job) for job in jobs}) == 3
+
+
+def test_the_check_says_how_many_hold_the_limb(context, tmp_path):
+    facts = check_study(context.study)["facts"]
+    assert "clamps: 11 pins of 4 N, 7 s before touch-down; 11 at site 1 meet the skin" in facts
+    with pytest.raises(ProblemError) as caught:
+        check_study(study_of(tmp_path, COARSE + "[clamps]\nangles_degrees = [10.0]\n"))
+    told = str(caught.value)
+    assert "study.toml: clamps: site 1: the clamp at 10 degrees would lie on the test pin" in told
+    assert "\n" not in told
+
+
+def test_pins_that_miss_are_refused_where_the_site_is_built(context):
+    model = planned_model(context, context.study.sites[0])
+    clamps = model.clamps
+    assert clamps is not None
+    above = replace(model, clamps=clamps.model_copy(update={"levels_mm": (300.0,)}))
+    mesh = read_vtu(model.mesh)
+    values = {tissue: context.study.material.of(tissue, "start") for tissue in context.study.tissues}
+    with pytest.raises(ProblemError, match="clamps: no clamping pin meets the skin"):
+        build_problem(above, mesh, values)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("[clamps]\nforce_N = 0.0", "clamps.force_N: Input should be greater than 0"),
+        ("[clamps]\nangles_degrees = [0.0, 90.0]", "clamps.angles_degrees: 0 is where the test pin is"),
+        ("[clamps]\nangles_degrees = [90.0, 90.0]", "clamps.angles_degrees: two pins are at one angle"),
+        ("[clamps]\nlevels_mm = [0.0, 5.0]", "clamps: levels_mm has 2 levels for 11 pins"),
+        ("[clamps]\nforce = 1.0", "clamps.force: unknown key"),
+        ("[calibration]\nsearch_radius_mm = 50.0\n[clamps]", "calibration.search_radius_mm: without effect"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(tmp_path, text, what):
+    with pytest.raises(StudyError) as caught:
+        study_of(tmp_path, f"{COARSE}{text}\n")
+    told = str(caught.value)
+    assert what in told
+    assert "study.toml" in told
+    assert "\n" not in told
+
+
+def test_a_record_under_force_is_not_clamped(tmp_path):
+    (tmp_path / "1.csv").touch()
+    text = "[clamps]\n[[records]]\nsite = '1'\nname = 'creep'\ntrace = '1.csv'\ncontrol = 'force'\n"
+    study = small_limb(tmp_path, f"{COARSE}{text}") / "study.toml"
+    study.write_text(study.read_text().replace("depth_mm = 3.0\n", ""))
+    with pytest.raises(StudyError, match='1-creep has control = "force", which goes without clamps'):
+        load_study(tmp_path)

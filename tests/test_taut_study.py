@@ -1,0 +1,129 @@
+"""Pre-stretch in a study: in which tissue, along what, what it decides, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from layered import store_blocks
+from limbfit.errors import InputError, StudyError
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import SimulationJob, build_problem, simulate
+from limbfit.mesh import read_vtu
+from limbfit.pipeline.experiments.socket_limb import SocketLimb
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import job_digest, recorded_model
+from limbfit.pipeline.verbs.run import keys
+from limbfit.study import Study, load_study
+
+TEXT = """
+[study]
+name = "taut"
+[surfaces]
+skin = "skin.stl"
+[mesh]
+element = "tet10"
+[material]
+{stated}
+[solver]
+load_steps = 4
+unload_steps = 3
+{more}
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+"""
+TAUT = "prestretch = { skin = 1.1 }\n"
+VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5}
+TRUTH = {"skin": VALUES | {"c_kPa": 9.0}, "muscle": VALUES}
+
+
+def study_of(folder: Path, stated: str = "", more: str = "", site: str = "") -> Study:
+    for name in ("skin.stl", "a.csv"):
+        (folder / name).touch()
+    text = TEXT.format(stated=stated, more=more) + site
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return load_study(folder)
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory) -> Context:
+    study = study_of(tmp_path_factory.mktemp("taut"), TAUT)
+    store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, TRUTH, 3)
+    return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+def test_a_layer_is_stretched_in_its_plane_and_fibres_along_themselves(context):
+    model = replace(recorded_model(context, context.study.recorded[0]))
+    assert model.prestretch == (("skin", 1.1),)
+    mesh = read_vtu(model.mesh)
+    G = np.asarray(build_problem(model, mesh, TRUTH).prestretch)
+    skin = mesh.regions == mesh.region_names.index("skin")
+    np.testing.assert_allclose(G[skin], np.tile(np.diag([1.1, 1.1, 1.1**-2]), (skin.sum(), 1, 1)))
+    np.testing.assert_array_equal(G[~skin], np.tile(np.eye(3), ((~skin).sum(), 1, 1)))
+    along = replace(model, fibres=(("muscle", (1.0, 0.0, 0.0)),), prestretch=(("muscle", 1.2),))
+    G = np.asarray(build_problem(along, mesh, TRUTH).prestretch)
+    expected = np.diag([1.2, 1.2**-0.5, 1.2**-0.5])
+    np.testing.assert_allclose(G[~skin], np.tile(expected, ((~skin).sum(), 1, 1)), atol=1e-12)
+
+
+def test_it_decides_the_calibration_on_whole_meshes(tmp_path):
+    plain, taut = study_of(tmp_path), study_of(tmp_path, TAUT)
+    before, after = keys(plain), keys(taut)
+    assert {stage for stage in before if before[stage] != after[stage]} == {"calibrate", "predict", "report"}
+    assert plain.within_mm == 65.0
+    assert taut.within_mm is None
+
+
+def test_force_follows_tissue_by_its_derivatives(context):
+    study, model = context.study, recorded_model(context, context.study.recorded[0])
+    flat, times = study.vector(TRUTH), (0.5 * model.knots_s[1], model.knots_s[1], 1.5 * model.knots_s[1])
+    names = [f"{tissue}.{key}" for tissue, key in study.parameters]
+    jobs = [SimulationJob(one, study.tissues, tuple(flat), times) for one in (model, model.bare)]
+    assert job_digest(jobs[0]) != job_digest(jobs[1])
+    found, slack = (simulate(job) for job in jobs)
+    assert found.completed, found.reason
+    assert np.abs(found.force_N - slack.force_N).max() > 0.02 * slack.force_N.max()
+    assert found.jacobian is not None
+    for name in ("skin.c_kPa", "muscle.c_kPa"):
+        own = np.array([name == other for other in names])
+        values = [tuple(np.where(own, flat * (1.0 + sign * 2e-3), flat)) for sign in (1, -1)]
+        ahead, back = (simulate(replace(jobs[0], parameters=one)).force_N for one in values)
+        difference = (ahead - back) / (4e-3 * flat[own])
+        slope = found.jacobian[:, own][:, 0]
+        np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+
+
+def test_a_socket_takes_none(context):
+    with pytest.raises(InputError, match=r"study.toml: material.prestretch: the limb in a socket is at rest"):
+        SocketLimb.of(context, "socket")
+
+
+@pytest.mark.parametrize(
+    ("stated", "more", "site", "what"),
+    [
+        ("prestretch = { muscle = 1.1 }", "", "", "material.prestretch.muscle: no layer, and no tissue with"),
+        ("prestretch = { hide = 1.1 }", "", "", "material.prestretch.hide: no layer"),
+        (
+            "prestretch = { skin = 2.0 }",
+            "",
+            "",
+            "material.prestretch.skin: Input should be less than or equal",
+        ),
+        (TAUT, "", "ultrasound = 'a.csv'\n", "a has ultrasound, which sees no pre-stretch; leave it out"),
+        (TAUT, "", "control = 'force'\n", 'a has control = "force", which goes without pre-stretch'),
+        (TAUT, "[calibration]\nsearch_radius_mm = 50.0", "", "calibration.search_radius_mm: without effect"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(tmp_path, stated, more, site, what):
+    with pytest.raises(StudyError) as caught:
+        study_of(tmp_path, stated, more, site)
+    told = str(caught.value)
+    assert what in told
+    assert "study.toml" in told
+    assert "\n" not in told
