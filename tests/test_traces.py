@@ -15,6 +15,7 @@ import pytest
 from scipy.io import savemat
 
 from limbfit.errors import TraceError
+from limbfit.phases import boundaries
 from limbfit.traces import (
     TouchDown,
     Trace,
@@ -439,7 +440,7 @@ def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
     assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
     curve = regularise(trace, touch)
     assert [phase.kind for phase in curve.phases] == expected.split()
-    ends = curve.corners_s[1:-1] + touch.time_s
+    ends = boundaries(curve.phases)[1:-1] + touch.time_s
     assert ends == pytest.approx(corners_s[1:-1], abs=0.01)
     error = curve.force_N - truth(curve.time_s + touch.time_s)
     assert np.sqrt(np.mean(error**2)) < 0.01

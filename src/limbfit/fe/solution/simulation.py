@@ -51,7 +51,7 @@ MOST_DEEPER = 3.0
 STEEP_PRESSURE = 3.0
 
 
-class Simulation:
+class SteppedRun:
     """One run: the system, its materials, and the step that was reached last."""
 
     def __init__(
