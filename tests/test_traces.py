@@ -543,9 +543,9 @@ def test_stated_touch_down_and_peak_are_taken():
     assert stated.baseline_N == found.baseline_N
     turn = 5.4 / 0.96
     later = regularise(trace, stated, peak_s=turn + 0.1)
-    assert later.corners_s[1] == pytest.approx(turn + 0.1 - stated.time_s)
+    assert boundaries(later.phases)[1] == pytest.approx(turn + 0.1 - stated.time_s)
     assert later.depth_mm == pytest.approx(5.0 - 0.3 * 0.96, abs=0.12)
-    assert regularise(trace, found).corners_s[1] == pytest.approx(turn - found.time_s, abs=0.01)
+    assert boundaries(regularise(trace, found).phases)[1] == pytest.approx(turn - found.time_s, abs=0.01)
 
 
 def test_stated_times_off_the_record_are_refused():
