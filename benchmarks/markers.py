@@ -30,7 +30,7 @@ from limbfit.anatomy.sites.registration import limb_motion
 from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import Limb, make_limb, rotation_about
-from limbfit.phantom.mri import Grid, image_of, make_grid
+from limbfit.phantom.mri import ScanGrid, image_of, make_grid
 from limbfit.phantom.sites import TrueSite, markers_of, true_sites
 
 SHIFT_MM, TURN_DEG = 5.0, 3.0
@@ -45,7 +45,7 @@ def moved(limb: Limb, seed: int) -> Limb:
     return limb.moved(rotation_about(axis, turn), shift * way / np.linalg.norm(way))
 
 
-def coarser(grid: Grid, factor: float) -> Grid:
+def coarser(grid: ScanGrid, factor: float) -> ScanGrid:
     """The same box in larger voxels."""
     size = np.array(grid.shape[::-1])
     spacing = np.array(grid.spacing) * factor
@@ -53,7 +53,9 @@ def coarser(grid: Grid, factor: float) -> Grid:
     middle = grid.origin + grid.direction @ (np.array(grid.spacing) * (size - 1) / 2)
     k, j, i = (int(n) for n in fewer[::-1])
     x, y, z = (float(s) for s in spacing)
-    return Grid((k, j, i), (x, y, z), middle - grid.direction @ (spacing * (fewer - 1) / 2), grid.direction)
+    return ScanGrid(
+        (k, j, i), (x, y, z), middle - grid.direction @ (spacing * (fewer - 1) / 2), grid.direction
+    )
 
 
 def skin_of(volume: Volume) -> tuple[Surface, NDArray[np.bool_]]:

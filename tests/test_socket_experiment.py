@@ -13,7 +13,7 @@ import pyvista as pv
 from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
-from limbfit.donning import Fit, Load, don, socket_problem, socket_steps
+from limbfit.donning import Load, SocketFit, don, socket_problem, socket_steps
 from limbfit.errors import RunError
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
@@ -137,7 +137,7 @@ def test_slopes_of_pressure_and_settling_are_central_differences(folder):
     mesh, _ = mesh_limb(anatomy, settings, 10.0)
     up = np.array([0.0, 0.0, 1.0])
     load = Load("stance", 60.0 * up, np.zeros(3), anatomy.cut_point, 1.0, 0.0)
-    fit = Fit(anatomy.cut_point, up, np.array([0.0, -1.0, 0.0]), 0.3, 1.0, 0.0, loads=(load,))
+    fit = SocketFit(anatomy.cut_point, up, np.array([0.0, -1.0, 0.0]), 0.3, 1.0, 0.0, loads=(load,))
     tissues = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}
     problem = socket_problem(mesh, tissues, socket, fit)
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)

@@ -15,6 +15,7 @@ import pytest
 from scipy.io import savemat
 
 from limbfit.errors import TraceError
+from limbfit.phases import boundaries
 from limbfit.traces import (
     TouchDown,
     Trace,
@@ -439,7 +440,7 @@ def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
     assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
     curve = regularise(trace, touch)
     assert [phase.kind for phase in curve.phases] == expected.split()
-    ends = curve.corners_s[1:-1] + touch.time_s
+    ends = boundaries(curve.phases)[1:-1] + touch.time_s
     assert ends == pytest.approx(corners_s[1:-1], abs=0.01)
     error = curve.force_N - truth(curve.time_s + touch.time_s)
     assert np.sqrt(np.mean(error**2)) < 0.01
@@ -542,9 +543,9 @@ def test_stated_touch_down_and_peak_are_taken():
     assert stated.baseline_N == found.baseline_N
     turn = 5.4 / 0.96
     later = regularise(trace, stated, peak_s=turn + 0.1)
-    assert later.corners_s[1] == pytest.approx(turn + 0.1 - stated.time_s)
+    assert boundaries(later.phases)[1] == pytest.approx(turn + 0.1 - stated.time_s)
     assert later.depth_mm == pytest.approx(5.0 - 0.3 * 0.96, abs=0.12)
-    assert regularise(trace, found).corners_s[1] == pytest.approx(turn - found.time_s, abs=0.01)
+    assert boundaries(regularise(trace, found).phases)[1] == pytest.approx(turn - found.time_s, abs=0.01)
 
 
 def test_stated_times_off_the_record_are_refused():

@@ -28,7 +28,7 @@ SHARE = 0.005  # of the travel: a smaller change is none
 
 
 @dataclass(frozen=True)
-class Phase:
+class MotionPhase:
     """What the indenter does from ``start_s`` to ``end_s``, and where it was then, mm."""
 
     kind: Kind
@@ -46,7 +46,7 @@ class Phase:
         """Mean speed, mm/s; negative on the way out."""
         return (self.end_mm - self.start_mm) / self.duration_s
 
-    def later(self, seconds: float) -> Phase:
+    def later(self, seconds: float) -> MotionPhase:
         """The same, with times that count from so much earlier."""
         return replace(self, start_s=self.start_s + seconds, end_s=self.end_s + seconds)
 
@@ -58,7 +58,7 @@ def tolerance_mm(displacement: Array) -> float:
 
 def find_phases(
     times: Array, displacement: Array, *, tolerance: float | None = None, contact_s: float | None = None
-) -> tuple[Phase, ...]:
+) -> tuple[MotionPhase, ...]:
     """The phases of a displacement: corners of a broken line, or as many samples as one likes.
 
     The displacement is reduced to the fewest straight pieces that follow it to the tolerance; a piece that
@@ -74,7 +74,7 @@ def find_phases(
     times, displacement = np.asarray(times, dtype=float), np.asarray(displacement, dtype=float)
     allowed = tolerance_mm(displacement) if tolerance is None else tolerance
     corners = _corners(times, displacement, allowed)
-    found: list[Phase] = []
+    found: list[MotionPhase] = []
     for a, b in pairwise(corners):
         piece = _piece(
             float(times[a]), float(times[b]), float(displacement[a]), float(displacement[b]), allowed
@@ -85,7 +85,7 @@ def find_phases(
     return tuple(found) if contact_s is None else _from_contact(found, contact_s)
 
 
-def loading_end(phases: Sequence[Phase]) -> Phase | None:
+def loading_end(phases: Sequence[MotionPhase]) -> MotionPhase | None:
     """The loading that first reaches the largest displacement, to the tolerance; None where nothing advances.
 
     Its end is the peak that people mean: what creeps on afterwards is the hold.
@@ -95,14 +95,14 @@ def loading_end(phases: Sequence[Phase]) -> Phase | None:
     return next((phase for phase in phases if phase.kind == "load" and phase.end_mm >= enough), None)
 
 
-def way_in(phases: Sequence[Phase]) -> Phase | None:
+def way_in(phases: Sequence[MotionPhase]) -> MotionPhase | None:
     """The loading with which the first advance ends, holds and other rates before it; None where none is.
 
     An advance of less than a tenth of the travel that is taken back is not counted.
     """
     ends = np.array([value for phase in phases for value in (phase.start_mm, phase.end_mm)])
     enough = ends.min() + 0.1 * float(np.ptp(ends))
-    last: Phase | None = None
+    last: MotionPhase | None = None
     for phase in phases:
         if phase.kind == "load":
             last = phase
@@ -113,12 +113,12 @@ def way_in(phases: Sequence[Phase]) -> Phase | None:
     return last
 
 
-def boundaries(phases: Sequence[Phase]) -> Array:
+def boundaries(phases: Sequence[MotionPhase]) -> Array:
     """Times (k,) s at which phases begin or end: the kinks of the displacement, both its ends among them."""
     return np.array([phases[0].start_s, *(phase.end_s for phase in phases)])
 
 
-def spread(phases: Sequence[Phase], points: int, among: Array | None = None) -> Array:
+def spread(phases: Sequence[MotionPhase], points: int, among: Array | None = None) -> Array:
     """About ``points`` times (k,) s, evenly over the phases, their boundaries and all ``among`` included.
 
     A phase that is short beside the others has ten steps nevertheless, or its part of half of the points.
@@ -136,7 +136,7 @@ def spread(phases: Sequence[Phase], points: int, among: Array | None = None) -> 
     return np.concatenate(grid)
 
 
-def in_words(phases: Sequence[Phase]) -> str:
+def in_words(phases: Sequence[MotionPhase]) -> str:
     """The phases as people say them, cycles that repeat within 5 % counted; the approach left out."""
     named = [phase for phase in phases if phase.kind != "approach"]
     for length in range(1, len(named) // 2 + 1):
@@ -148,7 +148,7 @@ def in_words(phases: Sequence[Phase]) -> str:
     return ", ".join(map(_word, named))
 
 
-def _alike(one: Phase, other: Phase) -> bool:
+def _alike(one: MotionPhase, other: MotionPhase) -> bool:
     """Whether two phases are the same part of two cycles: the first one's way is from touch-down."""
     if one.kind != other.kind:
         return False
@@ -156,19 +156,19 @@ def _alike(one: Phase, other: Phase) -> bool:
     return abs(a - b) <= 0.05 * abs(a)
 
 
-def _word(phase: Phase) -> str:
+def _word(phase: MotionPhase) -> str:
     if phase.kind == "hold":
         return f"hold for {phase.duration_s:.3g} s"
     return f"{phase.kind} at {abs(phase.rate_mm_s):.3g} mm/s"
 
 
-def _piece(start_s: float, end_s: float, start_mm: float, end_mm: float, allowed: float) -> Phase:
+def _piece(start_s: float, end_s: float, start_mm: float, end_mm: float, allowed: float) -> MotionPhase:
     change = end_mm - start_mm
     kind: Kind = "hold" if abs(change) <= allowed else "load" if change > 0.0 else "unload"
-    return Phase(kind, start_s, end_s, start_mm, end_mm)
+    return MotionPhase(kind, start_s, end_s, start_mm, end_mm)
 
 
-def _from_contact(phases: Sequence[Phase], contact_s: float) -> tuple[Phase, ...]:
+def _from_contact(phases: Sequence[MotionPhase], contact_s: float) -> tuple[MotionPhase, ...]:
     """One approach up to contact, then the phases."""
     first = phases[0]
     if contact_s <= first.start_s:
@@ -177,7 +177,7 @@ def _from_contact(phases: Sequence[Phase], contact_s: float) -> tuple[Phase, ...
     at = float(np.interp(contact_s, [within.start_s, within.end_s], [within.start_mm, within.end_mm]))
     left = [replace(p, start_s=contact_s, start_mm=at) if p is within else p for p in phases]
     return (
-        Phase("approach", first.start_s, contact_s, first.start_mm, at),
+        MotionPhase("approach", first.start_s, contact_s, first.start_mm, at),
         *(p for p in left if p.end_s > contact_s),
     )
 

@@ -13,7 +13,7 @@ from limbfit.acquire.hostend import HostEnd
 from limbfit.acquire.phases import Phase
 from limbfit.acquire.session import Session
 from limbfit.acquire.settings import Settings
-from limbfit.acquire.virtual import Fault, Limb, VirtualFitSocket, fit_surrogate
+from limbfit.acquire.virtual import Fault, VirtualFitSocket, VirtualLimb, fit_surrogate
 from limbfit.acquire.virtual.pins import BRAKING
 from limbfit.study.acquisition import AcquireTable
 
@@ -41,7 +41,7 @@ SURROGATE = fit_surrogate(*indentation())
 
 
 def device(seed: int = 0, faults: tuple[Fault, ...] = (), gap_mm=(3.5, 5.0)) -> VirtualFitSocket:
-    limb = Limb({"1": SURROGATE}, np.random.default_rng(seed), gap_mm)
+    limb = VirtualLimb({"1": SURROGATE}, np.random.default_rng(seed), gap_mm)
     return VirtualFitSocket(limb, seed=seed, faults=faults)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import SURROGATE, device, indentation
 
-from limbfit.acquire.virtual import Limb, fit_surrogate
+from limbfit.acquire.virtual import VirtualLimb, fit_surrogate
 from limbfit.errors import TraceError
 
 
@@ -47,7 +47,7 @@ def test_any_history_gives_bounded_forces_that_relax(corners: list[float]) -> No
 
 
 def test_the_stepped_limb_is_the_surrogate() -> None:
-    limb = Limb({"1": SURROGATE}, np.random.default_rng(0), (4.0, 4.0))
+    limb = VirtualLimb({"1": SURROGATE}, np.random.default_rng(0), (4.0, 4.0))
     limb.bring("1", 1)
     time, displacement, force = indentation()
     fine = np.arange(0.001, time[-1], 0.001)

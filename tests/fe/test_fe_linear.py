@@ -22,7 +22,7 @@ from limbfit.fe.solution.linear import (
     symmetric_product,
 )
 from limbfit.fe.solution.multigrid import Multigrid
-from limbfit.fe.solution.simulation import Simulation
+from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.solution.springs import touched
 
 
@@ -152,7 +152,7 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
 
 def test_a_deep_first_step_does_not_cost_the_single_precision():
     """Stiff contact deep inside makes the first tangent indefinite, which says nothing of the digits."""
-    run = Simulation(punched_block("tet10", 6), StepControl(), False, None)
+    run = SteppedRun(punched_block("tet10", 6), StepControl(), False, None)
     next(run.run())
     assert run.factor.counts["double_precision"] == 0
 

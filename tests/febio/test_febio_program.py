@@ -20,7 +20,7 @@ import pytest
 from limbfit.bench.blocks import punched_block
 from limbfit.errors import InputError, ProblemError, RunError
 from limbfit.fe import History
-from limbfit.febio import Verdict, find_febio, judge, read_log, result_of_log, run_febio
+from limbfit.febio import RunVerdict, find_febio, judge, read_log, result_of_log, run_febio
 from limbfit.febio.verdict import ERROR, NORMAL
 
 LOGS = Path(__file__).parents[3] / "shared" / "reference" / "febio-logs"
@@ -140,7 +140,7 @@ def test_a_good_run(tmp_path):
         program(tmp_path, f"sys.stdout.write({WELL!r}); open('forces.txt', 'w').write({table!r})"),
         tmp_path, 2.0, "forces.txt",
     )  # fmt: skip
-    assert run.verdict == Verdict("normal", "", 2.0, "4.11.0")
+    assert run.verdict == RunVerdict("normal", "", 2.0, "4.11.0")
     found = result_of_log(punched_block("hex8", 2), run.log, run.verdict)
     assert found.completed
     assert found.force.tolist() == [0.0, 1.5]  # along the axis, which is -z; rest is put before it
@@ -218,7 +218,7 @@ def test_a_program_that_cannot_start(tmp_path):
 
 def test_a_table_of_something_else(tmp_path):
     file = tmp_path / "log.txt"
-    good = Verdict("normal", "", 2.0, "")
+    good = RunVerdict("normal", "", 2.0, "")
     file.write_text("*Step  = 1\n*Time  = 2\n*Data  = Fx;Fy\n3,0,0\n")
     with pytest.raises(ProblemError, match="has no Fz"):
         result_of_log(punched_block("hex8", 2), read_log(file), good)

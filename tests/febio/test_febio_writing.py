@@ -16,7 +16,7 @@ from limbfit.fe.solution.control import schedule
 from limbfit.febio import (
     FebSettings,
     Range,
-    Verdict,
+    RunVerdict,
     find_febio,
     in_indenter_frame,
     read_feb,
@@ -246,7 +246,7 @@ def test_it_pushes_as_hard(tmp_path, shape):
     limit = 0.01 * direct.peak_force
     np.testing.assert_allclose(run.result.force, direct.force, atol=limit)
     log = read_log(run.files[0])
-    found = result_of_log(problem, log, Verdict("normal", "", 3.0, ""))
+    found = result_of_log(problem, log, RunVerdict("normal", "", 3.0, ""))
     np.testing.assert_allclose(found.force, run.result.force, atol=1e-3 * limit)
 
 

@@ -11,7 +11,7 @@ from bars import NAMES, PAPER, SITES, TRUTH, records
 from limbfit.identify import Prior, calibrate, estimate_uncertainty, separate
 from limbfit.identify.fit.parameters import search_space
 from limbfit.identify.uncertainty.beliefs import Beliefs
-from limbfit.identify.uncertainty.intervals import Kept, sampled_uncertainty
+from limbfit.identify.uncertainty.intervals import KeptRuns, sampled_uncertainty
 from limbfit.priors import of_tissues
 
 PEOPLE = tuple(Prior(name, *known) for name, known in of_tissues(("skin", "muscle")).items())
@@ -35,7 +35,7 @@ def test_a_parameter_that_does_not_move_has_no_share():
 
 def told(unknowns, seed=0):
     """Logarithms of the answer and what is known of it, as a run states it, for a draw of noise."""
-    kept, data = Kept(), records(0.03, seed=seed, sites=THIN)
+    kept, data = KeptRuns(), records(0.03, seed=seed, sites=THIN)
 
     def simulate(parameters):
         return [site.respond(parameters) for site in THIN]

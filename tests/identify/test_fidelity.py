@@ -104,7 +104,8 @@ def test_a_run_killed_anywhere_and_begun_again_repeats_itself():
             continue
         break
     assert kills == whole.calibration.evaluations + len(whole.rounds) - 1
-    assert again.calibration.to_dict() == whole.calibration.to_dict()
+    assert np.array_equal(again.calibration.parameters, whole.calibration.parameters)
+    assert again.calibration.history == whole.calibration.history
     assert again.rounds == whole.rounds
 
 
@@ -136,7 +137,7 @@ def test_a_fine_simulation_that_always_fails_is_told():
     found = calibrate_corrected(coarsened, fails, records(), PAPER)
     assert not found.calibration.converged
     assert "the correction fails: s2: on the whole mesh: folded" in found.calibration.reason
-    json.dumps(found.to_dict(), allow_nan=False)  # as it is stored
+    json.dumps([vars(one) for one in found.rounds], allow_nan=False)  # as it is stored
 
 
 def too_weak(parameters):
@@ -182,7 +183,7 @@ def test_a_coarse_simulation_lost_half_way_back_leaves_the_correction_before():
     assert failed
     assert all("s0: in the search: lost" in one.reason for one in failed)
     assert all(one.scales == one.expected_percent == (None,) * 4 for one in failed)
-    json.dumps(found.to_dict(), allow_nan=False)
+    json.dumps([vars(one) for one in found.rounds], allow_nan=False)
     assert "the correction fails: s0: in the search: lost" in found.calibration.reason
     whole = [one for one in found.rounds if one.stage == 1 and not one.reason]
     costs = [fine_cost(one.parameters, data) for one in whole]

@@ -9,7 +9,7 @@ from bars import NAMES, PAPER, TRUTH, records, simulate
 from limbfit.identify import Measured, SiteResponse, calibrate, estimate_uncertainty, separate
 from limbfit.identify.fit.parameters import Unknowns, search_space
 from limbfit.identify.uncertainty.coverage import coverage_study
-from limbfit.identify.uncertainty.intervals import Kept, further_evaluations, sampled_uncertainty
+from limbfit.identify.uncertainty.intervals import KeptRuns, further_evaluations, sampled_uncertainty
 from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.uncertainty import LINEARISED, SAMPLED
 
@@ -50,7 +50,7 @@ def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
 
 
 def near_the_truth(noise=0.03, grouping=None):
-    data, kept = records(noise, seed=4), Kept()
+    data, kept = records(noise, seed=4), KeptRuns()
     grouping = grouping or separate(NAMES)
     found = calibrate(kept.of(simulate), data, PAPER.from_start(TRUTH), stages=(grouping,))
     bounds = PAPER.from_start(TRUTH)
@@ -60,7 +60,7 @@ def near_the_truth(noise=0.03, grouping=None):
 
 def test_further_simulations_are_few_and_asked_for_again_alike():
     data, kept, known, space = near_the_truth()
-    asked = Kept(), Kept()
+    asked = KeptRuns(), KeptRuns()
     one, other = (sampled_uncertainty(known, data, PAPER, space, kept, again.of(simulate)) for again in asked)
     assert one.method == SAMPLED
     assert 0 < len(asked[0].points) <= 2
@@ -82,13 +82,13 @@ def test_failed_simulations_enter_no_interval():
         return [SiteResponse(100 * good.force_N, good.jacobian, False, "stopped"), *rest]
 
     before = len(kept.points)
-    failing_kept = Kept([*kept.points], [*kept.responses])
+    failing_kept = KeptRuns([*kept.points], [*kept.responses])
     assert not failing_kept.add(1.1 * TRUTH, failing(1.1 * TRUTH))
     assert len(failing_kept.points) == before
     found = sampled_uncertainty(known, data, PAPER, space, kept, failing)
     assert found.method == SAMPLED
     assert np.mean((found.intervals_95[:, 0] < TRUTH) & (found.intervals_95[:, 1] > TRUTH)) >= 0.75
-    alone = Kept(kept.points[:1], kept.responses[:1])
+    alone = KeptRuns(kept.points[:1], kept.responses[:1])
     assert sampled_uncertainty(known, data, PAPER, space, alone, failing) is known
     assert known.method == LINEARISED
 

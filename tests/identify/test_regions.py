@@ -10,12 +10,12 @@ from bars import NAMES, PAPER, SITES, TRUTH, records
 
 from limbfit.identify import calibrate
 from limbfit.identify.fit.parameters import separate
-from limbfit.identify.fit.regions import Region, fit_regions, mean_percent
+from limbfit.identify.fit.regions import RegionRecords, fit_regions, mean_percent
 
 SOFT = TRUTH * np.array([0.6, 1.0, 1.2, 1.0, 0.7, 1.0, 0.9, 1.1])
 
 
-def region(sites, truth, fitted=None) -> Region:
+def region(sites, truth, fitted=None) -> RegionRecords:
     """Sites whose records come from ``truth``; identified on the first ``fitted`` of them."""
     measured = records(truth=truth, sites=sites)
     used = fitted or len(sites)
@@ -26,7 +26,7 @@ def region(sites, truth, fitted=None) -> Region:
     def identify(start):
         return calibrate(lambda p: simulate(p)[:used], measured[:used], start, stages=(separate(NAMES),))
 
-    return Region(identify, simulate, tuple(measured))
+    return RegionRecords(identify, simulate, tuple(measured))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import _ramp, _triple, true_parameters
-from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, MeshJob, site_force, site_mesh
+from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, TruthMeshJob, site_force, site_mesh
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.sites import true_sites
 from limbfit.phantom.surfaces import true_anatomy
@@ -29,7 +29,7 @@ def test_site_is_simulated_to_its_end(phantom, name):
     folder, sites = phantom
     site = sites[name]
     made, at, axis = DISCRETISATIONS["coarse"], _triple(site.position), _triple(site.axis)
-    mesh = site_mesh(MeshJob(name, folder, at, axis, made.mesh, made.within_mm))
+    mesh = site_mesh(TruthMeshJob(name, folder, at, axis, made.mesh, made.within_mm))
     steps = made.steps(site.thickness)
     found = site_force(ForceJob(name, mesh, at, axis, _ramp(site), steps, true_parameters(0)))
     peak = int(np.argmax(found.force))

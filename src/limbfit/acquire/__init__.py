@@ -12,7 +12,7 @@ from .device import Device, LineDevice
 from .events import Event
 from .links import DEFAULT_ADDRESS, DEFAULT_PORT, connect
 from .operator import Keyboard, Nobody
-from .quality import Ramp, Verdict, judge, ramps
+from .quality import RecordedRamp, Verdict, judge, ramps
 from .recording import Recorder, Recording, follow_recording, read_recording
 from .session import Ending, Listener, LiveTold, PhaseTold, Session, Told, prioritise, run_session
 from .settings import Settings
@@ -29,7 +29,7 @@ __all__ = [
     "LiveTold",
     "Nobody",
     "PhaseTold",
-    "Ramp",
+    "RecordedRamp",
     "Recorder",
     "Recording",
     "Session",

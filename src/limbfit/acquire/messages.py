@@ -57,7 +57,7 @@ class SetLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Note:
+class NoteCommand:
     """What the session is at, for the device's display and log: ``SITE`` or ``PHASE`` and a word."""
 
     kind: str
@@ -86,7 +86,7 @@ class Bye:
     body = "BYE"
 
 
-Command = Hello | SetLimits | Note | Beat | Bye | Move | Hold | Stop | Fence
+Command = Hello | SetLimits | NoteCommand | Beat | Bye | Move | Hold | Stop | Fence
 
 
 def command_body(command: Command) -> str:
@@ -107,7 +107,7 @@ def parse_command(body: str) -> Command | None:
     """The command that a body states, or None."""
     verb, *words = body.split(" ")
     if verb in ("SITE", "PHASE") and len(words) == 1:
-        return Note(verb, words[0]) if _WORD.match(words[0]) else None
+        return NoteCommand(verb, words[0]) if _WORD.match(words[0]) else None
     if verb == "HELLO" and len(words) == 2:
         version = _integers(words[:1])
         return Hello(words[1], version[0]) if version and _NONCE.match(words[1]) else None

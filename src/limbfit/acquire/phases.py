@@ -70,7 +70,6 @@ CLAMPED = frozenset(
         Phase.UNLOAD,
     }
 )
-INWARD = frozenset({Phase.CLAMP, Phase.APPROACH, Phase.SEARCH, Phase.LOAD})  # a pin moves towards the limb
 
 _WAY: dict[tuple[Phase, Outcome], Phase] = {
     (Phase.IDLE, Outcome.BEGUN): Phase.POSITION,

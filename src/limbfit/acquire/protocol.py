@@ -38,7 +38,7 @@ STOP_PATIENCE_S = 15.0  # and so is one that has not come home by then
 
 
 @dataclass(frozen=True)
-class Device:
+class DeviceFacts:
     """What a session must know of the device: see `device.Identity`."""
 
     stroke_um: int
@@ -56,7 +56,7 @@ class Protocol:
     cycle : ramps begun so far, those of preconditioning included.
     """
 
-    def __init__(self, settings: Settings, device: Device) -> None:
+    def __init__(self, settings: Settings, device: DeviceFacts) -> None:
         self.settings, self.device = settings, device
         self.phase, self.reason = Phase.IDLE, ""
         self.touch_um = self.start_um = self.depth_um = self.cycle = 0

@@ -46,14 +46,14 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Ramp:
+class RecordedRamp:
     """One ramp of a record, as a trace; ``cycle`` counts from 1, those of preconditioning included."""
 
     cycle: int
     trace: Trace
 
 
-def ramps(recording: Recording) -> list[Ramp]:
+def ramps(recording: Recording) -> list[RecordedRamp]:
     """The complete ramps of a record: in, held or not, out, and a moment of rest around."""
     pin = int(recording.head["settings"]["pin"]) - 1
     marks = [event for event in recording.events if event["event"] == "phase" and event["phase"] != "hold"]
@@ -73,7 +73,7 @@ def ramps(recording: Recording) -> list[Ramp]:
             (position[inside] - start_um) / 1000,
             recording.force_mN[rows, pin][inside] / 1000,
         )
-        found.append(Ramp(int(load["cycle"]), trace))
+        found.append(RecordedRamp(int(load["cycle"]), trace))
     return found
 
 
@@ -98,13 +98,13 @@ def judge(recording: Recording) -> Verdict:
     return Verdict((*checks, _losses(recording)))
 
 
-def _complete(recording: Recording, counted: list[Ramp]) -> Check:
+def _complete(recording: Recording, counted: list[RecordedRamp]) -> Check:
     wanted = int(recording.head["settings"]["repeats"])
     found = f"{len(counted)} of {wanted} ramps"
     return Check("ramps", len(counted) == wanted, found, "record the site again")
 
 
-def _curves(counted: list[Ramp], speed_mm_s: float) -> list[Check]:
+def _curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
     smooth: list[Regularised] = []
     checks = []
     for ramp in counted:

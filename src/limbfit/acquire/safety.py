@@ -1,7 +1,7 @@
 """Every limit of the experiment, in one place: checked on each sample by limbfit and again by the device.
 
-`Guard` is what both ends run; `Limits` are the numbers.  What only one end can know - that the limb has moved
-in the clamps, that a sensor does not answer to a push, that a step takes too long - stands below it.
+`Guard` is what both ends run; `SafetyLimits` are the numbers.  What only one end can know - that the limb has
+moved in the clamps, that a sensor does not answer to a push, that a step takes too long - stands below it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DEAF_UM = 1500  # a push so far beyond touch must be felt
 
 
 @dataclass(frozen=True)
-class Limits:
+class SafetyLimits:
     """Per pin: largest force (mN) and position (um).
 
     For all: speed towards the limb (um/s), sensor range (mN), and how many samples alike mean a dead sensor.
@@ -46,11 +46,11 @@ class Violation:
     text: str
 
 
-def session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: int) -> Limits:
+def session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: int) -> SafetyLimits:
     """The limits of a session before the skin has been met; see `Guard.set_depth`."""
     force = [micro(settings.clamp_limit_N)] * PINS
     force[settings.pin - 1] = micro(settings.force_limit_N)
-    return Limits(
+    return SafetyLimits(
         force_mN=tuple(force),
         position_um=(stroke_um,) * PINS,
         speed_um_s=micro(settings.speed_limit_mm_s),
@@ -62,7 +62,7 @@ def session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: i
 class Guard:
     """Looks at every sample; remembers only what a limit in time needs."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: SafetyLimits) -> None:
         self.limits = limits
         self._least_mN = min(*limits.force_mN, limits.range_mN - 1)
         self._past: deque[Sample] = deque()
@@ -74,7 +74,7 @@ class Guard:
         position = list(self.limits.position_um)
         position[pin - 1] = min(position_um, position[pin - 1])
         old = self.limits
-        self.limits = Limits(old.force_mN, tuple(position), old.speed_um_s, old.range_mN, old.alike)
+        self.limits = SafetyLimits(old.force_mN, tuple(position), old.speed_um_s, old.range_mN, old.alike)
 
     def check(self, sample: Sample) -> Violation | None:
         """The first limit that the sample passes."""

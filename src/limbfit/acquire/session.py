@@ -18,12 +18,12 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from ..errors import RunError
-from .device import Device as AnyDevice
+from .device import Device
 from .events import PERIOD_US, Abort, Action, Begin, Event, Hold, LinkLost, Move, Sample, Stop, Tick
 from .hostend import limits_command
-from .messages import Beat, Bye, Declined, Identity, Note, OutOfReach, Tripped
+from .messages import Beat, Bye, Declined, Identity, NoteCommand, OutOfReach, Tripped
 from .phases import Phase
-from .protocol import Device, Protocol
+from .protocol import DeviceFacts, Protocol
 from .recording import Recorder
 from .settings import Settings, micro
 
@@ -113,7 +113,7 @@ class Session:
     def __init__(
         self,
         settings: Settings,
-        device: AnyDevice,
+        device: Device,
         *,
         site: str,
         recorder: Recorder | None = None,
@@ -121,7 +121,9 @@ class Session:
     ) -> None:
         identity: Identity = device.identity
         self.settings, self.device, self.recorder, self.listener = settings, device, recorder, listener
-        self.protocol = Protocol(settings, Device(identity.stroke_um, identity.range_mN, identity.touch_fF))
+        self.protocol = Protocol(
+            settings, DeviceFacts(identity.stroke_um, identity.range_mN, identity.touch_fF)
+        )
         self.counts = Counts()
         self.unreachable: tuple[int, ...] = ()
         self._paced = identity.clock == "paced"
@@ -147,7 +149,7 @@ class Session:
         self._fresh = now + FIRST_S
         with self._wire(now):
             self.device.send(limits, now)
-            self.device.send(Note("SITE", self._site), now)
+            self.device.send(NoteCommand("SITE", self._site), now)
         self.handle(Begin(), now)
 
     def reports(self, reports: list[Sample | Declined | Tripped | OutOfReach], now: float) -> None:
@@ -244,7 +246,7 @@ class Session:
         self._record("phase", now, **facts)
         if not protocol.is_over:
             with self._wire(now):
-                self.device.send(Note("PHASE", phase), now)
+                self.device.send(NoteCommand("PHASE", phase), now)
         if self.listener is not None:
             self.listener(PhaseTold(phase, now, protocol.reason, protocol.cycle))
 

@@ -29,7 +29,7 @@ NEVER = math.inf
 
 
 @dataclass(frozen=True)
-class Part:
+class CasePart:
     """``columns`` of ``table`` in the ``spans`` of time, s (start left out), with the ``goal``, percent."""
 
     name: str
@@ -45,7 +45,7 @@ class SocketCase:
     """An input of the folder ``socket``: its name and its parts."""
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[CasePart, ...]
     element: str = "hex8"
 
 
@@ -53,32 +53,32 @@ SOCKET = (
     SocketCase(
         "slide",
         (
-            Part("pressing", FORCES, ((0.0, 1.0),), 1.0, note=STICKS),
-            Part("sticking to slipping", FORCES, ((1.0, 1.5), (3.0, 3.5)), 3.0, note=NORMALS),
-            Part("slipping", FORCES, ((1.5, 3.0), (3.5, NEVER)), 1.0, note=NORMALS),
+            CasePart("pressing", FORCES, ((0.0, 1.0),), 1.0, note=STICKS),
+            CasePart("sticking to slipping", FORCES, ((1.0, 1.5), (3.0, 3.5)), 3.0, note=NORMALS),
+            CasePart("slipping", FORCES, ((1.5, 3.0), (3.5, NEVER)), 1.0, note=NORMALS),
         ),
     ),
     SocketCase(
         "cone",
         (
-            Part("pushed on, axial", ("Fz",), ((0.0, 2.5),), 1.0, note=NORMALS),
-            Part("pushed on, radial", ("Fx", "Fy"), ((0.0, 2.5),), 1.0, note=NORMALS),
-            Part("held, axial", ("Fz",), ((2.5, NEVER),), 3.0, note=STICKS),
-            Part("held, radial", ("Fx", "Fy"), ((2.5, NEVER),), 3.0, note=STICKS),
-            Part("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", BRIM),
-            Part("meridian, held", PLACES, ((2.5, NEVER),), 3.0, "cone-line", STICKS),
+            CasePart("pushed on, axial", ("Fz",), ((0.0, 2.5),), 1.0, note=NORMALS),
+            CasePart("pushed on, radial", ("Fx", "Fy"), ((0.0, 2.5),), 1.0, note=NORMALS),
+            CasePart("held, axial", ("Fz",), ((2.5, NEVER),), 3.0, note=STICKS),
+            CasePart("held, radial", ("Fx", "Fy"), ((2.5, NEVER),), 3.0, note=STICKS),
+            CasePart("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", BRIM),
+            CasePart("meridian, held", PLACES, ((2.5, NEVER),), 3.0, "cone-line", STICKS),
         ),
     ),
     SocketCase(
         "cone-load",
         (
-            Part("loaded by a force", ("z",), ((5.5, 6.5),), 1.0, note=STICKS),
-            Part("creep under it", ("z",), ((6.5, 8.5),), 1.0, note=STICKS),
-            Part("let go", ("z",), ((8.5, NEVER),), 3.0, note=STICKS),
-            Part("meridian under force", PLACES, ((5.5, NEVER),), 3.0, "cone-load-line", STICKS),
+            CasePart("loaded by a force", ("z",), ((5.5, 6.5),), 1.0, note=STICKS),
+            CasePart("creep under it", ("z",), ((6.5, 8.5),), 1.0, note=STICKS),
+            CasePart("let go", ("z",), ((8.5, NEVER),), 3.0, note=STICKS),
+            CasePart("meridian under force", PLACES, ((5.5, NEVER),), 3.0, "cone-load-line", STICKS),
         ),
     ),
-    SocketCase("tube", (Part("meridian", PLACES, ((0.0, NEVER),), 1.0, note="rounding"),)),
+    SocketCase("tube", (CasePart("meridian", PLACES, ((0.0, NEVER),), 1.0, note="rounding"),)),
 )
 
 
@@ -104,7 +104,7 @@ def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
             yield row | _compared(part, found, febio, "" if run.result.completed else run.result.reason)
 
 
-def _compared(part: Part, found: Log, febio: Log, reason: str) -> dict[str, Any]:
+def _compared(part: CasePart, found: Log, febio: Log, reason: str) -> dict[str, Any]:
     forces = part.columns[0] in FORCES
     columns, whole = (
         [febio.names.index(name) for name in names if name in febio.names]

@@ -60,7 +60,7 @@ def show_cube(found: dict[str, Any]) -> None:
     STDOUT.print(table)
 
 
-class Sites(StrEnum):
+class RegionSites(StrEnum):
     all = "all"
     fitted = "fitted"
 
@@ -68,9 +68,9 @@ class Sites(StrEnum):
 def regions(
     study: StudyPath,
     sites: Annotated[
-        Sites,
+        RegionSites,
         typer.Option(help="fit all recorded sites of a region, as the paper, or the study's fitted ones"),
-    ] = Sites.all,
+    ] = RegionSites.all,
     as_json: AsJson = False,
 ) -> None:
     """Identify each region separately, beside the model of the whole limb (the paper's table 3)."""

@@ -4,8 +4,8 @@ Or the other way round: under a stated pressure, whose shape is a socket's.
 """
 
 from .inside import RARE, SHEAR_LEVELS, Strains, TissueStrain
-from .model import Fit, Load, socket_problem, socket_steps
-from .outcome import SETTLING, WHOLE, Donned, Held, Patch, Row, don
+from .model import Load, SocketFit, socket_problem, socket_steps
+from .outcome import SETTLING, WHOLE, Donned, Held, Patch, SocketStep, don
 from .pressing import outer_surface, press, pressed_problem
 
 __all__ = [
@@ -14,11 +14,11 @@ __all__ = [
     "SHEAR_LEVELS",
     "WHOLE",
     "Donned",
-    "Fit",
     "Held",
     "Load",
     "Patch",
-    "Row",
+    "SocketFit",
+    "SocketStep",
     "Strains",
     "TissueStrain",
     "don",

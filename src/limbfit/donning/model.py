@@ -44,7 +44,7 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Fit:
+class SocketFit:
     """How a socket comes on a limb, and what it is loaded by then.
 
     Parameters
@@ -83,7 +83,7 @@ class Fit:
         return tuple(ends)
 
 
-def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket, fit: Fit) -> Problem:
+def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket, fit: SocketFit) -> Problem:
     """The limb's mesh in a socket that is put on and loaded.
 
     Bones and the proximal cut are held, so the socket moves: its loads are those that it exerts.
@@ -115,7 +115,7 @@ def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket
     )
 
 
-def _donning(fit: Fit) -> Motion:
+def _donning(fit: SocketFit) -> Motion:
     times, growth, z = [0.0, fit.donning_s], [0.0, 1.0], [0.0, 0.0]
     if fit.travel_mm is not None:
         growth, z = [1.0, 1.0], [-fit.travel_mm, 0.0]
@@ -124,7 +124,7 @@ def _donning(fit: Fit) -> Motion:
     return Motion.of(times, growth=growth, z=z)
 
 
-def _wrench(load: Load, fit: Fit) -> Array:
+def _wrench(load: Load, fit: SocketFit) -> Array:
     """(6,) force, N, and moment about the pivot, N mm, in the socket's coordinates."""
     force = np.asarray(load.force, dtype=float)
     moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
@@ -142,7 +142,7 @@ def _loading(load: Load, before: Array | None, after: Array) -> Motion:
     return Motion.of(times[:count], force=dict(zip(COORDINATES, values.T, strict=True)))
 
 
-def socket_steps(fit: Fit, modulus: float) -> StepControl:
+def socket_steps(fit: SocketFit, modulus: float) -> StepControl:
     """When a socket's simulation steps, and its contact stiffness; ``modulus`` as `Laws.modulus`, MPa."""
     times: list[float] = []
     for i, (_, on, off) in enumerate(fit.ends):

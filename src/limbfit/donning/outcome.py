@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..fe import Problem, Result, State, Step, StepControl, System, Tractions, solve, tractions
 from ..fe.kernel.laws import Laws
 from .inside import Strains
-from .model import Fit, socket_steps
+from .model import SocketFit, socket_steps
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -46,13 +46,13 @@ class Patch:
 
 
 @dataclass(frozen=True)
-class Row:
+class SocketStep:
     """One step: what the socket does, and what it does to the limb.
 
     ``force (3,)`` N and ``moment (3,)`` N mm about the pivot, on the socket, and its ``move (3,)`` mm and
-    ``turn (3,)`` degrees, along anterior, the third axis and proximal (`Fit.frame`).  ``penetration_mm``: how
-    far the limb is in the wall at most.  ``imbalance``: how far the contact is from the stated force and
-    moment, a share.
+    ``turn (3,)`` degrees, along anterior, the third axis and proximal (`SocketFit.frame`).
+    ``penetration_mm``: how far the limb is in the wall at most.  ``imbalance``: how far the contact is from
+    the stated force and moment, a share.
     """
 
     time: float
@@ -80,7 +80,7 @@ class Held:
         (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
     """
 
-    row: Row
+    row: SocketStep
     pressure: Array
     shear: Array
     displacement: Array
@@ -93,16 +93,16 @@ class Donned:
     """A socket's simulation: its ``rows``, one for each step, and what was ``held``, by name."""
 
     result: Result
-    rows: tuple[Row, ...]
+    rows: tuple[SocketStep, ...]
     held: Mapping[str, Held]
 
 
 def don(
     problem: Problem,
-    fit: Fit,
+    fit: SocketFit,
     regions: Mapping[str, Mask],
     sensitivities: bool = False,
-    on_row: Callable[[Row], None] | None = None,
+    on_row: Callable[[SocketStep], None] | None = None,
     steps: StepControl | None = None,
 ) -> Donned:
     """Simulate a socket's problem.
@@ -119,7 +119,7 @@ def don(
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     system = System(problem)
     patches = {WHOLE: np.ones(len(problem.bodies[0].faces), dtype=bool), **regions}
-    rows: list[Row] = []
+    rows: list[SocketStep] = []
     held: dict[str, Held] = {}
 
     def note(step: Step) -> None:
@@ -141,9 +141,9 @@ def don(
     return Donned(result, told, held)
 
 
-def _row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> Row:
+def _row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
     values = {name: Patch.of(found, mask) for name, mask in patches.items()}
-    return Row(
+    return SocketStep(
         time=step.time,
         force=step.reactions[0, :3],
         moment=step.reactions[0, 3:],

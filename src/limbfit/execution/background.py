@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from ..errors import RunError
-from .worker import GRACE_S, Outcome, Worker
+from .worker import GRACE_S, JobOutcome, Worker
 
 
 @contextmanager
@@ -24,14 +24,14 @@ def meanwhile(function: Callable[[Any], Any], job: Any) -> Iterator[Callable[[],
     """
     worker = Worker(threads=1)
     worker.send(function, job)
-    found: list[Outcome] = []
+    found: list[JobOutcome] = []
 
     def wait() -> Any:
         while not found:
             outcome = worker.receive()
             if outcome is None:
                 raise RunError(f"the process of {function.__name__} died: out of memory, killed or crashed")
-            if isinstance(outcome, Outcome):
+            if isinstance(outcome, JobOutcome):
                 found.append(outcome)
         return found[0].result()
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from ..errors import RunError
 from .face import NO_LIMITS, Answer, Job, Limits, paired
-from .worker import GRACE_S, READY, Outcome, Worker
+from .worker import GRACE_S, READY, JobOutcome, Worker
 
 TRIES = 2
 _LOOK_S = 0.25  # between two looks at what jobs take
@@ -49,7 +49,7 @@ class ProcessExecutor:
         self._mapping = True
         waiting, busy, tries = list(range(len(jobs))), dict[int, int](), [0] * len(jobs)
         limits = self.limits if lost is not None else NO_LIMITS
-        answers: dict[int, Outcome] = {}
+        answers: dict[int, JobOutcome] = {}
         try:
             for index in range(len(jobs)):
                 while index not in answers:
@@ -59,12 +59,12 @@ class ProcessExecutor:
                         self._worker(seat).send(function, jobs[job])
                     for seat, outcome in self._collect(busy, limits):
                         job = busy.pop(seat)
-                        if isinstance(outcome, Outcome):
+                        if isinstance(outcome, JobOutcome):
                             answers[job] = outcome
                         elif tries[job] < TRIES:
                             waiting.insert(0, job)
                         elif lost is not None:
-                            answers[job] = Outcome(lost(jobs[job], f"{outcome}, twice"))
+                            answers[job] = JobOutcome(lost(jobs[job], f"{outcome}, twice"))
                         else:
                             raise RunError(_obituary(function, job, keys[job]))
                 yield answers.pop(index).result()
@@ -87,7 +87,7 @@ class ProcessExecutor:
                 waiting.remove(job)
                 yield seat, job
 
-    def _collect(self, busy: dict[int, int], limits: Limits) -> Iterator[tuple[int, Outcome | str]]:
+    def _collect(self, busy: dict[int, int], limits: Limits) -> Iterator[tuple[int, JobOutcome | str]]:
         """Wait for workers to answer: (worker, outcome), or why there will be none."""
         lines = {self._worker(seat).connection: seat for seat in busy}
         limited = limits.time_s or limits.memory_GB

@@ -24,7 +24,7 @@ GRACE_S = 2.0  # for workers to end when told so
 READY = "ready"  # a worker's first word: its start is not its first job's time
 
 
-class Outcome:
+class JobOutcome:
     """What a job came to: an answer, or an exception with the worker's traceback."""
 
     def __init__(self, answer: Any = None, error: BaseException | None = None, trace: str = "") -> None:
@@ -55,7 +55,7 @@ class Worker:
         with suppress(OSError):  # it died while idle: reading its line tells so
             self.connection.send((function, job))
 
-    def receive(self) -> Outcome | str | None:
+    def receive(self) -> JobOutcome | str | None:
         """The outcome of the job, `READY`, or None where the process is dead."""
         try:
             message = self.connection.recv()
@@ -152,20 +152,20 @@ def serve(connection: Connection) -> None:
         _reply(connection, outcome)
 
 
-def _do(function: Callable, job: Any) -> Outcome:
+def _do(function: Callable, job: Any) -> JobOutcome:
     try:
-        return Outcome(function(job))
+        return JobOutcome(function(job))
     except MemoryError:
         os._exit(1)  # the parent tries once more in a fresh process
     except Exception as error:
         return _failure(error)
 
 
-def _failure(error: Exception) -> Outcome:
-    return Outcome(error=error, trace=traceback.format_exc())
+def _failure(error: Exception) -> JobOutcome:
+    return JobOutcome(error=error, trace=traceback.format_exc())
 
 
-def _reply(connection: Connection, outcome: Outcome) -> None:
+def _reply(connection: Connection, outcome: JobOutcome) -> None:
     try:
         connection.send(outcome)
     except ConnectionError:
@@ -173,7 +173,7 @@ def _reply(connection: Connection, outcome: Outcome) -> None:
     except Exception as error:  # neither every answer nor every exception can be pickled
         what = outcome.error if outcome.error is not None else error
         text = f"{type(what).__name__}: {what}"
-        connection.send(Outcome(error=RunError(text), trace=outcome.trace or traceback.format_exc()))
+        connection.send(JobOutcome(error=RunError(text), trace=outcome.trace or traceback.format_exc()))
 
 
 def _die_with_parent() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
 from ..mesh import Mesh
-from ..phases import Phase, boundaries, find_phases, loading_end
+from ..phases import MotionPhase, boundaries, find_phases, loading_end
 from .activation import Activation
 from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element
@@ -95,7 +95,7 @@ class History:
         return float(self.at(t)) + sum(self.across_at(t))
 
     @cached_property
-    def phases(self) -> tuple[Phase, ...]:
+    def phases(self) -> tuple[MotionPhase, ...]:
         """What the indenter does: loads, holds, unloads, in any number."""
         return find_phases(self.times, self.driver)
 

@@ -8,7 +8,7 @@ from .problem import step_control, to_problem
 from .program import FebioRun, axial_force, find_febio, result_of_log, run_febio
 from .reading.model import FebModel, read_feb
 from .running import FebRun, run_feb
-from .verdict import SLACK, Verdict, judge
+from .verdict import SLACK, RunVerdict, judge
 from .writing import FebSettings, contact_of, differences, write_feb
 
 __all__ = [
@@ -20,7 +20,7 @@ __all__ = [
     "FebioRun",
     "Log",
     "Range",
-    "Verdict",
+    "RunVerdict",
     "axial_force",
     "contact_of",
     "differences",

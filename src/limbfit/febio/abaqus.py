@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..errors import ProblemError, RunError
 from ..fe import Material, Problem, System
 from ..mesh import Mesh
-from .faceting import FRONT, INDENTER, PATCH, Tool, tool_mesh
+from .faceting import FRONT, INDENTER, PATCH, ToolMesh, tool_mesh
 from .moving import HELD
 from .writing import FebSettings, check_plain
 
@@ -33,7 +33,7 @@ _FACES = {
 _NO_TERM = 1e12  # mm^2/N
 
 
-def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSettings) -> Tool:
+def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSettings) -> ToolMesh:
     """Write an indentation as ``.inp``; returns the indenter's rigid mesh.
 
     Raises
@@ -75,7 +75,7 @@ def _check_material(name: str, material: Material, program: str) -> None:
 
 
 def _lines(
-    problem: Problem, system: System, tool: Tool, program: str, settings: FebSettings
+    problem: Problem, system: System, tool: ToolMesh, program: str, settings: FebSettings
 ) -> Iterator[str]:
     mesh, count = problem.mesh, len(problem.mesh.points)
     assert system.indenter is not None

@@ -24,7 +24,7 @@ BLUNT = 0.05  # edge radius over the width that FEBio's contact goes round witho
 
 
 @dataclass(frozen=True)
-class Tool:
+class ToolMesh:
     """A rigid mesh: ``points (n, 3)`` mm, ``cells`` of ``cell_type`` (hex8, or tri3 shells), and the faces
     (f, 4 | 3) that touch, outward."""
 
@@ -39,7 +39,7 @@ def blunt(indenter: Indenter) -> bool:
     return indenter.body.facets().rounding >= BLUNT * indenter.width
 
 
-def tool_mesh(indenter: Indenter) -> Tool:
+def tool_mesh(indenter: Indenter) -> ToolMesh:
     """The rigid mesh of an indenter where it stands.
 
     Shapes carry the rounding that limbfit itself computes with; a surface (``stl``) is written as it is, its
@@ -47,10 +47,10 @@ def tool_mesh(indenter: Indenter) -> Tool:
     """
     facets = indenter.body.facets()
     if facets.closed is not None:
-        return Tool(_placed(indenter, facets.points), facets.closed, "tri3", facets.front)
+        return ToolMesh(_placed(indenter, facets.points), facets.closed, "tri3", facets.front)
     count, back = len(facets.points), facets.points - [0.0, 0.0, 0.5 * indenter.width]
     cells = np.hstack([facets.front + count, facets.front])
-    return Tool(_placed(indenter, np.vstack([facets.points, back])), cells, "hex8", facets.front)
+    return ToolMesh(_placed(indenter, np.vstack([facets.points, back])), cells, "hex8", facets.front)
 
 
 def _placed(indenter: Indenter, local: Array) -> Array:
@@ -66,7 +66,7 @@ class Body:
     patch: str
     front: str
     pair: str
-    tool: Tool
+    tool: ToolMesh
     centre: Array
     motion: Motion
     faces: Indices
@@ -98,7 +98,7 @@ def written_bodies(problem: Problem) -> list[Body]:
     return found
 
 
-def _mesh_of(shape: RigidShape) -> Tool:
+def _mesh_of(shape: RigidShape) -> ToolMesh:
     if isinstance(shape, Indenter):
         return tool_mesh(shape)
     if not isinstance(shape, OpenSurface):
@@ -106,4 +106,4 @@ def _mesh_of(shape: RigidShape) -> Tool:
     used, faces = np.unique(shape.faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
     points = shape.points[used] @ shape.frame + np.asarray(shape.centre, dtype=float)
-    return Tool(points, faces, "tri3", faces)
+    return ToolMesh(points, faces, "tri3", faces)

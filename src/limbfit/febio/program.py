@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Problem, Result
 from .logs import Log, read_log
-from .verdict import SLACK, Verdict, judge
+from .verdict import SLACK, RunVerdict, judge
 
 Array = NDArray[np.float64]
 VARIABLE = "FEBIO_CMD"
@@ -31,7 +31,7 @@ GET_IT = f"install FEBio 4 (https://febio.org/downloads); put febio4 on the path
 class FebioRun:
     """One run: FEBio's own words as a verdict, its table of the indenter, if there is any, and its time."""
 
-    verdict: Verdict
+    verdict: RunVerdict
     log: Log | None
     seconds: float
     folder: Path
@@ -134,7 +134,7 @@ def _end(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def result_of_log(problem: Problem, log: Log | None, verdict: Verdict, seconds: float = 0.0) -> Result:
+def result_of_log(problem: Problem, log: Log | None, verdict: RunVerdict, seconds: float = 0.0) -> Result:
     """FEBio's force over time as a `Result`, complete or not.
 
     FEBio's table says nothing of penetration and area; forces across the axis, moments and coordinates are

@@ -21,12 +21,11 @@ Indices = NDArray[np.int64]
 @dataclass(frozen=True)
 class Tissue:
     """The deformable parts as one mesh; ``nodes (n,)`` are the places of its nodes in the model's, ``number``
-    the way back (-1: none), ``cell_ids (m,)`` FEBio's numbers."""
+    the way back (-1: none)."""
 
     mesh: Mesh
     nodes: Indices
     number: Indices
-    cell_ids: Indices
 
 
 def tissue_of(model: FebModel) -> Tissue:
@@ -62,7 +61,7 @@ def tissue_of(model: FebModel) -> Tissue:
         part_name = mesh.region_names[regions[bad[0]]]
         what = f"{len(bad)} elements are inverted or flat, the first is element {ids[bad[0]]}"
         raise refuse_part(parts[part_name], part_name, what)
-    return Tissue(mesh, nodes, number, ids)
+    return Tissue(mesh, nodes, number)
 
 
 def _node_sets(model: FebModel, number: Indices) -> dict[str, Indices]:

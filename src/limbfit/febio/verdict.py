@@ -15,7 +15,7 @@ SLACK = 1e-5  # of the end time: FEBio prints six digits, 10.0223 for 10.022314
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RunVerdict:
     """``kind`` is one of `KINDS`; ``reason`` one line for the user, empty where all went well.
 
     ``reached_s`` is the last time that converged; ``version`` that of FEBio, empty where it did not say.
@@ -33,7 +33,7 @@ class Verdict:
 
 def judge(
     messages: str, exit_code: int, end_s: float, *, timed_out: bool = False, limit_s: float = 0.0
-) -> Verdict:
+) -> RunVerdict:
     """The verdict over a run.
 
     Parameters
@@ -49,9 +49,9 @@ def judge(
     reached = times[-1] if times else 0.0
     kind, what = _kind(messages, exit_code, reached, end_s, timed_out, limit_s)
     if kind == "normal":
-        return Verdict(kind, "", reached, version)
+        return RunVerdict(kind, "", reached, version)
     where = "" if kind in ("input", "no output") else f" at {reached:.4g} s of {end_s:.4g} s"
-    return Verdict(kind, f"FEBio {what}{where}{_cause(messages, kind)}", reached, version)
+    return RunVerdict(kind, f"FEBio {what}{where}{_cause(messages, kind)}", reached, version)
 
 
 def _kind(

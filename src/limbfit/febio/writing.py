@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import ProblemError, RunError
 from ..fe import Indenter, Material, Problem, StepControl
 from ..fe.solution.control import schedule
-from .faceting import FRONT, INDENTER, PATCH, Body, Tool, blunt, written_bodies
+from .faceting import FRONT, INDENTER, PATCH, Body, ToolMesh, blunt, written_bodies
 from .fibres import axes_of_cells, axis_of, directions
 from .moving import HELD, Curves, boundary_lines, conditions, pressure_lines, row, step_ends
 from .penalty import explicit_penalty, mean_stiffness
@@ -51,7 +51,7 @@ class FebSettings:
     title: str = ""
 
 
-def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> Tool | None:
+def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> ToolMesh | None:
     """Write a problem as FEBio input; returns the rigid mesh of its indenter, or of its first body, if any.
 
     Raises

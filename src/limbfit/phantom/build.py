@@ -26,7 +26,7 @@ import numpy as np
 from ..anatomy.surfaces.surfaces import save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import DISCRETISATIONS, ForceJob, MeshJob, TrueForce, site_force, site_mesh
+from .forces import DISCRETISATIONS, ForceJob, TrueForce, TruthMeshJob, site_force, site_mesh
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
@@ -191,7 +191,7 @@ def _write_traces(
     made = DISCRETISATIONS[detail]
     settings = replace(made.mesh, layers=limb.layers)
     places = [(site.name, _triple(site.position), _triple(site.axis)) for site in indented]
-    wanted = [MeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
+    wanted = [TruthMeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
     jobs = []
     tell("meshes", 0, len(wanted))
     for (name, at, axis), site, mesh in zip(places, indented, mapping(site_mesh, wanted), strict=True):

@@ -71,7 +71,7 @@ DISCRETISATIONS = {
 
 
 @dataclass(frozen=True)
-class MeshJob:
+class TruthMeshJob:
     """A site to be meshed: where the anatomy is stored, and where the site is in it."""
 
     site: str
@@ -118,7 +118,7 @@ def _base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     return anatomy, base_mesh(anatomy, settings)
 
 
-def site_mesh(job: MeshJob) -> Mesh:
+def site_mesh(job: TruthMeshJob) -> Mesh:
     """Mesh one site, and keep the tissue that its force depends on."""
     anatomy, base = _base(job.anatomy, job.settings)
     position = np.array(job.position)

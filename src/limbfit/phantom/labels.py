@@ -9,13 +9,13 @@ import numpy as np
 from ..anatomy.grid import DEFAULT_NAMES
 from ..anatomy.imaging import LabelMap, write_labels
 from .geometry import BONES, Limb
-from .mri import SLAB, Grid
+from .mri import SLAB, ScanGrid
 
 FILE = Path("labels") / "labels.seg.nrrd"
 TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
 
 
-def true_labels(limb: Limb, grid: Grid) -> LabelMap:
+def true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
     """Soft tissue, bones and, where the limb has one, the patellar tendon, voxel by voxel."""
     values = {name: value for value, name in DEFAULT_NAMES.items()}
     array = np.zeros(grid.shape, dtype=np.uint8)
@@ -33,7 +33,7 @@ def true_labels(limb: Limb, grid: Grid) -> LabelMap:
     return LabelMap(array, np.array(grid.spacing), grid.origin, grid.direction, names | tendon)
 
 
-def write_true_labels(folder: Path, limb: Limb, grid: Grid) -> None:
+def write_true_labels(folder: Path, limb: Limb, grid: ScanGrid) -> None:
     """Write the label map to ``FILE`` below a folder."""
     (folder / FILE.parent).mkdir()
     write_labels(folder / FILE, true_labels(limb, grid))

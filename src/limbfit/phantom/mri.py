@@ -59,7 +59,7 @@ UTE = CONTRASTS["UTE"]
 
 
 @dataclass(frozen=True)
-class Grid:
+class ScanGrid:
     """Where the voxels are: ``shape`` (k, j, i); ``spacing``, ``direction`` columns for i, j, k (LPS mm)."""
 
     shape: tuple[int, int, int]
@@ -82,7 +82,7 @@ DETAIL_GRIDS = {
 }
 
 
-def make_grid(limb: Limb, detail: str, seed: int) -> Grid:
+def make_grid(limb: Limb, detail: str, seed: int) -> ScanGrid:
     """The scanner's oblique box around a limb: a few degrees off the limb's own frame."""
     shape, spacing = DETAIL_GRIDS[detail]
     random = np.random.default_rng([seed, 3])
@@ -90,7 +90,7 @@ def make_grid(limb: Limb, detail: str, seed: int) -> Grid:
     direction = limb.rotation @ tilt
     middle = limb.to_patient(np.array([0.0, 3.0, PROXIMAL_CUT_MM / 2 - 1.0]))
     half = np.array([shape[2] - 1, shape[1] - 1, shape[0] - 1]) / 2 * np.array(spacing)
-    return Grid(shape, spacing, middle - direction @ half, direction)
+    return ScanGrid(shape, spacing, middle - direction @ half, direction)
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def _add_marker(
     signal[box] += (levels.marker - levels.air) * share * (1 - skin[box])
 
 
-def _limb_window(grid: Grid, limb: Limb, k: slice) -> tuple[slice, slice]:
+def _limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slice]:
     """Rows and columns of a slab that can hold tissue."""
     heights = np.array([-10.0, PROXIMAL_CUT_MM + 40.0])
     axis = limb.to_patient(np.stack([0 * heights, 0 * heights, heights], axis=-1))
@@ -172,13 +172,13 @@ def _limb_window(grid: Grid, limb: Limb, k: slice) -> tuple[slice, slice]:
     return window[0], window[1]
 
 
-def _bias_field(seed: int, amplitude: float) -> Callable[[Grid, slice], NDArray[np.float32]]:
+def _bias_field(seed: int, amplitude: float) -> Callable[[ScanGrid, slice], NDArray[np.float32]]:
     """A smooth receive profile within 1 +- ``amplitude`` over the whole image."""
     random = np.random.default_rng([seed, 4])
     linear, quadratic = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
     scale = amplitude / (np.abs(linear).sum() + np.abs(quadratic).sum())
 
-    def profile(grid: Grid, k: slice) -> NDArray[np.float32]:
+    def profile(grid: ScanGrid, k: slice) -> NDArray[np.float32]:
         terms = []
         for axis, (a, b) in enumerate(zip(linear, quadratic, strict=True)):
             u = np.linspace(-1, 1, grid.shape[axis])
@@ -191,7 +191,7 @@ def _bias_field(seed: int, amplitude: float) -> Callable[[Grid, slice], NDArray[
 
 def slabs(
     limb: Limb,
-    grid: Grid,
+    grid: ScanGrid,
     markers: Sequence[SkinMarker],
     seed: int,
     noise: float | None = None,
@@ -221,7 +221,7 @@ def slabs(
 
 def image_of(
     limb: Limb,
-    grid: Grid,
+    grid: ScanGrid,
     markers: Sequence[SkinMarker] = (),
     *,
     seed: int = 0,
@@ -236,7 +236,7 @@ def image_of(
 def write_series(
     folder: Path,
     limb: Limb,
-    grid: Grid,
+    grid: ScanGrid,
     markers: Sequence[SkinMarker] = (),
     *,
     seed: int = 0,
@@ -267,7 +267,7 @@ def _decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
 
 
 def _slice_dataset(
-    grid: Grid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: UID
+    grid: ScanGrid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: UID
 ) -> FileDataset:
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = MRImageStorage
@@ -303,7 +303,7 @@ def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, 
     data.MagneticFieldStrength, data.FlipAngle, data.EchoTrainLength = "3", "10", "1"
 
 
-def _place(data: FileDataset, grid: Grid, index: int) -> None:
+def _place(data: FileDataset, grid: ScanGrid, index: int) -> None:
     """Image plane tags: the row cosines point along i, the column cosines along j."""
     position = grid.origin + index * grid.spacing[2] * grid.direction[:, 2]
     data.ImagePositionPatient = _decimals(position)

@@ -51,7 +51,7 @@ class Ramp:
 
 
 @dataclass(frozen=True)
-class Record:
+class RobotRecord:
     """A record: ``time`` (n,) s, ``displacement`` (n,) mm, ``force`` (n,) N, and what it was made with."""
 
     time: Array
@@ -67,7 +67,7 @@ class Record:
         np.savetxt(path, table, fmt=("%.3f", "%.4f", "%.4f"), delimiter=",", header=HEADER, comments="")
 
 
-def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Generator) -> Record:
+def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Generator) -> RobotRecord:
     """Record an indentation.
 
     Parameters
@@ -86,7 +86,7 @@ def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Genera
     touching = (since > 0) & (since < 2 * ramp.peak_s)
     clean = np.zeros_like(time)
     clean[touching] = force(since[touching])
-    return Record(
+    return RobotRecord(
         time=time,
         displacement=displacement + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size),
         force=clean + sd * random.standard_normal(time.size),
@@ -98,7 +98,7 @@ def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Genera
 
 def write_ultrasound(
     path: Path,
-    made: Record,
+    made: RobotRecord,
     layers: Mapping[str, tuple[float, Callable[[Array], Array]]],
     random: np.random.Generator,
 ) -> None:

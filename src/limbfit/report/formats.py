@@ -47,6 +47,12 @@ def symbol(key: str) -> str:
     return _GREEK.get(letter, letter) + name[len(letter) :].translate(_BELOW)
 
 
+def label(name: str) -> str:
+    """``skin.c_kPa`` as ``skin c``."""
+    tissue, _, kind = name.rpartition(".")
+    return f"{tissue} {symbol(kind)}".strip()
+
+
 def unit_of(key: str) -> str:
     """Its unit: ``tau_s`` is in s."""
     return split_key(key)[1] or NOTHING

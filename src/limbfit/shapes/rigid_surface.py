@@ -27,9 +27,6 @@ SMALLEST_MM, LARGEST_MM = 0.5, 500.0  # of an indenter's width: beyond, the file
 FRONT = 0.1  # faces whose unit normal leans at least so much towards the tissue
 STRAIGHT = 1e-8  # squared sine below which normals or edges count as parallel
 SPREAD = 2.5e-3  # squared sine of a spread of normals that a moved corner need not follow
-_NOTHING = np.zeros((0, 3, 3))
-_NO_TREE = (np.zeros((0, 6)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
-NO_BODY: Body = (_NOTHING, np.zeros((0, 3)), _NOTHING, _NOTHING, _NOTHING, _NO_TREE, _NO_TREE)
 
 
 @dataclass(frozen=True, eq=False)

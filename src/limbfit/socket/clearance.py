@@ -11,7 +11,7 @@ from ..anatomy.frame import Frame
 from ..anatomy.surfaces.surfaces import signed_distance
 from ..anatomy.surfaces.triangles import Surface, half_edges
 from ..errors import SurfaceError
-from .rays import Profile
+from .rays import LimbProfile
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,7 +21,7 @@ AIM_MM = 0.8  # what is aimed at where it is measured
 ROUNDS = 12
 
 
-def cleared(points: Array, faces: Ints, limb: Profile, outer: Surface, frame: Frame) -> Array:
+def cleared(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
     """The points of a face (limb frame) where the face is clear of the limb by ``CLEAR_MM`` or more.
 
     Each stays on its ray and moves outwards only. What is measured are the face's points, middles of edges

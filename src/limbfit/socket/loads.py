@@ -37,11 +37,6 @@ class StandardLoad:
     inside_mm: float = 0.0
     source: str = ""
 
-    @property
-    def needs_side(self) -> bool:
-        """Whether it must be known where medial is."""
-        return bool(self.medial or self.inside_mm)
-
     def force(self, body_weight: float, directions: Directions) -> Array:
         """(3,) N, LPS, on the socket."""
         force = self.proximal * directions.proximal + self.anterior * directions.anterior

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
 from ..errors import SurfaceError
-from .rays import Profile, radii, smooth
+from .rays import LimbProfile, radii, smooth
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class Offsets:
     radial : (k, angles) mm, positive outwards, at the limb's stations and angles.
     """
 
-    limb: Profile
+    limb: LimbProfile
     radial: Array
 
     def moves(self, points: Array) -> Array:
@@ -37,7 +37,7 @@ class Offsets:
         return np.asarray(size[:, None] * self.limb.rays.direction(angle, station))
 
 
-def offsets(limb: Profile, before: Surface, after: Surface, frame: Frame) -> Offsets:
+def offsets(limb: LimbProfile, before: Surface, after: Surface, frame: Frame) -> Offsets:
     """By how much a limb's outer surface (LPS mm) moves along each ray of the limb.
 
     Both surfaces have the same triangles, open at the proximal cut, so that their facets cancel.

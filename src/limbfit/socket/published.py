@@ -14,7 +14,7 @@ WHOLE = "the limb"
 
 
 @dataclass(frozen=True)
-class Finding:
+class PublishedFinding:
     """What was found over some regions, how, and by whom."""
 
     regions: tuple[str, ...]
@@ -25,38 +25,38 @@ class Finding:
 
 SANDERS_1997 = "Sanders et al., J Rehabil Res Dev 1997, 34:19"
 FINDINGS = (
-    Finding(
+    PublishedFinding(
         ("tibial crest", "distal tibia", "anterior middle", "anterior distal"),
         "the largest pressure and shear of stance, in its first half",
         "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
         SANDERS_1997,
     ),
-    Finding(
+    PublishedFinding(
         ("medial proximal", "lateral proximal"),
         "in front of them, the largest pressure in the second half of stance",
         "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
         SANDERS_1997,
     ),
-    Finding(
+    PublishedFinding(
         ("patellar tendon",),
         "the load grows where the limb shrinks, as at the distal end",
         "measured monthly at 13 sites, walking, 2 persons who lost weight",
         "Sanders et al., Prosthet Orthot Int 2002, 26:243",
     ),
-    Finding(
+    PublishedFinding(
         ("patellar tendon",),
         "a bar moved by 10 mm either way changed pressures elsewhere by nothing significant",
         "measured, 10 men, patellar-tendon-bearing sockets",
         "Abu Osman et al., Med Eng Phys 2010, 32:760",
     ),
-    Finding(
+    PublishedFinding(
         ("distal fibula",),
         "pressure concentrates there and near the brim with patellar-tendon bearing; it is lower and more "
         "even in a hydrostatic socket",
         "simulated by finite elements",
         "Moo et al., Acta Bioeng Biomech 2009, 11(4)",
     ),
-    Finding(
+    PublishedFinding(
         (WHOLE,),
         "pressures are distributed alike in pressure-cast and in hand-cast patellar-tendon-bearing sockets, "
         "and higher in the former",

@@ -89,7 +89,7 @@ class Rays:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class LimbProfile:
     """Radii of a closed limb surface on its rays.
 
     Attributes
@@ -124,7 +124,7 @@ class Profile:
         return value
 
 
-def profile(outer: Surface, frame: Frame) -> Profile:
+def profile(outer: Surface, frame: Frame) -> LimbProfile:
     """The radii of a limb's closed outer surface (LPS mm) in its frame.
 
     Raises
@@ -147,7 +147,7 @@ def profile(outer: Surface, frame: Frame) -> Profile:
             remedy="close the surface, or move the proximal cut nearer to the knee",
         )
     radius = smooth(radius, stations, float(np.median(radius)), SMOOTH_MM)
-    return Profile(rays, stations, angles, radius, folds)
+    return LimbProfile(rays, stations, angles, radius, folds)
 
 
 def _words(point: Array) -> str:

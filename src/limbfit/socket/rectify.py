@@ -15,7 +15,7 @@ from ..errors import SurfaceError
 from .areas import Area, Zone
 from .clearance import cleared
 from .offsets import Offsets
-from .rays import FOLD_MM, Profile, profile
+from .rays import FOLD_MM, LimbProfile, profile
 from .rings import spaced, stitched
 from .shape import Socket
 from .trim import Trim, Trimmed, trimmed
@@ -121,7 +121,7 @@ def reduced_to(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) 
     return face, reductions[len(roots) - 1]
 
 
-def _refuse_folds(limb: Profile, lines: Trimmed, frame: Frame) -> None:
+def _refuse_folds(limb: LimbProfile, lines: Trimmed, frame: Frame) -> None:
     inside = limb.stations[:, None] <= lines.brim_station[None, :]
     folds = np.where(inside, limb.folds, 0.0)
     if folds.max() > FOLD_MM:
@@ -172,7 +172,7 @@ def _carried(dense: Array, values: Array, shares: Array) -> Array:
     return np.column_stack([np.interp(shares, length, column) for column in around.T])
 
 
-def _shaped(drawn: Drawn, limb: Profile, frame: Frame, recipe: Recipe) -> Array:
+def _shaped(drawn: Drawn, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
     """The drawn points (limb frame), rectified; distances add up along the limb's own normals."""
     points = drawn.points
     normals = -Surface(points, drawn.faces).vertex_normals
@@ -189,7 +189,7 @@ def _shaped(drawn: Drawn, limb: Profile, frame: Frame, recipe: Recipe) -> Array:
     return points + moves + _flared(drawn, normals, recipe.flare_mm)
 
 
-def _distal(z: Array, limb: Profile, recipe: Recipe) -> Array:
+def _distal(z: Array, limb: LimbProfile, recipe: Recipe) -> Array:
     """(n,) share of the distal clearance at heights: 1 at the pole, 0 from the end's height on, smooth."""
     height = DISTAL_SHARE * limb.rays.end_radius
     if recipe.distal_clearance_mm > STEEPEST * height / 1.875:

@@ -27,18 +27,15 @@ FAR_MM = 20.0  # a stated position so far off the skin is a mistake
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
+class SkinRegion:
     """A part of the skin: its middle on the skin (LPS mm) and the skin's faces that belong to it (m,)."""
 
     name: str
     position: Array
     faces: Mask
 
-    def area_mm2(self, skin: Surface) -> float:
-        return float(skin.face_areas[self.faces].sum())
 
-
-def default_regions(anatomy: Anatomy, known: Directions, below: float | None = None) -> dict[str, Region]:
+def default_regions(anatomy: Anatomy, known: Directions, below: float | None = None) -> dict[str, SkinRegion]:
     """The regions of a limb by name, where nothing is stated.
 
     Four sides in three levels between ``below`` and the distal end; over the bones that have these names, the
@@ -59,11 +56,11 @@ def default_regions(anatomy: Anatomy, known: Directions, below: float | None = N
         if mask.any():
             centre = np.average(middles[mask], axis=0, weights=skin.face_areas[mask])
             nearest = np.flatnonzero(mask)[np.linalg.norm(middles[mask] - centre, axis=1).argmin()]
-            regions[name] = Region(name, middles[nearest], mask)
+            regions[name] = SkinRegion(name, middles[nearest], mask)
     return regions
 
 
-def stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> Region:
+def stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> SkinRegion:
     """The round region of a name: faces of the skin within a radius that look the way of the middle.
 
     Raises
@@ -78,7 +75,7 @@ def stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float
             f"region {name!r} lies {np.sqrt(squared[0]):.0f} mm off the skin",
             remedy="give a position on the skin (LPS, mm)",
         )
-    return Region(name, foot[0], _disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
+    return SkinRegion(name, foot[0], _disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
 
 
 def _disc(skin: Surface, middle: Array, radius_mm: float, outward: Array) -> Mask:

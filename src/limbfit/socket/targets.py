@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..errors import SurfaceError
 from .areas import Zone
-from .regions import Region
+from .regions import SkinRegion
 from .shape import Socket
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ class Target:
     pressure_kPa: float
     regions: Mapping[str, float] = field(default_factory=dict)
 
-    def at(self, points: Array, anatomy: Anatomy, regions: Mapping[str, Region], socket: Socket) -> Array:
+    def at(self, points: Array, anatomy: Anatomy, regions: Mapping[str, SkinRegion], socket: Socket) -> Array:
         """Pressure (n,) kPa at points (n, 3) of the limb's outer surface, LPS mm; 0 beyond the brim.
 
         Parameters
@@ -91,7 +91,7 @@ class Target:
         return found * _under(points, socket)
 
 
-def zone(name: str, anatomy: Anatomy, regions: Mapping[str, Region], depth_mm: float) -> Zone:
+def zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_mm: float) -> Zone:
     """A region of the limb as what is pressed into a face by a depth, or relieved.
 
     Raises

@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 
 from ..anatomy.frame import Frame
 from ..errors import SurfaceError
-from .rays import Profile
+from .rays import LimbProfile
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class _Line:
         return PchipInterpolator(turns, np.tile(self.heights, 3))
 
 
-def trimmed(limb: Profile, frame: Frame, trim: Trim) -> Trimmed:
+def trimmed(limb: LimbProfile, frame: Frame, trim: Trim) -> Trimmed:
     """The meridians of a limb up to its trimline.
 
     Raises
@@ -126,7 +126,7 @@ def trimmed(limb: Profile, frame: Frame, trim: Trim) -> Trimmed:
     return Trimmed(points, ways, length, station)
 
 
-def _over(points: Array, angles: Array, limb: Profile, frame: Frame, trim: Trim) -> list[Array]:
+def _over(points: Array, angles: Array, limb: LimbProfile, frame: Frame, trim: Trim) -> list[Array]:
     """How far points (angles, k, 3) lie over each part of the trimline, mm."""
     found = []
     for point, normal in trim.planes:
@@ -142,7 +142,7 @@ def _over(points: Array, angles: Array, limb: Profile, frame: Frame, trim: Trim)
     return found
 
 
-def _line(points: Array, limb: Profile) -> _Line:
+def _line(points: Array, limb: LimbProfile) -> _Line:
     angle, station, radius = limb.rays.coordinates(points)
     off = np.abs(radius - limb.at(angle, station))
     if off.max() > OFF_LIMB_MM:

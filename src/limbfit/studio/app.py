@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from ..errors import InputError, LimbfitError
 from ..web.assets import STATIC as SHARED
 from .folder import StudyFolder
-from .guard import Door, Guard, TooLargeError
+from .guard import Door, GuardMiddleware, TooLargeError
 
 STATIC = Path(__file__).parent / "static"
 # Of every view: the modules beside this one whose names end in _routes.
@@ -42,7 +42,7 @@ def create_app(folder: StudyFolder, door: Door) -> FastAPI:
     app.add_api_route("/", _page, include_in_schema=False)
     app.mount("/static", StaticFiles(directory=STATIC))
     app.mount("/web", StaticFiles(directory=SHARED))
-    app.add_middleware(Guard, door=door)
+    app.add_middleware(GuardMiddleware, door=door)
     return app
 
 

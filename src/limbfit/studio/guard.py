@@ -80,7 +80,7 @@ def is_loopback(host: str) -> bool:
     return host in ("127.0.0.1", "localhost", "::1")
 
 
-class Guard:
+class GuardMiddleware:
     """ASGI middleware that refuses everything that is not the page of this server."""
 
     def __init__(self, app: ASGIApp, door: Door) -> None:

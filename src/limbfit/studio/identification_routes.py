@@ -23,7 +23,7 @@ LOGS_SEARCHED = 5  # for the iterates of a search that was stopped
 _ENDS = {"end": "ended", "failed": "failed", "interrupted": "stopped"}
 
 
-class Wanted(BaseModel):
+class RunRequest(BaseModel):
     """What to run: up to a stage, and stages that are done anew whether they are done or not."""
 
     model_config = ConfigDict(extra="forbid")
@@ -82,7 +82,7 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
 
 
 @router.post("/start")
-def post_start(folder: Folder, wanted: Wanted) -> dict[str, Any]:
+def post_start(folder: Folder, wanted: RunRequest) -> dict[str, Any]:
     """Start or resume: ``limbfit run`` with these options, as a process of its own."""
     return start_run(folder, wanted.until, wanted.start, wanted.force)
 

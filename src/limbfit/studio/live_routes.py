@@ -30,7 +30,7 @@ _WAITING = 1 << 16  # bytes: more than is written between two requests
 _MOST_VERDICT = 1 << 20
 
 
-class Check(BaseModel):
+class StoredCheck(BaseModel):
     """One line of a stored verdict."""
 
     name: str
@@ -39,11 +39,11 @@ class Check(BaseModel):
     remedy: str
 
 
-class Verdict(BaseModel):
+class StoredVerdict(BaseModel):
     """A stored verdict; ``trace`` is the record of the site that came of it, where one did."""
 
     good: bool
-    checks: list[Check]
+    checks: list[StoredCheck]
     trace: str | None = None
 
 
@@ -132,7 +132,7 @@ def _verdict(file: Path) -> dict[str, Any] | None:
     try:
         if file.stat().st_size > _MOST_VERDICT:
             raise ValueError
-        return Verdict.model_validate_json(file.read_bytes()).model_dump()
+        return StoredVerdict.model_validate_json(file.read_bytes()).model_dump()
     except (ValidationError, ValueError):
         raise TraceError("not a verdict of limbfit acquire", file=file) from None
 

@@ -17,11 +17,11 @@ Place = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 Text = Annotated[str, Field(max_length=200)]
 
 
-class _Strict(BaseModel):
+class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class NewSite(_Strict):
+class NewSite(StrictModel):
     """A site that a click places; without a record it is one to be simulated, to ``depth_mm``."""
 
     name: Text
@@ -30,7 +30,7 @@ class NewSite(_Strict):
     depth_mm: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 
 
-class SiteChange(_Strict):
+class SiteChange(StrictModel):
     """What changes of a site; what is not given stays."""
 
     name: Text | None = None

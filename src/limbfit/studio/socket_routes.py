@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import igl
 import numpy as np
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from ..errors import InputError
 from ..mesh import read_vtu
@@ -23,7 +23,7 @@ from ..web.shapes import patient_frame, volume_of
 from .editing import remove_area, set_area
 from .folder import StudyFolder, fingerprint, stored
 from .identification_routes import last_run
-from .model_routes import Place, Text
+from .model_routes import Place, StrictModel, Text
 from .playback import arrays_of
 from .processes import running, start_socket, starting
 from .scene import anatomy_of, on_skin
@@ -36,11 +36,7 @@ _FIELDS = {"pressure": "pressure_kPa", "shear": "shear_kPa"}
 Length = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class AreaOfPage(_Strict):
+class AreaOfPage(StrictModel):
     """An area of the page: at a ``position`` that was clicked, or at the middle of a ``region``."""
 
     name: Text
@@ -50,7 +46,7 @@ class AreaOfPage(_Strict):
     depth_mm: Length
 
 
-class WantedRun(_Strict):
+class WantedRun(StrictModel):
     """Which command to run: that of the socket, or its design."""
 
     design: bool = False

@@ -130,7 +130,7 @@ class Layer(TomlTable):
         return self
 
 
-class Region(TomlTable):
+class RegionTable(TomlTable):
     """A body of its own inside the core, as a tendon or a scar: a label of the map, or a closed surface.
 
     A ``surface`` is in the coordinates and the unit of ``[surfaces]``; beside an image in LPS and mm, unless
@@ -142,7 +142,7 @@ class Region(TomlTable):
     surface: Path | None = None
 
     @model_validator(mode="after")
-    def _one_source(self) -> Region:
+    def _one_source(self) -> RegionTable:
         if (self.label is None) == (self.surface is None):
             raise ValueError("give either label (of the label map) or surface (a file)")
         return self
@@ -157,7 +157,7 @@ class GeometryTable(TomlTable):
     skin_layer_mm: Positive = 3.0
     layers: tuple[Layer, ...] = ()
     core: str = Field(default="muscle", pattern=TISSUE_NAME)
-    regions: tuple[Region, ...] = ()
+    regions: tuple[RegionTable, ...] = ()
     bone_policy: Literal["trim-bone", "thin-skin"] = "trim-bone"
     bone_clearance_mm: Positive = 1.5
     proximal_cut: Plane | None = None

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..phases import Phase, boundaries, find_phases, spread
+from ..phases import MotionPhase, boundaries, find_phases, spread
 from .displacement import broken_line
 from .numerics import Array, rms
 from .record import Trace
@@ -89,7 +89,7 @@ def regularise_creep(
     )
 
 
-def _as_moved(phase: Phase, curve: SmoothCurve) -> Phase:
+def _as_moved(phase: MotionPhase, curve: SmoothCurve) -> MotionPhase:
     """A phase of the force with the displacements at its ends."""
     start, end = curve(np.array([phase.start_s, phase.end_s]))
     return replace(phase, start_mm=float(start), end_mm=float(end))

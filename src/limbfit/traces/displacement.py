@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ..errors import TraceError
-from ..phases import Phase, find_phases, tolerance_mm, way_in
+from ..phases import MotionPhase, find_phases, tolerance_mm, way_in
 from .numerics import Array, bins, noise_level, straight
 
 _MAX_KNOTS = 41
@@ -27,7 +27,7 @@ class BrokenLine:
         return np.interp(at, self.times, self.values)
 
     @cached_property
-    def phases(self) -> tuple[Phase, ...]:
+    def phases(self) -> tuple[MotionPhase, ...]:
         """What the indenter does, from the first sample to the last."""
         return find_phases(self.times, self.values, tolerance=max(tolerance_mm(self.values), self.tolerance))
 

@@ -26,7 +26,7 @@ _LEAST_NOISE = 1e-4  # of the rise
 
 
 @dataclass(frozen=True)
-class Part:
+class OnsetPart:
     """The part of a way in that is looked at, as means of ``samples`` neighbours: (n,) s, mm, N.
 
     ``rise_N`` is how far the force rises on the whole way in.
@@ -53,7 +53,7 @@ class Onset:
     misfit: float
 
 
-def find_onset(part: Part, scatter: Scatter, around: Onset | None = None) -> Onset:
+def find_onset(part: OnsetPart, scatter: Scatter, around: Onset | None = None) -> Onset:
     """The mean place over its likelihood, the noise's correlation known and the shape of the onset not.
 
     Stiffness and baseline are integrated out (both flat, the stiffness by the force at the end of the part),
@@ -71,7 +71,7 @@ def find_onset(part: Part, scatter: Scatter, around: Onset | None = None) -> Ons
     return _weighed(part, whiten, np.linspace(low, high, _PLACES))
 
 
-def _weighed(part: Part, whiten: Array, places: Array) -> Onset:
+def _weighed(part: OnsetPart, whiten: Array, places: Array) -> Onset:
     """Every onset that starts at one of the places (m,), weighed by its likelihood."""
     shapes = _shapes(part, places) @ whiten.T
     one, force = whiten.sum(axis=1), whiten @ part.force_N
@@ -96,7 +96,7 @@ def _weighed(part: Part, whiten: Array, places: Array) -> Onset:
     return Onset(mean, sd, exponent, float((share * baseline).sum()), least / free)
 
 
-def _shapes(part: Part, places: Array) -> Array:
+def _shapes(part: OnsetPart, places: Array) -> Array:
     """Onsets (memories, places, exponents, n) for all memories and exponents, one at the part's end."""
     depth = np.maximum(part.travel_mm - places[:, None, None], 0.0)
     elastic = depth ** EXPONENTS[:, None]

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
-from ..phases import Phase, boundaries, find_phases, spread, way_in
+from ..phases import MotionPhase, boundaries, find_phases, spread, way_in
 from .displacement import broken_line
 from .numerics import Array, bins, rms, straight
 from .record import Trace
@@ -31,7 +31,7 @@ class Regularised:
     force_N: Array
     knots_s: Array
     knots_mm: Array
-    phases: tuple[Phase, ...]
+    phases: tuple[MotionPhase, ...]
     noise_N: float
     noise_mm: float
     curve: SmoothCurve = field(repr=False)
@@ -55,11 +55,6 @@ class Regularised:
     @property
     def depth_mm(self) -> float:
         return float(self.knots_mm.max())
-
-    @property
-    def corners_s(self) -> Array:
-        """Ends of the phases (k,) s."""
-        return boundaries(self.phases)
 
     @property
     def speed_load_mm_s(self) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import TraceError
 from .displacement import BrokenLine, broken_line
 from .numerics import Array, bins
-from .onset import Part, find_onset
+from .onset import OnsetPart, find_onset
 from .record import MIN_SAMPLES, Trace
 from .scatter import Scatter, scatter_of
 
@@ -85,7 +85,7 @@ def _way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
     return trace.time_s[load], line(trace.time_s[load]), trace.force_N[load]
 
 
-def _part(time: Array, travel: Array, force: Array, moving: int, scatter: Scatter) -> Part:
+def _part(time: Array, travel: Array, force: Array, moving: int, scatter: Scatter) -> OnsetPart:
     """The low-force part of a way in, as means."""
     at, smooth, _ = bins(np.arange(len(force), dtype=float), force, 200)
     base = float(np.median(force[: max(moving, len(force) // 50, 1)]))
@@ -100,7 +100,7 @@ def _part(time: Array, travel: Array, force: Array, moving: int, scatter: Scatte
     samples = max(end // _MEANS, 1)
     start = end % samples
     t, u, f = (column[start:end].reshape(-1, samples).mean(axis=1) for column in (time, travel, force))
-    return Part(t, u, f, samples, rise)
+    return OnsetPart(t, u, f, samples, rise)
 
 
 def touch_down_at(trace: Trace, time_s: float) -> TouchDown:

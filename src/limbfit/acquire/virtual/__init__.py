@@ -6,17 +6,17 @@ that such devices plausibly have; it is no model of a particular one.
 
 from .faults import FAULT_KINDS, Fault, read_faults
 from .fitsocket import VirtualFitSocket
-from .limb import Limb
+from .limb import VirtualLimb
 from .server import Serving, serve
 from .surrogate import Surrogate, fit_surrogate
 
 __all__ = [
     "FAULT_KINDS",
     "Fault",
-    "Limb",
     "Serving",
     "Surrogate",
     "VirtualFitSocket",
+    "VirtualLimb",
     "fit_surrogate",
     "read_faults",
     "serve",

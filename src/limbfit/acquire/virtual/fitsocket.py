@@ -21,17 +21,17 @@ from ..messages import (
     Declined,
     Hello,
     Identity,
-    Note,
+    NoteCommand,
     OutOfReach,
     SetLimits,
     Tripped,
     parse_command,
     sample_body,
 )
-from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, Limits
+from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
 from ..wire import HOST_LINE, VERSION, Decoder, Encoder, salt_of
 from .faults import Fault, FaultClock
-from .limb import Limb
+from .limb import VirtualLimb
 from .pins import STROKE_MM, Motors, Sensors
 
 STEP_US = 1000
@@ -59,7 +59,7 @@ class VirtualFitSocket:
     """
 
     def __init__(
-        self, limb: Limb, *, seed: int = 0, faults: tuple[Fault, ...] = (), clock: str = "real"
+        self, limb: VirtualLimb, *, seed: int = 0, faults: tuple[Fault, ...] = (), clock: str = "real"
     ) -> None:
         self.limb, self.clock = limb, clock
         self._random = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ class VirtualFitSocket:
         self.acknowledged_us = 0
         self._begun_us = self._stopped_us = 0
         self._watchdog_us = MOST_WATCHDOG_MS * 1000
-        self._most = Limits(
+        self._most = SafetyLimits(
             (MOST_FORCE_MN,) * PINS, (round(1000 * STROKE_MM),) * PINS, MOST_SPEED_UM_S, 1 << 30, 1 << 30
         )
         self._guard = Guard(self._most)
@@ -174,9 +174,9 @@ class VirtualFitSocket:
         match command:
             case SetLimits():
                 return self._arm(command)
-            case Note(kind="SITE", word=word):
+            case NoteCommand(kind="SITE", word=word):
                 return "" if self.limb.bring(word, self._pin) else "unknown-site"
-            case Note(word=word):
+            case NoteCommand(word=word):
                 self.faults.enter(word)
                 return ""
             case Stop():
@@ -205,7 +205,7 @@ class VirtualFitSocket:
         most = min(limits.position_um, round(1000 * STROKE_MM))
         alike = max(round(FROZEN_S * 1e6 / STEP_US), FROZEN_SAMPLES)
         speed = min(limits.speed_um_s, MOST_SPEED_UM_S)
-        self._guard = Guard(Limits(tuple(force), (most,) * PINS, speed, self.sensors.range_mN, alike))
+        self._guard = Guard(SafetyLimits(tuple(force), (most,) * PINS, speed, self.sensors.range_mN, alike))
         self._watchdog_us = 1000 * min(limits.watchdog_ms, MOST_WATCHDOG_MS)
         self._pin = limits.pin
         self.is_armed = True

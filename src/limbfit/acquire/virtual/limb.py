@@ -21,7 +21,7 @@ _DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
 _ROWS = np.arange(PINS)
 
 
-class Limb:
+class VirtualLimb:
     """Tissue under 14 pins, stepped in time; ``sites`` are what the test pin may meet.
 
     Attributes

@@ -30,7 +30,7 @@ _SAME_LIMB = 0.7  # least correlation of two images of one limb
 
 
 @dataclass(frozen=True)
-class Motion:
+class LimbMotion:
     """A rigid motion of points, LPS mm: ``rotation @ (point - centre) + centre + shift``.
 
     ``correlation`` is that of the grey values that it lays onto each other.
@@ -55,7 +55,7 @@ class Motion:
         return float(np.linalg.norm(self.shift))
 
 
-def limb_motion(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> Motion:
+def limb_motion(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> LimbMotion:
     """The motion that lays the limb of ``moved`` onto that of ``image``.
 
     Parameters
@@ -90,7 +90,7 @@ def limb_motion(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> Motion
             '(image.markers = "same")',
         )
     turn = Rotation.from_rotvec(unknowns[:3] / _ARM_MM).as_matrix()
-    return Motion(turn.T, centre, -turn.T @ unknowns[3:6], correlation)
+    return LimbMotion(turn.T, centre, -turn.T @ unknowns[3:6], correlation)
 
 
 def _sample(image: Volume, limb: NDArray[np.bool_]) -> Array:

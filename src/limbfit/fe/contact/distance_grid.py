@@ -27,7 +27,7 @@ MARGIN = 4  # nodes around the reach that a spline and its coefficients need
 
 
 @dataclass(frozen=True)
-class Grid:
+class DistanceGrid:
     """Nodes at ``low (3,)`` + ``spacing`` (mm) times their indices below ``shape (3,)``."""
 
     low: Array
@@ -35,7 +35,7 @@ class Grid:
     shape: tuple[int, int, int]
 
     @classmethod
-    def around(cls, points: Array, reach: float, spacing: float) -> Grid:
+    def around(cls, points: Array, reach: float, spacing: float) -> DistanceGrid:
         """A grid that holds all that is within ``reach`` mm of points (n, 3)."""
         pad = reach + MARGIN * spacing
         low, high = points.min(axis=0) - pad, points.max(axis=0) + pad
@@ -43,7 +43,7 @@ class Grid:
         return cls(low, spacing, (x, y, z))
 
 
-def coefficients(grid: Grid, points: Array, faces: NDArray[np.int64], reach: float) -> Array:
+def coefficients(grid: DistanceGrid, points: Array, faces: NDArray[np.int64], reach: float) -> Array:
     """(2, x, y, z) of the distance from the wall, positive on the side from which its triangles run
     counter-clockwise, and of the way beyond its brim, mm.
 

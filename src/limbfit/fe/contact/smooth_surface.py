@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from .distance_grid import Grid, coefficients, spline
+from .distance_grid import DistanceGrid, coefficients, spline
 from .wall import Wall, checked
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ class SmoothSurface(Wall):
     clear: Array | None = None
     start: Array | None = None
     end: Array | None = None
-    grid: Grid | None = None
+    grid: DistanceGrid | None = None
     reach: float = 10.0
     fade: float = 4.0
     growth: float = 1.0
@@ -86,7 +86,7 @@ class SmoothSurface(Wall):
             checked(clear, triangles, "the clear shape")
             both = np.concatenate([used, clear[np.unique(triangles)]])
             reach += float(np.linalg.norm(clear - final, axis=1)[np.unique(triangles)].max())
-        grid = Grid.around(both, reach, spacing)
+        grid = DistanceGrid.around(both, reach, spacing)
         end = coefficients(grid, final, triangles, reach)
         if clear is not None:
             start = coefficients(grid, clear, triangles, reach)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..bodies import Bodies
 from ..contact.contact import Touch
 from ..system import Evaluation, System
-from .factor import Factor, Solution
+from .factor import Factor, LinearSolution
 from .springs import SpringChange
 
 Array = NDArray[np.float64]
@@ -77,16 +77,16 @@ def _matched(factor: Factor, at: Evaluation, touch: Touch, closed: Bools, data: 
     return None
 
 
-def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> Solution:
+def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> LinearSolution:
     """Without foresight: the closed points stay closed."""
     return factor.solve(at.tangent, b, _matched(factor, at, touch, touch.closed, at.tangent), tolerance)
 
 
 def _with_contact(
     system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float
-) -> Solution:
+) -> LinearSolution:
     bodies = touching(system)
-    found, closed = Solution(np.zeros_like(b), True, True), touch.closed
+    found, closed = LinearSolution(np.zeros_like(b), True, True), touch.closed
     for _ in range(ROUNDS):
         guess = found.x
         if factor.lasting:
@@ -107,14 +107,14 @@ def _with_contact(
     return found
 
 
-def _of_descent(factor: Factor, data: Array, b: Array, blocks: Array, tolerance: float) -> Solution:
+def _of_descent(factor: Factor, data: Array, b: Array, blocks: Array, tolerance: float) -> LinearSolution:
     """Where an old factor met negative curvature: the solution of a new one, stiffened where need be."""
     factor.factorise(data, blocks)
     if not factor.shifted:
         found = factor.solve(data, b, None, tolerance)
         if found.convex:
             return found
-    return Solution(factor.apply(b), False, False)
+    return LinearSolution(factor.apply(b), False, False)
 
 
 def _closed(touch: Touch, moved: Array) -> Bools:

@@ -43,7 +43,7 @@ FIRST_SHIFT, LARGEST_SHIFT = 0.1, 1e6
 
 
 @dataclass(frozen=True)
-class Solution:
+class LinearSolution:
     """``x (n, r)``; ``converged`` within the limit; ``convex``: no negative curvature was met."""
 
     x: Array
@@ -231,7 +231,7 @@ class Factor:
     def solve(
         self, data: Array, b: Array, springs: SpringChange | None, tolerance: float,
         x: Array | None = None, limit: int | None = None,
-    ) -> Solution:  # fmt: skip
+    ) -> LinearSolution:  # fmt: skip
         """Solve ``A x = b (n, r)`` by conjugate gradients from the guess ``x``.
 
         Parameters
@@ -247,7 +247,7 @@ class Factor:
         p, rz = np.zeros_like(b), np.ones(b.shape[1])
         for _ in range(self.limit if limit is None else limit):
             if (np.linalg.norm(r, axis=0) <= target).all():
-                return Solution(x, True, True)
+                return LinearSolution(x, True, True)
             z = self.precondition(r, springs)
             fresh = np.einsum("ij,ij->j", r, z)
             p = z + fresh / np.where(rz > 0.0, rz, 1.0) * p
@@ -255,18 +255,20 @@ class Factor:
             if (rz < 0.0).any():
                 # Multigrid of a matrix that is not positive definite need not be either; a factor that is
                 # not has too few digits.
-                return Solution(x if x.any() else r, False, self.lasting)
+                return LinearSolution(x if x.any() else r, False, self.lasting)
             Ap = self.product(data, p)
             curvature = np.einsum("ij,ij->j", p, Ap)
             live = rz > 0.0
             if (curvature[live] <= 0.0).any():  # Steihaug 1983: stop at the edge of the convex region
-                return Solution(x if x.any() else z, False, False)
+                return LinearSolution(x if x.any() else z, False, False)
             step = np.where(live, rz / np.where(live, curvature, 1.0), 0.0)
             x += step * p
             r -= step * Ap
-        return Solution(x, bool((np.linalg.norm(r, axis=0) <= target).all()), True)
+        return LinearSolution(x, bool((np.linalg.norm(r, axis=0) <= target).all()), True)
 
-    def solve_anew(self, data: Array, b: Array, blocks: Array | None, tolerance: float, x: Array) -> Solution:
+    def solve_anew(
+        self, data: Array, b: Array, blocks: Array | None, tolerance: float, x: Array
+    ) -> LinearSolution:
         """`solve` with a factor of this very matrix, whose springs are ``blocks (c, 3, 3)``.
 
         Where even that does not converge, single precision is too little for the matrix, and is given up.

@@ -16,7 +16,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from ...phases import Phase
+from ...phases import MotionPhase
 from ..problem import History
 
 Array = NDArray[np.float64]
@@ -87,19 +87,19 @@ def foresee(
     return targets
 
 
-def _count(phase: Phase, times: Array) -> int:
+def _count(phase: MotionPhase, times: Array) -> int:
     """How many of the times lie in a phase, its start left out."""
     little = 1e-9 * phase.end_s
     return int(((times > phase.start_s + little) & (times <= phase.end_s + little)).sum())
 
 
-def _at(history: History, now: float, target: float) -> Phase | None:
+def _at(history: History, now: float, target: float) -> MotionPhase | None:
     """The phase of the step from ``now`` to ``target``."""
     middle = 0.5 * (now + target)
     return next((phase for phase in history.phases if phase.start_s <= middle <= phase.end_s), None)
 
 
-def _end_of_contact(phase: Phase, times: Array, forces: Array) -> float:
+def _end_of_contact(phase: MotionPhase, times: Array, forces: Array) -> float:
     """When the force is foreseen to vanish, s: its rate changes by the factor by which it changed last."""
     recent = np.flatnonzero(times >= phase.start_s * (1.0 - 1e-9))[-3:]
     if len(recent) < 3:

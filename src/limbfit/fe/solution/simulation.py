@@ -54,7 +54,7 @@ STEEP_PRESSURE = 3.0
 LONG_SINCE = 1e9
 
 
-class Simulation:
+class SteppedRun:
     """One run: the system, its materials, and the step that was reached last."""
 
     def __init__(

@@ -18,7 +18,7 @@ from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import System
 from .control import StepControl
-from .simulation import Simulation
+from .simulation import SteppedRun
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def iterate(
     ProblemError
         Before anything is solved, where the problem is impossible as stated.
     """
-    yield from Simulation(problem, steps, sensitivities, warm_start, system).run()
+    yield from SteppedRun(problem, steps, sensitivities, warm_start, system).run()
 
 
 def solve(
@@ -67,7 +67,7 @@ def solve(
         on is no error: the result says ``completed = False`` and why.
     """
     started = time.perf_counter()
-    run = Simulation(problem, steps, sensitivities, warm_start, system)
+    run = SteppedRun(problem, steps, sensitivities, warm_start, system)
     rows: list[Step] = []
     kept: list[State] = []
     deepest_state: State | None = None
@@ -90,7 +90,7 @@ def solve(
 
 def _result(
     problem: Problem,
-    run: Simulation,
+    run: SteppedRun,
     rows: list[Step],
     kept: list[State],
     deepest: State | None,
@@ -131,7 +131,7 @@ def _result(
 
 
 def _doubts(
-    run: Simulation, deepest: State | None, displacement: Array, force: Array, penetration: Array
+    run: SteppedRun, deepest: State | None, displacement: Array, force: Array, penetration: Array
 ) -> tuple[Doubt, ...]:
     """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
     folds: tuple[Doubt, ...] = ()
@@ -147,7 +147,7 @@ def _doubts(
     )
 
 
-def _statistics(run: Simulation, seconds: float, sunk_steps: int) -> dict[str, Any]:
+def _statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dict[str, Any]:
     used = [run.factor, *([run.slopes] if run.slopes is not run.factor else [])]
     parts = dict(run.seconds)
     for factor in used:

@@ -19,7 +19,7 @@ MOST_STEPS = 20_000
 
 
 @dataclass(frozen=True)
-class Phase:
+class ControlPhase:
     """A step of the analysis: ``steps`` of ``size`` s.
 
     With ``most`` (s, or the number of the curve that gives it) FEBio adapts them, not below ``least``;
@@ -38,7 +38,7 @@ class Phase:
         return self.steps * self.size
 
 
-def read_phases(root: Node, curves: Mapping[int, Curve]) -> tuple[Phase, ...]:
+def read_phases(root: Node, curves: Mapping[int, Curve]) -> tuple[ControlPhase, ...]:
     """The analysis steps, in order."""
     steps = root.find("Step")
     if steps is not None and len(steps):
@@ -55,7 +55,7 @@ def read_phases(root: Node, curves: Mapping[int, Curve]) -> tuple[Phase, ...]:
     return phases
 
 
-def _phase(node: Node, curves: Mapping[int, Curve]) -> Phase:
+def _phase(node: Node, curves: Mapping[int, Curve]) -> ControlPhase:
     analysis = node.string("analysis", "STATIC").upper()
     if analysis not in ("STATIC", "STEADY-STATE"):
         raise node.child("analysis").refuse(f"an analysis of type {analysis} is not supported, only STATIC")
@@ -66,13 +66,13 @@ def _phase(node: Node, curves: Mapping[int, Curve]) -> Phase:
     tolerance = 1e-3 if solver is None else solver.number("dtol", 1e-3)
     stepper = node.find("time_stepper")
     if stepper is None:
-        return Phase(int(steps), size, tolerance=tolerance)
+        return ControlPhase(int(steps), size, tolerance=tolerance)
     most = stepper.find("dtmax")
     must = most.attributes.get("lc") if most is not None else None
     if must is not None and not (must.isdecimal() and int(must) in curves):
         assert most is not None
         raise most.refuse(f"there is no load controller {must!r}")
-    return Phase(
+    return ControlPhase(
         int(steps),
         size,
         stepper.number("dtmin", 0.0),
@@ -82,7 +82,7 @@ def _phase(node: Node, curves: Mapping[int, Curve]) -> Phase:
     )
 
 
-def step_times(phases: tuple[Phase, ...], curves: Mapping[int, Curve]) -> Array:
+def step_times(phases: tuple[ControlPhase, ...], curves: Mapping[int, Curve]) -> Array:
     """Times (k,) s of FEBio's steps, as long as each converges within its optimal iterations.
 
     From one step to the next the automatic stepper goes a fifth of the way to its largest step, and

@@ -36,7 +36,7 @@ _VOLUMETRIC = {
 
 
 @dataclass(frozen=True)
-class RigidBody:
+class RigidMaterial:
     """A rigid material: its number in the file, its centre of mass (3,), mm (NaN: to be found), and its
     line."""
 
@@ -47,7 +47,7 @@ class RigidBody:
 
 def read_materials(
     section: Node, used: Container[str]
-) -> tuple[dict[str, Material], dict[str, RigidBody], tuple[str, ...]]:
+) -> tuple[dict[str, Material], dict[str, RigidMaterial], tuple[str, ...]]:
     """Deformable and rigid materials by name, and a note for those that limbfit does not have.
 
     Those are an error where a part is made of one (``used``: their names).
@@ -58,7 +58,7 @@ def read_materials(
         For a law, or a parameter of one, that limbfit does not have.
     """
     soft: dict[str, Material] = {}
-    rigid: dict[str, RigidBody] = {}
+    rigid: dict[str, RigidMaterial] = {}
     numbers, notes = set(), list[str]()
     for node in section:
         name, number = node.attribute("name"), node.identity()
@@ -68,7 +68,7 @@ def read_materials(
         if node.attribute("type") == "rigid body":
             centre = node.find("center_of_mass")
             at = np.array([np.nan] * 3 if centre is None else centre.numbers(3))
-            rigid[name] = RigidBody(number, at, node.line)
+            rigid[name] = RigidMaterial(number, at, node.line)
             continue
         try:
             soft[name] = _law(node)

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ...fe import Material
-from .controls import Phase, read_phases
+from .controls import ControlPhase, read_phases
 from .curves import Curve, read_curves
 from .fibres import read_fibres
 from .geometry import Geometry, Indices, Part, node_set, read_geometry
-from .materials import RigidBody, read_materials
+from .materials import RigidMaterial, read_materials
 from .motions import RigidCondition, amount, body_of, curved, read_conditions
 from .requests import Request, read_requests
 from .rigid import carried_nodes, centre_of_mass
@@ -40,7 +40,7 @@ _CONTACT_ZERO = ("tension", "offset", "node_reloc")
 
 
 @dataclass(frozen=True)
-class Motion:
+class NodeMotion:
     """Displacement ``component`` of nodes: ``factor`` times a load curve (0: held)."""
 
     target: str
@@ -101,14 +101,14 @@ class FebModel:
 
     geometry: Geometry
     materials: Mapping[str, Material]
-    rigid: Mapping[str, RigidBody]
-    motions: tuple[Motion, ...]
+    rigid: Mapping[str, RigidMaterial]
+    motions: tuple[NodeMotion, ...]
     conditions: tuple[RigidCondition, ...]
     carried: Mapping[str, Indices]
     contacts: tuple[Contact, ...]
     pressures: tuple[PressureLoad, ...]
     curves: Mapping[int, Curve]
-    phases: tuple[Phase, ...]
+    phases: tuple[ControlPhase, ...]
     requests: tuple[Request, ...]
     notes: tuple[str, ...]
     fibres: Mapping[str, Array]
@@ -174,7 +174,9 @@ def _model(root: Node) -> FebModel:
     )
 
 
-def _node_motions(section: Node | None, geometry: Geometry, curves: Mapping[int, Curve]) -> Iterator[Motion]:
+def _node_motions(
+    section: Node | None, geometry: Geometry, curves: Mapping[int, Curve]
+) -> Iterator[NodeMotion]:
     for bc in section or ():
         if bc.tag != "bc":
             raise bc.refuse("only <bc> is supported here")
@@ -184,9 +186,9 @@ def _node_motions(section: Node | None, geometry: Geometry, curves: Mapping[int,
             for i, letter in enumerate(COMPONENTS):
                 named = letter in [dof.strip() for dof in bc.string("dofs", "").split(",")]
                 if named or bc.flag(f"{letter}_dof"):
-                    yield Motion(target, nodes, i, 0.0, 0, bc.line)
+                    yield NodeMotion(target, nodes, i, 0.0, 0, bc.line)
         elif kind in ("prescribed displacement", "prescribe"):
-            yield Motion(target, nodes, *_driven(bc, curves), bc.line)
+            yield NodeMotion(target, nodes, *_driven(bc, curves), bc.line)
         elif kind not in _ELSEWHERE:
             raise bc.refuse(f"boundary condition {kind!r} is not supported")
 
@@ -219,7 +221,7 @@ def _pressures(
             yield PressureLoad(name, factor, curve, load.line)
 
 
-def _tied(section: Node | None, rigid: Mapping[str, RigidBody]) -> list[tuple[str, Node]]:
+def _tied(section: Node | None, rigid: Mapping[str, RigidMaterial]) -> list[tuple[str, Node]]:
     """Sets of nodes that are tied to a rigid body: its name, and the condition."""
     return [(body_of(bc, rigid), bc) for bc in section or () if bc.attributes.get("type") == "rigid"]
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ...fe import Motion
-from .controls import Phase, step_times
+from .controls import ControlPhase, step_times
 from .curves import Curve
-from .materials import RigidBody
+from .materials import RigidMaterial
 from .tree import Node
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class RigidCondition:
 
 
 def read_conditions(
-    root: Node, rigid: Mapping[str, RigidBody], curves: Mapping[int, Curve]
+    root: Node, rigid: Mapping[str, RigidMaterial], curves: Mapping[int, Curve]
 ) -> tuple[RigidCondition, ...]:
     """The conditions and loads of rigid bodies, those of single steps among them.
 
@@ -61,7 +61,7 @@ def read_conditions(
 
 
 def _conditions(
-    node: Node, rigid: Mapping[str, RigidBody], curves: Mapping[int, Curve], step: int | None
+    node: Node, rigid: Mapping[str, RigidMaterial], curves: Mapping[int, Curve], step: int | None
 ) -> Iterator[RigidCondition]:
     kind = node.attribute("type")
     if node.tag not in ("rigid_bc", "rigid_constraint", "rigid_load"):
@@ -86,7 +86,7 @@ def _conditions(
     )
 
 
-def body_of(condition: Node, rigid: Mapping[str, RigidBody]) -> str:
+def body_of(condition: Node, rigid: Mapping[str, RigidMaterial]) -> str:
     """The name of the rigid body that a condition is about; it gives its name or its number."""
     names = {str(body.number): name for name, body in rigid.items()}
     name = names.get(condition.string("rb"), condition.string("rb"))
@@ -133,7 +133,7 @@ def rigid_motion(
     name: str,
     conditions: Sequence[RigidCondition],
     curves: Mapping[int, Curve],
-    phases: Sequence[Phase],
+    phases: Sequence[ControlPhase],
 ) -> Motion:
     """What moves the rigid body ``name``: along and about the axes of space, mm, rad, N and N mm.
 

@@ -18,7 +18,7 @@ from .objective import Measured, Simulate, SiteResponse, check_responses, new_do
 from .parameters import Grouping, Space, Unknowns, search_space, two_stages
 from .prediction import error_percent
 from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
-from .trust_region import FIRST_RADIUS, Point, Step, minimise
+from .trust_region import FIRST_RADIUS, Point, SearchStep, minimise
 
 Array = NDArray[np.float64]
 
@@ -221,7 +221,7 @@ class _Run:
                 return point
         raise CalibrationError(f"the simulation of the stored iterate fails now: {self.failure}")
 
-    def _steps(self, space: Space, point: Point, state: SearchState) -> Iterator[Step]:
+    def _steps(self, space: Space, point: Point, state: SearchState) -> Iterator[SearchStep]:
         done = sum(1 for iterate in state.history if iterate.stage == state.stage) - 1
         paper = self.settings.stopping == "paper"
         pointwise = self.settings.objective == "pointwise" and not paper
@@ -238,7 +238,7 @@ class _Run:
             stop=self._paper_rule(space) if paper else self._valley_rule(state),
         )
 
-    def _after(self, state: SearchState, step: Step) -> SearchState:
+    def _after(self, state: SearchState, step: SearchStep) -> SearchState:
         """The state after an accepted step, the stage closed where it was the last."""
         history = state.history
         if tuple(step.point.z.tolist()) != state.z:
@@ -253,7 +253,7 @@ class _Run:
             self.folds,
         )  # fmt: skip
 
-    def _stage_result(self, stage: int, mine: list[Iterate], counted: int, step: Step) -> StageResult:
+    def _stage_result(self, stage: int, mine: list[Iterate], counted: int, step: SearchStep) -> StageResult:
         last = mine[-1]
         reason = step.reason if step.converged or not self.failure else f"{step.reason} ({self.failure})"
         return StageResult(

@@ -57,12 +57,6 @@ class CoarseToFine:
         pairs = zip(self.coarse, self.fine, self.reasons)
         return tuple(None if reason else _difference_percent(c, f) for c, f, reason in pairs)
 
-    @property
-    def differences_N(self) -> tuple[np.ndarray, ...]:
-        """What the fine mesh adds to the force of the coarse one (n,), per site; zero where not corrected."""
-        pairs = zip(self.coarse, self.fine, self.reasons)
-        return tuple((f.force_N - c.force_N) * (not reason) for c, f, reason in pairs)
-
     def __call__(self, responses: Sequence[SiteResponse]) -> list[SiteResponse]:
         """Coarse responses (force and derivatives) anywhere, as the fine meshes would give them."""
         _check_same(responses, self.coarse)

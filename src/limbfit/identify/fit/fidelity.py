@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,9 +86,6 @@ class Corrected:
     calibration: Calibration
     rounds: tuple[Round, ...]
     correction: CoarseToFine | None
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"rounds": [vars(one) for one in self.rounds]}
 
 
 def calibrate_corrected(

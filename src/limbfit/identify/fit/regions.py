@@ -18,7 +18,7 @@ Identify = Callable[[Unknowns], Calibration]
 
 
 @dataclass(frozen=True)
-class Region:
+class RegionRecords:
     """What a region is fitted and judged on.
 
     Parameters
@@ -44,7 +44,9 @@ class RegionFit:
     whole_percent: dict[str, float | None]
 
 
-def fit_regions(regions: Mapping[str, Region], unknowns: Unknowns, whole: Array) -> dict[str, RegionFit]:
+def fit_regions(
+    regions: Mapping[str, RegionRecords], unknowns: Unknowns, whole: Array
+) -> dict[str, RegionFit]:
     """Parameters of each region, started from those of the whole limb.
 
     Parameters
@@ -56,7 +58,7 @@ def fit_regions(regions: Mapping[str, Region], unknowns: Unknowns, whole: Array)
     return {name: _fit(region, start, whole) for name, region in regions.items()}
 
 
-def _fit(region: Region, start: Unknowns, whole: Array) -> RegionFit:
+def _fit(region: RegionRecords, start: Unknowns, whole: Array) -> RegionFit:
     before = errors(region.simulate, whole, region.measured)
     found = region.identify(start)
     return RegionFit(found, errors(region.simulate, found.parameters, region.measured), before)

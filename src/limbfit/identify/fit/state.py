@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,32 +80,6 @@ class SearchState:
     stages: tuple[StageResult, ...] = ()
     folds: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> SearchState:
-        """The state of :meth:`to_dict`, also after a trip through JSON."""
-        return cls(
-            stage=int(content["stage"]),
-            z=tuple(content["z"]),
-            radius=float(content["radius"]),
-            evaluations=int(content["evaluations"]),
-            history=tuple(_iterate(entry) for entry in content["history"]),
-            stages=tuple(_stage_result(entry) for entry in content["stages"]),
-            folds=int(content["folds"]),
-        )
-
-
-def _iterate(entry: dict[str, Any]) -> Iterate:
-    tuples = {key: tuple(entry[key]) for key in ("parameters", "errors_percent")}
-    return Iterate(**{**entry, **tuples})
-
-
-def _stage_result(entry: dict[str, Any]) -> StageResult:
-    tuples = {key: tuple(entry[key]) for key in ("grouping", "parameters")}
-    return StageResult(**{**entry, **tuples})
-
 
 @dataclass(frozen=True)
 class Calibration:
@@ -135,17 +109,3 @@ class Calibration:
     @property
     def cost(self) -> float:
         return self.stages[-1].cost
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-like values, without the responses."""
-        return {
-            "parameters": dict(zip(self.names, self.parameters.tolist())),
-            "errors_percent": dict(zip(self.sites, self.history[-1].errors_percent)),
-            "cost": self.cost,
-            "converged": self.converged,
-            "reason": self.reason,
-            "evaluations": self.evaluations,
-            "settings": asdict(self.settings),
-            "stages": [asdict(stage) for stage in self.stages],
-            "history": [asdict(iterate) for iterate in self.history],
-        }

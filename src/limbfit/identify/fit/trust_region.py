@@ -47,7 +47,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Step:
+class SearchStep:
     """An accepted point and the radius to go on with; ``reason`` is set on the last, with ``converged``."""
 
     point: Point
@@ -71,7 +71,7 @@ def minimise(
     radius: float = FIRST_RADIUS,
     max_iterations: int = 25,
     stop: Stop | None = None,
-) -> Iterator[Step]:
+) -> Iterator[SearchStep]:
     """Yield the accepted points from ``point`` on; the last one carries the reason for the end.
 
     Parameters
@@ -90,7 +90,7 @@ def minimise(
     while True:
         reason = _converged(point, lower, upper, tolerance, change)
         if reason:
-            yield Step(point, radius, reason, converged=True)
+            yield SearchStep(point, radius, reason, converged=True)
             return
         step = _bounded_step(point, np.maximum(lower - point.z, -radius), np.minimum(upper - point.z, radius))
         hopeless = _predicted(point, step) < _FLOOR * point.cost and not np.any(np.abs(step) > 0.99 * radius)
@@ -102,12 +102,12 @@ def minimise(
             refused = refused + 1 if trial is not None else 0
             rough = refused >= _MAX_REFUSED and _predicted(point, step) < _ROUGH * point.cost
             if trial is not None and (hopeless or rough):
-                yield Step(point, radius, AT_THE_FLOOR, converged=True)
+                yield SearchStep(point, radius, AT_THE_FLOOR, converged=True)
                 return
             rejected += 1
             if rejected >= _MAX_REJECTED or radius < 1e-3 * tolerance:
                 why = "the simulations fail" if trial is None else "no smaller step lowers the error"
-                yield Step(point, radius, f"stuck: {why} around this point")
+                yield SearchStep(point, radius, f"stuck: {why} around this point")
                 return
             continue
         previous, point, rejected, refused, accepted = point, trial, 0, 0, accepted + 1
@@ -117,9 +117,9 @@ def minimise(
         if hopeless and previous.cost - point.cost < tolerance * previous.cost:
             reason = reason or AT_THE_FLOOR
         if reason or accepted >= max_iterations:
-            yield Step(point, radius, reason or "the limit of iterations is reached", bool(reason))
+            yield SearchStep(point, radius, reason or "the limit of iterations is reached", bool(reason))
             return
-        yield Step(point, radius)
+        yield SearchStep(point, radius)
 
 
 def _bounded_step(point: Point, lower: Array, upper: Array) -> Array:

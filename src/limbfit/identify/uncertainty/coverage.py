@@ -13,7 +13,7 @@ from ..fit.calibration import calibrate
 from ..fit.objective import Measured
 from ..fit.parameters import Unknowns, search_space, separate
 from ..fit.state import CalibrationSettings
-from .intervals import Kept, restated, sampled_uncertainty
+from .intervals import KeptRuns, restated, sampled_uncertainty
 from .likelihood import Likelihood, StandIn
 from .noise import SiteNoise
 from .posterior import Posterior, sample_posterior
@@ -100,13 +100,13 @@ def coverage_study(
         measured, noise = record(repeat, clean)
         off_truth = np.random.default_rng(repeat).normal(0.0, _START_SD, truth.size)
         start = unknowns.from_start(truth * np.exp(off_truth))
-        kept = Kept()
+        kept = KeptRuns()
         found = calibrate(kept.of(simulate), measured, start, settings, stages=stages)
         u = estimate_uncertainty(
             found.parameters, found.responses, measured, unknowns, noise, settings=settings
         )
         linear.append(_judged(u, truth))
-        asked = Kept()
+        asked = KeptRuns()
         ours = sampled_uncertainty(u, measured, unknowns, space, kept, asked.of(simulate))
         stated.append(_judged(ours, truth))
         further.append(len(asked.points) * len(measured))

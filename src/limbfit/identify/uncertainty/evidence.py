@@ -19,7 +19,7 @@ _CLEAR, _STRONG = 2.0, 10.0  # differences of criteria (Burnham and Anderson 200
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Rival:
     """A model's fit: ``parameters`` counts the free ones and the size of the misfit.
 
     ``aic`` is corrected for few samples (Hurvich and Tsai 1989); both use the effective number of samples.
@@ -42,8 +42,8 @@ class Evidence:
     error and the probability of so large a one by chance (paired t-test); empty without held-out sites.
     """
 
-    first: Candidate
-    second: Candidate
+    first: Rival
+    second: Rival
     heldout: dict[str, float]
     better: str
     verdict: str
@@ -52,7 +52,7 @@ class Evidence:
         return asdict(self)
 
 
-def candidate(name: str, likelihood: Likelihood, start: Array) -> tuple[Candidate, Optimum]:
+def candidate(name: str, likelihood: Likelihood, start: Array) -> tuple[Rival, Optimum]:
     """The best fit in the likelihood's space from ``start`` (k,), size of the misfit included."""
     at = likelihood.optimum(start)
     factor = 1.0
@@ -69,14 +69,14 @@ def candidate(name: str, likelihood: Likelihood, start: Array) -> tuple[Candidat
     correction = 2 * k * (k + 1) / max(n - k - 1, 1.0)
     value = at.minus_2_log
     return (
-        Candidate(name, k, value, n, factor, value + 2 * k + correction, value + k * float(np.log(n))),
+        Rival(name, k, value, n, factor, value + 2 * k + correction, value + k * float(np.log(n))),
         at,
     )
 
 
 def compare(
-    first: Candidate,
-    second: Candidate,
+    first: Rival,
+    second: Rival,
     errors_first: Sequence[float] = (),
     errors_second: Sequence[float] = (),
 ) -> Evidence:
@@ -110,7 +110,7 @@ def _paired(one: Array, two: Array) -> dict[str, float]:
 
 
 def _words(
-    first: Candidate, second: Candidate, fitted: int, unseen: int, size: float, heldout: dict[str, float]
+    first: Rival, second: Rival, fitted: int, unseen: int, size: float, heldout: dict[str, float]
 ) -> tuple[str, str]:
     names = {1: second.name, -1: first.name}
     if fitted:

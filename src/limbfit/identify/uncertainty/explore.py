@@ -47,7 +47,7 @@ class ExploreSettings:
 
 
 @dataclass(frozen=True)
-class Round:
+class ExploreRound:
     """The emulator after a round: its runs, and its stated error (sites,) over the posterior in percent.
 
     ``new_percent`` (sites,) is its error at the round's runs before it knew them; empty in the first.
@@ -74,7 +74,7 @@ class Explored:
     posterior: Posterior
     profiles: tuple[Profile, ...]
     checks: tuple[EndCheck, ...]
-    rounds: tuple[Round, ...]
+    rounds: tuple[ExploreRound, ...]
     needed_percent: tuple[float, ...]
     good_enough: bool
     runs: tuple[Sequence[SiteResponse], ...] = field(repr=False)
@@ -129,7 +129,7 @@ class _Exploration:
         self.points: list[Array] = []
         self.responses: list[Sequence[SiteResponse]] = []
         self.spent = 0
-        self.rounds: list[Round] = []
+        self.rounds: list[ExploreRound] = []
         self.new_percent: tuple[float, ...] = ()
         model = known.residual_model
         # Recorded noise, or where the model is wrong by more than that, a third of by how much.
@@ -196,7 +196,9 @@ class _Exploration:
         error = np.quantile(stated, _QUANTILE, axis=0)
         outside = 1 - float(np.mean([self.emulator.inside(p) for p in draws]))
         loo = np.median(self.emulator.loo_percent, axis=0)
-        self.rounds.append(Round(len(self.points), _tuple(error), _tuple(loo), self.new_percent, outside))
+        self.rounds.append(
+            ExploreRound(len(self.points), _tuple(error), _tuple(loo), self.new_percent, outside)
+        )
         self.good_enough = bool(np.all(error <= self.needed) and outside < 0.05)
         self.tell(f"{len(self.points)} runs: emulator within {error.max():.2f} % of the largest force")
         return self.good_enough or self.spent >= self.settings.runs

@@ -35,7 +35,7 @@ _SAME = 1e-6  # in logarithms: the same point
 
 
 @dataclass
-class Kept:
+class KeptRuns:
     """Complete simulations of all sites: ``points`` (p,) and the ``responses`` there."""
 
     points: list[Array] = field(default_factory=list)
@@ -60,7 +60,7 @@ class Kept:
 
         return keeping
 
-    def near(self, measured: Sequence[Measured]) -> Kept:
+    def near(self, measured: Sequence[Measured]) -> KeptRuns:
         """Those whose forces came near the records, the nearest first."""
         errors = [
             float(np.mean([error_percent(r.force_N, site.force_N) for r, site in zip(run, measured)]))
@@ -68,7 +68,7 @@ class Kept:
         ]
         order = [i for i in np.argsort(errors) if errors[i] <= _NEAR * min(errors) + _NEAR_PERCENT]
         chosen = order[:_MOST_RUNS]
-        return Kept([self.points[i] for i in chosen], [self.responses[i] for i in chosen])
+        return KeptRuns([self.points[i] for i in chosen], [self.responses[i] for i in chosen])
 
 
 def further_evaluations(records: int, spent: int) -> int:
@@ -84,7 +84,7 @@ def sampled_uncertainty(
     measured: Sequence[Measured],
     unknowns: Unknowns,
     space: Space,
-    kept: Kept,
+    kept: KeptRuns,
     simulate: Simulate,
     evaluations: int = _MOST_EVALUATIONS,
     seed: int = 0,
@@ -120,7 +120,7 @@ def sampled_uncertainty(
     return both_readings(known, _sample(likelihood(), runs, seed, last=True), unknowns, space)
 
 
-def _sample(likelihood: Likelihood, runs: Kept, seed: int, last: bool = False) -> Posterior:
+def _sample(likelihood: Likelihood, runs: KeptRuns, seed: int, last: bool = False) -> Posterior:
     """From the most probable run on; where weighed draws miss much of the last sample, by a longer walk."""
     z = np.array([likelihood.space.reduce(np.log(point)) for point in runs.points])
     best = z[int(np.argmin(likelihood.minus_2_log(z)))]
@@ -140,7 +140,7 @@ def _most_probable(likelihood: Likelihood, posterior: Posterior) -> Array:
     return likelihood.space.expand(candidates[int(np.argmin(likelihood.minus_2_log(candidates)))])
 
 
-def _learn(runs: Kept, simulate: Simulate, point: Array) -> None:
+def _learn(runs: KeptRuns, simulate: Simulate, point: Array) -> None:
     """Simulate at a point, in six digits so that a run taken up again asks for the very same; once more
     half-way to the best that completed where that fails."""
     point = np.array([float(f"{value:.6g}") for value in point])

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,33 +88,6 @@ class Uncertainty:
     @property
     def sd_log(self) -> Array:
         return np.sqrt(np.diag(self.covariance))
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-like values."""
-        model = self.residual_model
-        return {
-            "method": self.method,
-            "centre": dict(zip(self.names, self.centre.tolist())),
-            "intervals_95": dict(zip(self.names, self.intervals_95.tolist())),
-            "sd_log": dict(zip(self.names, self.sd_log.tolist())),
-            "verdicts": dict(zip(self.names, self.verdicts)),
-            "at_bound": dict(zip(self.names, self.at_bound)),
-            "correlation": self.correlation.tolist(),
-            "covariance_log": self.covariance.tolist(),
-            "sampling_covariance_log": self.sampling_covariance.tolist(),
-            "combinations": [
-                {
-                    "text": c.text,
-                    "weights": c.weights.tolist(),
-                    "sd_log": c.sd_log,
-                    "factor_95": c.factor_95,
-                    "verdict": c.verdict,
-                }
-                for c in self.combinations
-            ],
-            "degrees_of_freedom": dict(zip(self.names, self.degrees_of_freedom.tolist())),
-            "residuals": model.to_dict(),
-        }
 
 
 def estimate_uncertainty(

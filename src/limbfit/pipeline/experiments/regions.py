@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...errors import InputError, StudyError
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...identify.fit.regions import Region, RegionFit, fit_regions, mean_percent
+from ...identify.fit.regions import RegionFit, RegionRecords, fit_regions, mean_percent
 from ...identify.fit.state import Calibration
 from ...study import Site
 from ..shared.context import Context
@@ -93,7 +93,9 @@ def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
     return words + ([f"sites without a region: {', '.join(without)}"] if without else [])
 
 
-def _region(context: Context, cache: SimulationCache, laboratory: Laboratory, mine: Sequence[Site]) -> Region:
+def _region(
+    context: Context, cache: SimulationCache, laboratory: Laboratory, mine: Sequence[Site]
+) -> RegionRecords:
     records = [site_record(context, record) for record in context.study.records_at(*mine)]
     stage = groupings(context.study)[-1:]
 
@@ -103,7 +105,7 @@ def _region(context: Context, cache: SimulationCache, laboratory: Laboratory, mi
     def simulate(parameters: Array) -> list[SiteResponse]:
         return _forces(context, cache, records, parameters)
 
-    return Region(identify, simulate, tuple(record.measured for record in records))
+    return RegionRecords(identify, simulate, tuple(record.measured for record in records))
 
 
 def _forces(

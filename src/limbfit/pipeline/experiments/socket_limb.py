@@ -15,7 +15,7 @@ from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.liner import under_liner
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
-from ...donning import SETTLING, Donned, Fit, Held, Load, Patch, Row, don, socket_problem
+from ...donning import SETTLING, Donned, Held, Load, Patch, SocketFit, SocketStep, don, socket_problem
 from ...donning.model import OUTER
 from ...errors import InputError, RunError
 from ...fe import Doubt
@@ -25,7 +25,7 @@ from ...laws import FIBRED
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
-from ...socket.regions import Region
+from ...socket.regions import SkinRegion
 from ...study import Study
 from ..shared.context import Context
 from ..shared.simulations import fibres_of
@@ -59,7 +59,7 @@ class SocketLimb:
     anatomy: Anatomy
     outer: Anatomy
     depth: Array | None
-    regions: Mapping[str, Region]
+    regions: Mapping[str, SkinRegion]
     fibres: tuple[tuple[str, Direction], ...]
 
     @classmethod
@@ -112,7 +112,7 @@ class SocketLimb:
             flatness=FLATNESS,
         )
 
-    def fit(self, socket: Socket) -> Fit:
+    def fit(self, socket: Socket) -> SocketFit:
         """How a socket comes on this limb, and its loads."""
         table, known = self.study.socket, directions(self.anatomy, self.study.socket.side)
         knee = knee_centre(self.anatomy)
@@ -121,7 +121,7 @@ class SocketLimb:
             force, moment, point = load_of(self.study, load, self.anatomy)
             loads.append(Load(load.name, force, moment, point, load.duration_s, load.hold_s))
         depth = float(np.ptp(socket.points @ known.proximal))
-        return Fit(
+        return SocketFit(
             pivot=self.anatomy.cut_point if knee is None else knee,
             proximal=known.proximal,
             anterior=known.anterior,
@@ -163,7 +163,7 @@ class SocketLimb:
         fit = self.fit(socket)
         end = fit.ends[-1][2]
 
-        def on_row(row: Row) -> None:
+        def on_row(row: SocketStep) -> None:
             force = float(np.linalg.norm(row.force))
             words = f"{row.time:.2f} of {end:g} s: {force:.0f} N, {row.whole.peak_kPa:.0f} kPa at most"
             told(row.time, end, words)
@@ -228,7 +228,7 @@ def warning(doubt: Doubt) -> str:
     )
 
 
-def _stopped(found: Donned, fit: Fit) -> str:
+def _stopped(found: Donned, fit: SocketFit) -> str:
     """Why a simulation did not come to its end, and what may be done about it."""
     last = found.rows[-1] if found.rows else None
     time = 0.0 if last is None else last.time
@@ -278,7 +278,7 @@ def _inside(mesh: Mesh, one: Held, faces: Mapping[str, Mask]) -> list[dict[str, 
     return rows
 
 
-def _step(row: Row, fit: Fit) -> dict[str, Any]:
+def _step(row: SocketStep, fit: SocketFit) -> dict[str, Any]:
     return {
         "time_s": row.time,
         "force_N": fit.frame.T @ row.force,

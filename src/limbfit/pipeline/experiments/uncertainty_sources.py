@@ -34,11 +34,11 @@ Array = NDArray[np.float64]
 
 FINER = 0.75  # edges of the finer mesh, where the study has no coarse one to compare with
 MORE_STEPS = 2
-Vary = Callable[..., "Variant"]
+Vary = Callable[..., "SourceVariant"]
 
 
 @dataclass(frozen=True)
-class Variant:
+class SourceVariant:
     """A changed model of every fitted site: ``jobs``, beside the jobs of what they are compared with.
 
     ``shared``: the change is the same at all sites, or each site has its own. ``counted``: it is a spread
@@ -63,21 +63,23 @@ class Variant:
 class Change:
     """What a variant does: change of force (n,) N at every fitted site; zero at those that ``failed``."""
 
-    variant: Variant
+    variant: SourceVariant
     force_N: tuple[Array, ...]
     failed: tuple[str, ...]
 
 
 def variants(
     context: Context, folder: Path, records: Sequence[SiteRecord], parameters: Array
-) -> list[Variant]:
+) -> list[SourceVariant]:
     """All variants of the study, their meshes made; ``records`` are those whose meshes are searched on."""
     table = context.study.uncertainty
     plain = tuple(record.job(parameters, sensitivities=False) for record in records)
 
-    def vary(source: str, change: str, models: Sequence[SiteModel], shared: bool, counted: bool) -> Variant:
+    def vary(
+        source: str, change: str, models: Sequence[SiteModel], shared: bool, counted: bool
+    ) -> SourceVariant:
         jobs = tuple(replace(job, model=model) for job, model in zip(plain, models, strict=True))
-        return Variant(source, change, jobs, plain, shared, counted)
+        return SourceVariant(source, change, jobs, plain, shared, counted)
 
     models = [record.model for record in records]
     found = [
@@ -100,7 +102,7 @@ def variants(
     return found
 
 
-def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[Variant]:
+def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[SourceVariant]:
     """Edge radius, friction and bulk modulus; the last two are alternatives, no spreads."""
     radius = study.uncertainty.edge_radius_mm
     found = []
@@ -193,7 +195,7 @@ def _of_mesh(
     records: Sequence[SiteRecord],
     plain: tuple[SimulationJob, ...],
     parameters: Array,
-) -> Variant:
+) -> SourceVariant:
     """How far forces are from those of an infinitely fine mesh, from two."""
     study = context.study
     settings = searched_settings(study)
@@ -210,7 +212,7 @@ def _of_mesh(
     change, scale = mesh_share(study)
     # With coarse meshes the residuals' covariance has it already.
     counted = study.mesh.coarse is None
-    return Variant("mesh", change, tuple(jobs), plain, False, counted, scale)
+    return SourceVariant("mesh", change, tuple(jobs), plain, False, counted, scale)
 
 
 def mesh_share(study: Study) -> tuple[str, float]:
@@ -224,7 +226,7 @@ def mesh_share(study: Study) -> tuple[str, float]:
 
 
 def changes(
-    context: Context, cache: SimulationCache, wanted: Sequence[Variant], records: Sequence[SiteRecord]
+    context: Context, cache: SimulationCache, wanted: Sequence[SourceVariant], records: Sequence[SiteRecord]
 ) -> list[Change]:
     """Simulate the variants of the ``records``."""
     jobs = [job for variant in wanted for job in (*variant.jobs, *variant.compared_with)]

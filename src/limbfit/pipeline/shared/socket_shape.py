@@ -17,7 +17,7 @@ from ...socket import Area, Recipe, Socket, read_socket, rectified
 from ...socket.bones import refuse_bones
 from ...socket.landmarks import bone, directions, knee_centre
 from ...socket.loads import STANDARD_LOADS
-from ...socket.regions import Region, default_regions, stated_region
+from ...socket.regions import SkinRegion, default_regions, stated_region
 from ...socket.trim import Trim
 from ...study import Study
 from ...study.socket import SocketAreaTable, SocketLoadTable
@@ -94,7 +94,7 @@ def _top(anatomy: Anatomy) -> float:
     return 0.0 if tibia is None else float(anatomy.height(tibia.points).max())
 
 
-def regions_of(study: Study, anatomy: Anatomy) -> dict[str, Region]:
+def regions_of(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
     """Named regions of the skin: those of any limb, and the study's own, which win."""
     known = directions(anatomy, study.socket.side)
     regions = default_regions(anatomy, known)
@@ -104,7 +104,7 @@ def regions_of(study: Study, anatomy: Anatomy) -> dict[str, Region]:
     return regions
 
 
-def _area(study: Study, area: SocketAreaTable, regions: Mapping[str, Region]) -> Area:
+def _area(study: Study, area: SocketAreaTable, regions: Mapping[str, SkinRegion]) -> Area:
     if area.position is not None:
         return Area(area.name, np.array(area.position), area.radius_mm, area.depth_mm)
     name = area.region or ""

@@ -19,7 +19,7 @@ from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_correcte
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
-from ...identify.uncertainty.intervals import Kept, further_evaluations, sampled_uncertainty
+from ...identify.uncertainty.intervals import KeptRuns, further_evaluations, sampled_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Study
@@ -78,7 +78,7 @@ class Laboratory:
         self.latest: dict[str, Simulation] = {}
         self.penalties: dict[str, float | None] = {}
         self.doubts: list[Doubted] = []
-        self.kept = Kept()
+        self.kept = KeptRuns()
         self._chain: tuple[Array, ...] = ()
         self._starts: dict[bytes, tuple[Array, ...]] = {}
 
@@ -178,7 +178,7 @@ class Laboratory:
             anchored = replace(anchored, mesh_N=lacking)
             spent = self.simulated
         known = linearised(study, self.records, found.parameters, anchored)
-        kept = Kept()
+        kept = KeptRuns()
         for point, run in zip(self.kept.points, self.kept.responses, strict=True):
             kept.add(point, anchored.as_fine(list(run)))
 

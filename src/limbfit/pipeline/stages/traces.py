@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...errors import TraceError
 from ...identify.fit.objective import Measured, SiteResponse
 from ...indentation import Simulation, SimulationJob, SiteModel
-from ...phases import Phase, in_words
+from ...phases import MotionPhase, in_words
 from ...study import Record, Site, Study
 from ...traces import (
     Creep,
@@ -75,7 +75,7 @@ def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dic
     first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
     phases = [phase.later(touch.time_s) for phase in smooth.phases]
     if touch.time_s > first_s:
-        phases.insert(0, Phase("approach", first_s, touch.time_s, first_mm, 0.0))
+        phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
     return [{**asdict(phase), "rate_mm_s": phase.rate_mm_s} for phase in phases]
 
 

@@ -19,7 +19,7 @@ from ...acquire import (
     LineDevice,
     Listener,
     Nobody,
-    Ramp,
+    RecordedRamp,
     Recorder,
     Session,
     Settings,
@@ -31,7 +31,7 @@ from ...acquire import (
     read_recording,
     run_session,
 )
-from ...acquire.virtual import Fault, Limb, Serving, Surrogate, VirtualFitSocket, fit_surrogate, serve
+from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError
 from ...study import AcquireTable, Indentation, Record, Site, Study
 from ..shared.store import Store, disk_errors, write_json
@@ -274,7 +274,7 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
     return {"verdict": verdict, "files": files}
 
 
-def _place_trace(study: Study, trace: Path, ramp: Ramp) -> Path:
+def _place_trace(study: Study, trace: Path, ramp: RecordedRamp) -> Path:
     """The record where the study names it; a former one stays beside it, with the time in its name."""
     file = study.path(trace)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -284,7 +284,7 @@ def _place_trace(study: Study, trace: Path, ramp: Ramp) -> Path:
     return file
 
 
-def _write_ramp(study: Study, file: Path, ramp: Ramp) -> None:
+def _write_ramp(study: Study, file: Path, ramp: RecordedRamp) -> None:
     names, trace = study.traces, ramp.trace
     columns = zip(
         (names.time_s, names.displacement_mm, names.force_N),
@@ -315,7 +315,7 @@ def virtual_fitsocket(
         Where no site has a stored simulation.
     """
     sites = stored_surrogates(study)
-    limb = Limb(sites, np.random.default_rng(seed))
+    limb = VirtualLimb(sites, np.random.default_rng(seed))
     return VirtualFitSocket(limb, seed=seed, faults=faults, clock="paced" if paced else "real")
 
 

@@ -18,7 +18,7 @@ from ...febio import (
     SLACK,
     FaceWise,
     Log,
-    Verdict,
+    RunVerdict,
     contact_of,
     find_febio,
     mean_penalty,
@@ -107,7 +107,7 @@ def _of_log(problem: Problem, log: Log, file: Path) -> Result:
     """A table from elsewhere, complete where it reaches the end of the history."""
     reached, end = float(log.times[-1]), float(problem.history.times[-1])
     reason = "" if reached > end * (1.0 - SLACK) else f"the table ends at {reached:.4g} s of {end:.4g} s"
-    verdict = Verdict("partial" if reason else "normal", reason, reached, "")
+    verdict = RunVerdict("partial" if reason else "normal", reason, reached, "")
     try:
         return result_of_log(problem, log, verdict)
     except ProblemError as error:

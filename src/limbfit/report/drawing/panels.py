@@ -163,7 +163,7 @@ _SIDES = (("L", "R"), ("P", "A"), ("S", "I"))  # towards which an axis of patien
 
 
 @dataclass(frozen=True)
-class Row:
+class PictureRow:
     """Panels side by side under their titles; a colour bar beside them where ``bar`` has limits and title."""
 
     shots: Sequence[Shot]
@@ -181,7 +181,7 @@ class Key:
     filled: bool = True
 
 
-def sheet(title: str, rows: Sequence[Row], keys: Sequence[Key] = (), spare_in: float = 0.0) -> Drawing:
+def sheet(title: str, rows: Sequence[PictureRow], keys: Sequence[Key] = (), spare_in: float = 0.0) -> Drawing:
     """Rows of pictures on one sheet with a title and a legend; every picture has a scale and its sides.
 
     ``spare_in`` inches above the legend are left free.

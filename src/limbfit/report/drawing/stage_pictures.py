@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ...errors import InputError
 from ...mesh import dihedral_angles
 from ..store import Json, Results, load_store
-from .panels import FIELD_MAP, Drawing, Key, Mark, Row, Shot, View, sheet, write_png
+from .panels import FIELD_MAP, Drawing, Key, Mark, PictureRow, Shot, View, sheet, write_png
 from .pictures import (
     BONE,
     MATT,
@@ -70,14 +70,14 @@ def surfaces_sheet(store: Results) -> Drawing:
     plotter = _limb_plotter(store, skin)
     plotter.add_mesh(_cut_plane(store, skin), color=CUT_PLANE, opacity=0.55, lighting=False)
     views = four_sides(store, skin)
-    rows = [Row(_shots(plotter, views), SIDES)]
+    rows = [PictureRow(_shots(plotter, views), SIDES)]
     for thickness, title in _thicknesses(store, skin):
         limits = (0.0, float(min(np.ceil(np.percentile(thickness, 99)), THICKEST_MM)))
         plotter = new_plotter()
         plotter.add_mesh(
             skin.copy(), scalars=thickness, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, **MATT
         )
-        rows.append(Row(_shots(plotter, views), ("",) * 4, (limits, title)))
+        rows.append(PictureRow(_shots(plotter, views), ("",) * 4, (limits, title)))
     regions = [name for name in store.surface_files if name.startswith("region-")]
     keys = [Key("skin", SKIN_SURFACE), Key("bone", BONE), Key("proximal cut", CUT_PLANE)]
     keys += [Key(name.removeprefix("region-"), inner_colour(name)) for name in regions]
@@ -106,7 +106,7 @@ def sites_sheet(store: Results) -> Drawing:
     used = {bool(row.get("fitted")) for row in store.sites}
     if len(used) == 2:
         keys += [Key("fitted", "#555555", True), Key("held out", "#555555", True, filled=False)]
-    return sheet("Sites, with the axis of the indenter", [Row(shots, SIDES)], keys)
+    return sheet("Sites, with the axis of the indenter", [PictureRow(shots, SIDES)], keys)
 
 
 def mesh_sheet(store: Results) -> Drawing:
@@ -132,7 +132,7 @@ def mesh_sheet(store: Results) -> Drawing:
     keys = [Key(name, colour) for name, colour in (colours | {"wall of a bone": BONE}).items()]
     drawing = sheet(
         "Meshes, cut along the limb through the site",
-        [Row(whole, titles), Row(near, [f"{title}, near the indenter" for title in titles])],
+        [PictureRow(whole, titles), PictureRow(near, [f"{title}, near the indenter" for title in titles])],
         keys,
         spare_in=2.2,
     )

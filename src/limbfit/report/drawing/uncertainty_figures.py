@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
-from ..formats import fixed, symbol
+from ..formats import fixed, label
 from ..page import Figure
 from ..store import Json, Results, compared_of
 from .ink import (
@@ -90,10 +90,6 @@ def _draw_pair(
 
 
 def _name_axes(ax: Axes, names: list[str], i: int, j: int) -> None:
-    def short(name: str) -> str:
-        tissue, _, kind = name.rpartition(".")
-        return f"{tissue} {symbol(kind)}"
-
     ax.tick_params(labelsize=5, length=2)
     for axis, wanted in ((ax.xaxis, i == len(names) - 1), (ax.yaxis, j == 0 and i > 0)):
         axis.set_major_formatter(lambda value, _: f"{10**value:.3g}" if wanted else "")  # noqa: B023
@@ -101,9 +97,9 @@ def _name_axes(ax: Axes, names: list[str], i: int, j: int) -> None:
         if not wanted:
             axis.set_tick_params(labelbottom=False, labelleft=False)
     if i == len(names) - 1:
-        ax.set_xlabel(short(names[j]), fontsize=7)
+        ax.set_xlabel(label(names[j]), fontsize=7)
     if j == 0:
-        ax.set_ylabel(short(names[i]), fontsize=7)
+        ax.set_ylabel(label(names[i]), fontsize=7)
 
 
 def _record(row: Json) -> str:

@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 
 from ..drawing.ink import INK, MUTED, ONE_MATERIAL, SIMULATED, STYLE, THIRD, legend_above, panels, svg
-from ..formats import fixed, heading, number, numeric, symbol
+from ..formats import fixed, heading, label, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
 from ..store import Json, Results
 
@@ -68,12 +68,6 @@ def _design_table(content: Json) -> Table:
 def factor(value: float) -> str:
     """Of a 95 % interval, in words where nothing is known."""
     return "open" if value > _WIDEST else f"×/÷ {number(value)}"
-
-
-def label(name: str) -> str:
-    """A parameter's tissue and symbol."""
-    tissue, _, parameter = name.rpartition(".")
-    return f"{tissue} {symbol(parameter)}"
 
 
 def expected_figure(name: str, designs: Sequence[Json], of: str) -> Figure:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from ..formats import fixed, heading, numeric
+from ..formats import fixed, heading, label, numeric
 from ..page import Block, Bullets, Cell, Prose, Row, Section, Table
 from ..store import Json, Results
-from .design import expected_figure, factor, label
+from .design import expected_figure, factor
 
 
 def protocol_section(store: Results, content: Json) -> Section:

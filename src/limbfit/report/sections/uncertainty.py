@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from ..drawing.ink import MUTED, SIMULATED, STYLE, legend_above, panels, svg
 from ..drawing.uncertainty_figures import pairs_figure, prediction_figure, true_values
-from ..formats import fixed, heading, number, numeric, symbol
+from ..formats import fixed, heading, label, number, numeric
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Row, Section, Table
 from ..store import Json, Results
 
@@ -32,12 +32,6 @@ def uncertainty_section(store: Results, content: Json) -> Section:
     )
     found = tuple(block for block in blocks if block is not None)
     return Section("uncertainty", "What the records determine", found)
-
-
-def label(name: str) -> str:
-    """``skin.c_kPa`` as ``skin c``."""
-    tissue, _, kind = name.rpartition(".")
-    return f"{tissue} {symbol(kind)}".strip()
 
 
 def _method(content: Json) -> Prose:

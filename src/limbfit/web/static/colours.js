@@ -9,7 +9,6 @@ const MAP_STOPS = {
     "5a5f6e 61656f 686a71 6f7073 767676 7d7c78 848279 8c8878 938e78 9b9476 a39a74 " +
     "aba072 b4a76f bcae6c c4b468 cdbb63 d5c25e dec958 e7d150 f0d846 f9e03a fee838",
 };
-export const MAP_NAMES = Object.keys(MAP_STOPS);
 
 function stopsOf(name) {
   return MAP_STOPS[name].split(" ").map((hex) => [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16)));
