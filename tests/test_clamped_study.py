@@ -10,8 +10,7 @@ import pytest
 
 from limbfit.errors import ProblemError, StudyError
 from limbfit.execution import SerialExecutor
-from limbfit.indentation import SimulationJob, build_problem, simulate
-from limbfit.mesh import read_vtu
+from limbfit.indentation import SimulationJob, simulate
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import job_digest, planned_model
 from limbfit.pipeline.shared.store import Store
@@ -111,15 +110,15 @@ def test_the_check_says_how_many_hold_the_limb(context, tmp_path):
     assert "\n" not in told
 
 
-def test_pins_that_miss_are_refused_where_the_site_is_built(context):
-    model = planned_model(context, context.study.sites[0])
-    clamps = model.clamps
+def test_pins_that_miss_are_refused_with_the_study_s_file(context):
+    clamps = context.study.clamps
     assert clamps is not None
-    above = replace(model, clamps=clamps.model_copy(update={"levels_mm": (300.0,)}))
-    mesh = read_vtu(model.mesh)
-    values = {tissue: context.study.material.of(tissue, "start") for tissue in context.study.tissues}
-    with pytest.raises(ProblemError, match="clamps: no clamping pin meets the skin"):
-        build_problem(above, mesh, values)
+    above = context.study.model_copy(update={"clamps": clamps.model_copy(update={"levels_mm": (300.0,)})})
+    with pytest.raises(ProblemError) as caught:
+        planned_model(replace(context, study=above), above.sites[0])
+    told = str(caught.value)
+    assert "study.toml: clamps: site 1: no clamping pin meets the skin; give clamps.angles_degrees" in told
+    assert "\n" not in told
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,9 @@ from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
 from ...indentation import Direction, Simulation, SimulationJob, SiteModel, simulate
+from ...mesh import read_vtu
 from ...study import Indentation, Record, Site, Study, Vector
+from .clamping import pins_met
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
@@ -178,20 +180,29 @@ def site_model(
 
     ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
     than ``calibration.search_radius_mm``. ``layers``: tissues whose compression is wanted, too.
+
+    Raises
+    ------
+    ProblemError
+        Where the study's clamps do not meet the limb there.
     """
     study: Study = context.study
     site = one.site if isinstance(one, Record) else one
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
     folder = COARSE if searched and study.mesh.coarse is not None else ""
     mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
-    indenter = study.indenter_of(one)
+    indenter, along = study.indenter_of(one), limb_axis(context)
+    place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    if study.clamps is not None:  # said here, with the study's file, before workers build the site
+        whole = read_vtu(mesh)
+        pins_met(study, one, place, (whole.points, whole.face_sets["skin"]), along)
     return SiteModel(
         name=one.name,
         site=site.name,
         mesh=mesh,
         mesh_digest=file_digest(mesh),
-        position=tuple(placed["position_mm"]),
-        axis=tuple(placed["axis"]),
+        position=place[0],
+        axis=place[1],
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
         knots_N=tuple(knots_N),
@@ -208,7 +219,7 @@ def site_model(
         extensions_digest=extensions_digest(study.extensions),
         layers=tuple(layers),
         clamps=study.clamps,
-        along=limb_axis(context),
+        along=along,
         course=study.material.course,
         prestretch=tuple(sorted(study.material.prestretch.items())),
     )

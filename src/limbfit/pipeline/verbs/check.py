@@ -8,9 +8,9 @@ import numpy as np
 
 from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
-from ...errors import ProblemError
-from ...indentation import clamping_pins, read_indenter
+from ...indentation import read_indenter
 from ...study import ClampsTable, Study
+from ..shared.clamping import pins_met
 from ..shared.context import Listener, Progress, quiet
 from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
 from ..shared.store import Store
@@ -119,17 +119,14 @@ def _clamps_fact(
     if anatomy is None or not placed:
         return f"{said}; they are placed after limbfit run --until sites"
     held = []
+    x, y, z = (float(value) for value in anatomy.cut_normal)
     for site in study.sites:
-        place, table = placed[site.name], study.indenters_at(site)[0]
-        at, axis = tuple(place["position_mm"]), tuple(place["axis"])
-        here = table if table.file is None else table.model_copy(update={"file": study.path(table.file)})
-        skin, tool = anatomy.skin, read_indenter(here, at, axis, site.edge)
-        try:
-            pins = clamping_pins(skin.points, skin.faces, tool, np.asarray(anatomy.cut_normal), clamps)
-        except ProblemError as error:
-            what = f"site {site.name}: {error.what}"
-            raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
-        held.append(f"{len(pins)} at site {site.name}")
+        row, one = placed[site.name], (study.records_at(site) or (site,))[0]
+        place, skin = (
+            (tuple(row["position_mm"]), tuple(row["axis"])),
+            (anatomy.skin.points, anatomy.skin.faces),
+        )
+        held.append(f"{pins_met(study, one, place, skin, (x, y, z))} at site {site.name}")
     return f"{said}; {', '.join(held)} meet the skin"
 
 
