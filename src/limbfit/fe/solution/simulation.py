@@ -30,7 +30,7 @@ from .pace import Pace
 from .schedule import foresee
 from .sensitivity import Explicit, MemoryDerivative
 from .springs import touched
-from .touchdown import TouchDown
+from .touchdown import IndenterStart
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class SteppedRun:
         self.floor, self.pushing = NOTHING * self.laws.modulus * width**2, False
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
         self.deepest = control.penetration * travel(self.system, self.laws.modulus)
-        self.touch = TouchDown.of(problem)
+        self.touch = IndenterStart.of(problem)
         rest, drives = np.zeros((self.system.rows, 3)), self.touch.drives(problem.drives(0.0))
         if self.system.bodies is not None:
             rest = self.system.bodies.impose(rest, drives)

@@ -22,7 +22,7 @@ CLEAR = 3.0  # widths of the indenter that it is off the tissue until it touches
 
 
 @dataclass(frozen=True)
-class TouchDown:
+class IndenterStart:
     """How far the indenter begins beyond where it would touch the tissue at rest.
 
     Parameters
@@ -37,27 +37,27 @@ class TouchDown:
     slope: Array | None = None
 
     @classmethod
-    def of(cls, problem: Problem) -> TouchDown:
+    def of(cls, problem: Problem) -> IndenterStart:
         """That with which a simulation begins."""
         meets = problem.touch_down_s > 0.0 or (problem.prestretch is not None and problem.start == "touching")
         if problem.indenter is None or not meets:
             return cls()
         return cls(True, -CLEAR * problem.indenter.width)
 
-    def after(self, system: System, u: Array, drives: Drives, du: Array | None) -> TouchDown:
+    def after(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
         """It touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
         assert system.bodies is not None
         body = system.bodies.first
         surface = replace(body.surface, points=body.surface.points + u[: system.nodes])
         offset = touching_offset(surface, body.start)
         if du is None:
-            return TouchDown(False, offset)
-        moved = TouchDown(False, offset).drives(drives)
+            return IndenterStart(False, offset)
+        moved = IndenterStart(False, offset).drives(drives)
         tool = system.bodies.tools(u, moved)[0]
         gaps, normals, _ = tool.body.local_distance(tool.local)
         at = np.unravel_index(gaps.argmin(), gaps.shape)
         normal = normals[at]
-        return TouchDown(False, offset, normal @ tool.moved(du)[at] / normal[2])
+        return IndenterStart(False, offset, normal @ tool.moved(du)[at] / normal[2])
 
     def drives(self, stated: Drives) -> Drives:
         """What drives the bodies, with the indenter moved by the offset."""
