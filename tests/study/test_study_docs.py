@@ -19,7 +19,7 @@ TABLES = (
     *("geometry.proximal_cut", "geometry.amputation", "geometry.layers", "geometry.regions"),
     *("socket.areas", "socket.trim_planes"),
 )
-DOCS = Path(__file__).parents[1] / "docs" / "study.md"
+DOCS = Path(__file__).parents[2] / "docs" / "study.md"
 
 
 def tables_in(annotation: Any) -> list[type[BaseModel]]:

@@ -27,7 +27,7 @@ from limbfit.traces import (
 )
 from limbfit.traces.regularise import _spline
 
-SHARED = Path(__file__).parents[1] / ".." / "shared"
+SHARED = Path(__file__).parents[2] / ".." / "shared"
 OPENLIMB = SHARED / "reference" / "openlimb-study"
 RELAXATION = SHARED / "data" / "relaxation"
 needs_openlimb = pytest.mark.skipif(not OPENLIMB.is_dir(), reason="shared/reference is not here")

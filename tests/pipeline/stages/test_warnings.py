@@ -18,7 +18,7 @@ from limbfit.pipeline.shared import simulations
 from limbfit.pipeline.stages.doubted import Doubted, doubts_record
 from limbfit.report import build_report
 
-sys.path.insert(0, str(Path(__file__).parent / "report"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "report"))
 from stored_results import write_results
 
 FOLD = Doubt("folded", "7 elements are inside out at a node at 9.1 mm", 7, 9.1, 1.0)

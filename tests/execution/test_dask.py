@@ -12,13 +12,13 @@ import time
 
 import numpy as np
 import pytest
+from test_execution import die, nap, refuse, solve, threads, told
 
 from conftest import COARSE
 from limbfit.errors import InputError, TraceError
 from limbfit.execution import THREAD_VARIABLES, DaskExecutor, Limits, SerialExecutor
 from limbfit.pipeline import run_study
 from limbfit.study import load_study
-from test_execution import die, nap, refuse, solve, threads, told
 
 distributed = pytest.importorskip("distributed")
 

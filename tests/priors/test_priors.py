@@ -109,7 +109,7 @@ def test_literature_is_cited_and_read_where_it_says() -> None:
 
 
 def test_the_page_lists_every_literature_value_and_every_prior() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "priors.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "priors.md").read_text(encoding="utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     for one in LITERATURE:
         values = [f" {one[key]:g} " for key in ("c_kPa", "m", "gamma", "tau_s") if key in one]

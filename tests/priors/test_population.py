@@ -11,7 +11,7 @@ import pytest
 
 from limbfit.priors import POPULATION
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from layer_compressions import Footprint, Layers
 from population import DATA, SQUARE, THREE, TWO, constant, exponent, seen_in, steps
 from population_fit import Fit, Legs, coverage, fit, predict

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent / "anatomy"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
 from bodies import ellipsoid, limb
 
 from limbfit import load_study, run_study

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from test_study_docs import KEYS
 
 import limbfit
 from limbfit.acquire import Settings
@@ -22,7 +23,6 @@ from limbfit.pipeline.shared.keys import Keys
 from limbfit.pipeline.verbs.run import keys
 from limbfit.study import Study, load_study
 from limbfit.study.vain import VAIN, VAIN_OF_SITE
-from test_study_docs import KEYS
 
 # Studies in which each key acts: the second is for those that an image, layers or markers rule out.
 IMAGED: dict[str, Any] = {
