@@ -76,7 +76,7 @@ class SiteModel:
     knots_N: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
     clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
-    along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally
+    along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally, across which the clamps are
     course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
     prestretch: tuple[tuple[str, float], ...] = ()  # of tissues at rest
 

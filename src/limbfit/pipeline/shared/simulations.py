@@ -191,11 +191,13 @@ def site_model(
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
     folder = COARSE if searched and study.mesh.coarse is not None else ""
     mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
-    indenter, along = study.indenter_of(one), limb_axis(context)
+    indenter = study.indenter_of(one)
     place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    clamped: dict[str, Any] = {}
     if study.clamps is not None:  # said here, with the study's file, before workers build the site
-        whole = read_vtu(mesh)
+        whole, along = read_vtu(mesh), limb_axis(context)
         pins_met(study, one, place, (whole.points, whole.face_sets["skin"]), along)
+        clamped = {"clamps": study.clamps, "along": along}
     return SiteModel(
         name=one.name,
         site=site.name,
@@ -218,10 +220,9 @@ def site_model(
         extensions=study.extensions,
         extensions_digest=extensions_digest(study.extensions),
         layers=tuple(layers),
-        clamps=study.clamps,
-        along=along,
         course=study.material.course,
         prestretch=tuple(sorted(study.material.prestretch.items())),
+        **clamped,
     )
 
 
