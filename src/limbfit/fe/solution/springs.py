@@ -27,8 +27,8 @@ Bools = NDArray[np.bool_]
 NOTABLE = 0.03
 # More columns than this make the dense solutions dear.
 MOST_COLUMNS = 500
-# Share of the unknowns beyond which eliminating them last makes the factor itself dear.
-MOST_LAST = 0.1
+# Over the power 2/3 of all unknowns, as a cut across the body has: with more, the factor itself gets dear.
+MOST_LAST = 1.5
 
 
 def touched(system: System, problem: Problem) -> Index:
@@ -36,7 +36,7 @@ def touched(system: System, problem: Problem) -> Index:
     if system.bodies is None:
         return NONE
     found = system.bodies.swept([body.motion for body in problem.rigid_bodies])
-    return found if len(found) <= MOST_LAST * system.unknowns else NONE
+    return found if len(found) <= MOST_LAST * system.unknowns ** (2 / 3) else NONE
 
 
 class Halves(Protocol):
