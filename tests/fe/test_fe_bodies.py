@@ -28,7 +28,7 @@ from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.pose import Pose
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
-from limbfit.fe.solution.linear import symmetric_product
+from limbfit.fe.solution.products import symmetric_product
 from limbfit.fe.system import Increment
 
 TOOL = Indenter("square", 20.0, 3.0, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))

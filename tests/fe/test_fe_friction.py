@@ -13,7 +13,7 @@ from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, Supp
 from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.tool import Tool
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.linear import symmetric_product
+from limbfit.fe.solution.products import symmetric_product
 from limbfit.fe.system import Increment
 
 

@@ -19,9 +19,9 @@ from limbfit.fe.solution.linear import (
     WITHOUT_PARDISO,
     NotPositiveDefiniteError,
     linear_solver,
-    symmetric_product,
 )
 from limbfit.fe.solution.multigrid import Multigrid
+from limbfit.fe.solution.products import symmetric_product
 from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.solution.springs import touched
 
@@ -106,6 +106,18 @@ def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
         x = factor.precondition(b, springs)
         assert np.linalg.norm(factor.product(changed, x) - b) <= 1e-3 * np.linalg.norm(b)
         assert np.linalg.norm(factor.product(changed, factor.apply(b)) - b) > 0.1 * np.linalg.norm(b)
+
+
+def test_springs_on_held_nodes_are_no_columns_of_unknowns_that_go_last():
+    """They have no unknowns at all, so they would stand on an empty set of them."""
+    problem = punch("tet10", 2, 1)
+    held = np.union1d(problem.fixed, problem.contact_faces[0])
+    system = System(replace(problem, fixed=held))
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    factor = Factor(system, laws.moduli)
+    assert not len(factor.last)
+    assert not factor.columns.inner.any()
+    assert len(factor.columns.W) == system.unknowns
 
 
 @pytest.mark.parametrize("name", ["pardiso", "cholmod"])

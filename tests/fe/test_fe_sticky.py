@@ -12,7 +12,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, System, iterate, solve
 from limbfit.fe.contact.sticky import Anchors
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.linear import symmetric_product
+from limbfit.fe.solution.products import symmetric_product
 from limbfit.fe.system import Increment
 
 

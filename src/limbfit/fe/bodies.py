@@ -309,11 +309,11 @@ class Bodies:
         return np.flatnonzero(touched).astype(np.int32)
 
     def standing_on(self, unknowns: Index) -> NDArray[np.bool_]:
-        """Contact points (c,) that move with these unknowns alone."""
+        """Contact points (c,) that move with these unknowns alone; none where there are none."""
         others = np.ones(self.unknowns)
         others[unknowns] = 0.0
         alone = (self._spread.T @ others).reshape(-1, 3) == 0.0
-        return alone.all(axis=1) & (self.free == 0 or len(unknowns) > 0)
+        return alone.all(axis=1) & (len(unknowns) > 0)
 
     def driven(self, u: Array, drives: Drives, penalty: float) -> tuple[float, Loads]:
         """Energy of what drives the free coordinates at ``u (r, 3)``, and its derivative."""

@@ -26,9 +26,9 @@ from .linear import (
     NotPositiveDefiniteError,
     factors_are_dear,
     linear_solver,
-    symmetric_product,
 )
 from .multigrid import Multigrid
+from .products import symmetric_product
 from .springs import SpringChange, SpringColumns
 
 Array = NDArray[np.float64]
@@ -196,11 +196,11 @@ class Factor:
         return self._timed(self._solver.solve, b, 1.0)
 
     def forward(self, b: Array, last: bool = False) -> Array:
-        """The first half of `apply`, as in `LinearSolver`."""
+        """The first half of `apply`, as in `Halves`."""
         return self._timed(lambda b: self._solver.forward(b, last), b, 0.0 if last else 0.5)
 
     def backward(self, y: Array, last: bool = False) -> Array:
-        """The second half of `apply`, as in `LinearSolver`."""
+        """The second half of `apply`, as in `Halves`."""
         return self._timed(lambda y: self._solver.backward(y, last), y, 0.0 if last else 0.5)
 
     def _timed(self, half: Callable[[Array], Array], b: Array, share: float) -> Array:

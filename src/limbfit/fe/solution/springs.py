@@ -11,14 +11,12 @@ indenter will touch is eliminated last, so that ``W`` is small and costs nothing
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..problem import Problem
 from ..system import System
-from .linear import NONE, Index
+from .linear import NONE, Halves, Index
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -37,20 +35,6 @@ def touched(system: System, problem: Problem) -> Index:
         return NONE
     found = system.bodies.swept([body.motion for body in problem.rigid_bodies])
     return found if len(found) <= MOST_LAST * system.unknowns ** (2 / 3) else NONE
-
-
-class Halves(Protocol):
-    """The halves of a factor's solutions, as in `LinearSolver`."""
-
-    @property
-    def transposed(self) -> bool: ...
-
-    @property
-    def last(self) -> Index: ...
-
-    def forward(self, b: Array, last: bool = False) -> Array: ...
-
-    def backward(self, y: Array, last: bool = False) -> Array: ...
 
 
 class SpringColumns:

@@ -151,19 +151,18 @@ def fibres_of(context: Context) -> tuple[tuple[str, Direction], ...]:
     for tissue, stated in context.study.fibres.items():
         if stated == "flow":
             found.append((tissue, "flow"))
-            continue
-        if stated == "axis":
-            found.append((tissue, limb_axis(context)))
-            continue
-        x, y, z = (float(value) for value in np.array(stated) / np.linalg.norm(stated))
-        found.append((tissue, (x, y, z)))
+        else:
+            found.append((tissue, limb_axis(context) if stated == "axis" else _unit(stated)))
     return tuple(found)
 
 
 def limb_axis(context: Context) -> Vector:
     """The limb's axis, proximally: the unit normal of its proximal cut."""
-    along = np.array(context.stored("surfaces", "surfaces.json")["cut_normal"])
-    x, y, z = (float(value) for value in along / np.linalg.norm(along))
+    return _unit(context.stored("surfaces", "surfaces.json")["cut_normal"])
+
+
+def _unit(along: Sequence[float]) -> Vector:
+    x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
     return x, y, z
 
 
