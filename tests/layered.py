@@ -21,7 +21,7 @@ from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, fibres_of
 from limbfit.pipeline.shared.store import Store, write_json
 from limbfit.pipeline.stages.traces import run_traces
-from limbfit.study import Study
+from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "fat", "muscle")
 TRUTH = {
@@ -29,6 +29,42 @@ TRUTH = {
     "fat": {"c_kPa": 2.0, "m": 4.0, "gamma": 1.0, "tau_s": 1.2},
     "muscle": {"c_kPa": 5.0, "m": 5.0, "gamma": 3.0, "tau_s": 0.3},
 }
+
+BLOCK_STUDY = """
+[study]
+name = "block"
+[surfaces]
+skin = "skin.stl"
+[mesh]
+element = "tet10"
+[material]
+{material}
+[solver]
+load_steps = 4
+unload_steps = 3
+{more}
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+{site}
+"""
+
+
+def block_study(folder: Path, material: str, more: str = "", site: str = "") -> Study:
+    """The study of one block, by its ``[material]``, what stands before its site ``a``, and more of that."""
+    for name in ("skin.stl", "a.csv"):
+        (folder / name).touch()
+    text = BLOCK_STUDY.format(material=material, more=more, site=site)
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return load_study(folder)
+
+
+def block_context(study: Study, truth: Parameters) -> Context:
+    """That of a `block_study`, 18 mm of skin and muscle pressed by 3 mm, up to its records."""
+    store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, truth, 3)
+    return Context(study, store, SerialExecutor(), lambda event: None)
 
 
 def layered_block(

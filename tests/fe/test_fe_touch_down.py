@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import punch
+from blocks import parameter_slope, punch
 from test_fe_fibres import ASKEW, GROUND, TISSUE
 
 from limbfit import History, Indenter, Problem
@@ -39,15 +39,7 @@ def slope_of(problem: Problem, tissue: str, name: str) -> tuple[np.ndarray, np.n
     """Derivative of the force by a parameter: the simulation's, and that of central differences."""
     centre = solve(problem, CONTROL, sensitivities=True, store="all")
     assert centre.completed, centre.reason
-    material = problem.materials[tissue]
-    value, forces = dict(zip(material.parameter_names, material.parameters))[name], []
-    for sign in (1, -1):
-        changed = material.with_parameters({name: value * (1 + sign * 1e-4)})
-        moved = problem.with_materials({**problem.materials, tissue: changed})
-        forces.append(solve(moved, CONTROL, warm_start=centre).force)
-    column = list(centre.parameter_names).index((tissue, name))
-    assert centre.force_sensitivity is not None
-    return centre.force_sensitivity[:, column], (forces[0] - forces[1]) / (2e-4 * value)
+    return parameter_slope(centre, CONTROL, tissue, name)
 
 
 def test_it_touches_the_tissue_where_that_is_by_then():

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import store_blocks
+from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
-from limbfit.execution import SerialExecutor
 from limbfit.fe import Contractile, OgdenQLV
 from limbfit.indentation import SimulationJob, build_problem, materials, simulate
 from limbfit.mesh import read_vtu
@@ -18,45 +17,21 @@ from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import recorded_model
 from limbfit.pipeline.verbs.run import keys
-from limbfit.study import Study, load_study
+from limbfit.study import Study
 
-TEXT = """
-[study]
-name = "contraction"
-[surfaces]
-skin = "skin.stl"
-[mesh]
-element = "tet10"
-[material]
-law = "{law}"
-{stated}
-[solver]
-load_steps = 4
-unload_steps = 3
-[[sites]]
-name = "a"
-fitted = true
-trace = "a.csv"
-position = [0.0, 0.0, 0.0]
-"""
 ALONG = "fibres = { muscle = [1.0, 0.0, 0.0] }\n"
 COURSE = "activation = { time_s = [0.0, 2.0], share = [0.5, 1.0] }\n"
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5, "k1_kPa": 3.0, "k2": 3.0, "active_kPa": 6.0}
 TRUTH = {"skin": VALUES | {"c_kPa": 9.0}, "muscle": VALUES}
 
 
-def study_of(folder: Path, stated: str = "", law: str = "ogden-active") -> Study:
-    for name in ("skin.stl", "a.csv"):
-        (folder / name).touch()
-    (folder / "study.toml").write_text(TEXT.format(stated=stated, law=law), encoding="utf-8")
-    return load_study(folder)
+def study_of(folder: Path, stated: str = "", law: str = "ogden-active", site: str = "") -> Study:
+    return block_study(folder, f'law = "{law}"\n{stated}', site=site)
 
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory) -> Context:
-    study = study_of(tmp_path_factory.mktemp("active"), ALONG)
-    store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, TRUTH, 3)
-    return Context(study, store, SerialExecutor(), lambda event: None)
+    return block_context(study_of(tmp_path_factory.mktemp("active"), ALONG), TRUTH)
 
 
 def test_the_core_contracts_and_no_other_tissue(tmp_path):
@@ -133,8 +108,5 @@ def test_what_cannot_be_is_said_in_a_line(tmp_path, stated, law, what):
 
 
 def test_a_record_under_force_takes_none(tmp_path):
-    study_of(tmp_path)
-    text = TEXT.format(stated="", law="ogden-active") + "control = 'force'\n"
-    (tmp_path / "study.toml").write_text(text, encoding="utf-8")
     with pytest.raises(StudyError, match='a has control = "force", which goes without contraction'):
-        load_study(tmp_path)
+        study_of(tmp_path, site="control = 'force'")

@@ -3,59 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from layered import store_blocks
+from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
-from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import job_digest, recorded_model
 from limbfit.pipeline.verbs.run import keys
-from limbfit.study import Study, load_study
 
-TEXT = """
-[study]
-name = "taut"
-[surfaces]
-skin = "skin.stl"
-[mesh]
-element = "tet10"
-[material]
-{stated}
-[solver]
-load_steps = 4
-unload_steps = 3
-{more}
-[[sites]]
-name = "a"
-fitted = true
-trace = "a.csv"
-position = [0.0, 0.0, 0.0]
-"""
 TAUT = "prestretch = { skin = 1.1 }\n"
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5}
 TRUTH = {"skin": VALUES | {"c_kPa": 9.0}, "muscle": VALUES}
 
 
-def study_of(folder: Path, stated: str = "", more: str = "", site: str = "") -> Study:
-    for name in ("skin.stl", "a.csv"):
-        (folder / name).touch()
-    text = TEXT.format(stated=stated, more=more) + site
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    return load_study(folder)
-
-
 @pytest.fixture(scope="module")
 def context(tmp_path_factory) -> Context:
-    study = study_of(tmp_path_factory.mktemp("taut"), TAUT)
-    store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, TRUTH, 3)
-    return Context(study, store, SerialExecutor(), lambda event: None)
+    return block_context(block_study(tmp_path_factory.mktemp("taut"), TAUT), TRUTH)
 
 
 def test_a_layer_is_stretched_in_its_plane_and_fibres_along_themselves(context):
@@ -73,7 +41,7 @@ def test_a_layer_is_stretched_in_its_plane_and_fibres_along_themselves(context):
 
 
 def test_it_decides_the_calibration_on_whole_meshes(tmp_path):
-    plain, taut = study_of(tmp_path), study_of(tmp_path, TAUT)
+    plain, taut = block_study(tmp_path, ""), block_study(tmp_path, TAUT)
     before, after = keys(plain), keys(taut)
     assert {stage for stage in before if before[stage] != after[stage]} == {"calibrate", "predict", "report"}
     assert plain.within_mm == 65.0
@@ -122,7 +90,7 @@ def test_a_socket_takes_none(context):
 )
 def test_what_cannot_be_is_said_in_a_line(tmp_path, stated, more, site, what):
     with pytest.raises(StudyError) as caught:
-        study_of(tmp_path, stated, more, site)
+        block_study(tmp_path, stated, more, site)
     told = str(caught.value)
     assert what in told
     assert "study.toml" in told

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from guide import identified
-from layered import store_blocks
+from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
-from limbfit.execution import SerialExecutor
 from limbfit.fe import Fibred, OgdenQLV
 from limbfit.indentation import SimulationJob, build_problem, materials, simulate
 from limbfit.mesh import read_vtu
@@ -19,43 +18,20 @@ from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import fibres_of, recorded_model
 from limbfit.pipeline.stages.laboratory import groupings, unknowns
 from limbfit.pipeline.verbs.run import keys
-from limbfit.study import load_study
+from limbfit.study import Study
 
-TEXT = """
-[study]
-name = "fibres"
-[surfaces]
-skin = "skin.stl"
-[mesh]
-element = "tet10"
-[material]
-law = "{law}"
-{fibres}
-[solver]
-load_steps = 4
-unload_steps = 3
-[[sites]]
-name = "a"
-fitted = true
-trace = "a.csv"
-position = [0.0, 0.0, 0.0]
-"""
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5, "k1_kPa": 30.0, "k2": 3.0}
 TRUTH = {"skin": VALUES | {"c_kPa": 9.0}, "muscle": VALUES}
 
 
-def study_of(folder: Path, fibres: str = "", law: str = "ogden-fibres"):
-    for name in ("skin.stl", "a.csv"):
-        (folder / name).touch()
-    (folder / "study.toml").write_text(TEXT.format(fibres=fibres, law=law), encoding="utf-8")
-    return load_study(folder)
+def study_of(folder: Path, fibres: str = "", law: str = "ogden-fibres") -> Study:
+    return block_study(folder, f'law = "{law}"\n{fibres}')
 
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory) -> Context:
-    study = study_of(tmp_path_factory.mktemp("fibres"), "fibres = { muscle = [2.0, 0.0, 0.0] }")
-    store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, TRUTH, 3)
-    return Context(study, store, SerialExecutor(), lambda event: None)
+    folder = tmp_path_factory.mktemp("fibres")
+    return block_context(study_of(folder, "fibres = { muscle = [2.0, 0.0, 0.0] }"), TRUTH)
 
 
 def test_the_core_has_fibres_along_the_limb_and_no_other_tissue(tmp_path):
