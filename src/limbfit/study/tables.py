@@ -266,6 +266,7 @@ class CalibrationTable(TomlTable):
     ``fixed``, ``tied`` and ``prior`` name parameters as ``skin.c_kPa``; ``starts`` after one are random.
     ``priors`` are those of people, where ``prior`` names none; ``prior_tissues`` says what tissue of people
     one of the model is.
+    ``surface_error_mm``: how far skin and bone may be off; without it a share of the image's voxels.
     Parameters are searched on what of each mesh is within ``search_radius_mm`` of its site (0: on all of it),
     and on coarse meshes where the study has them (``mesh.coarse``); forces of the whole meshes correct that,
     at most ``corrections`` times per stage.
@@ -281,6 +282,7 @@ class CalibrationTable(TomlTable):
     priors: Literal["population"] | None = None
     prior_tissues: dict[str, str] = {}
     force_error_percent: Positive = 1.0
+    surface_error_mm: Positive | None = None
     starts: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
     search_radius_mm: Annotated[float, Field(ge=0)] = 65.0

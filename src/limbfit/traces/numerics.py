@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -32,3 +33,8 @@ def straight(at: Array, knots: Array) -> Array:
     rows, matrix = np.arange(len(at)), np.zeros((len(at), len(knots)))
     matrix[rows, k], matrix[rows, k + 1] = 1.0 - share, share
     return matrix
+
+
+def curved(at: Array, knots: Array) -> Array:
+    """The matrix (m, n) that takes values at ``knots`` (n,) to those at ``at`` (m,) of their cubic."""
+    return np.asarray(make_interp_spline(knots, np.eye(len(knots)), k=min(3, len(knots) - 1))(at))

@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from ..errors import TraceError
 from ..phases import MotionPhase, boundaries, find_phases, spread, way_in
 from .displacement import broken_line
-from .numerics import Array, bins, rms, straight
+from .numerics import Array, bins, curved, rms
 from .record import Trace
 from .touchdown import TouchDown
 
@@ -82,6 +82,7 @@ class Regularised:
 
 _LEAST_SAMPLES = 5  # of a part
 _BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
+_SAME_S = 1e-9  # of a corner and a point there
 _PINNED = 1e3  # weight of a shared end point, in weights of its whole part
 
 
@@ -160,11 +161,17 @@ class SmoothCurve:
         return self._joined(self._splines, at)
 
     def response(self, at: Array) -> Array:
-        """What smoothing makes of a force given at times (n,) s, straight between: a matrix (n, n).
+        """What smoothing makes of a force given at times (n,) s, a cubic in each part: a matrix (n, n).
 
         That force is averaged over the same times as the samples of the record, and smoothed by as much.
+        Straight between, a convex force would be too large everywhere.
         """
-        given = [straight(x, at) for x, _, _ in self._bins]
+        given = []
+        for (x, _, _), start, end in zip(self._bins, self._corners, self._corners[1:]):
+            near = np.flatnonzero((at >= start - _SAME_S) & (at <= end + _SAME_S))
+            matrix = np.zeros((len(x), len(at)))
+            matrix[:, near] = curved(x, at[near])
+            given.append(matrix)
         splines, _ = self._fitted(given, self._penalties)
         return self._joined(splines, at)
 

@@ -138,7 +138,7 @@ def test_further_records_narrow_every_interval(tmp_path: Path, no_own_record: No
         at = laboratory.anchored(study.vector(TRUTH))
         for record, response in zip(laboratory.records, at.responses, strict=True):
             assert np.abs(response.force_N - record.compared).mean() < 0.04 * record.compared.max()
-        known.append(linearised(study, laboratory.records, study.vector(TRUTH), at))
+        known.append(linearised(context, laboratory.records, study.vector(TRUTH), at))
     every = known[1]
     assert {noise.name: noise.unit for noise in every.residual_model.noise} == {
         name: "mm" if name == "a-creep" else "N" for name in HISTORIES

@@ -205,7 +205,7 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         study = context.study
         laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))
-        known = linearised(study, laboratory.records, study.vector(TRUTH), at)
+        known = linearised(context, laboratory.records, study.vector(TRUTH), at)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in laboratory.records] == ["a", "a+skin", "a+muscle"]
     assert [one.unit for one in laboratory.measured] == ["N", "mm", "mm"]

@@ -37,14 +37,16 @@ def summarise(errors_percent: Sequence[float]) -> Summary:
     return Summary(errors.size, float(errors.mean()), sd, float(errors.max()))
 
 
-def prediction_sd(jacobian: Array, parameters: Array, covariance_log: Array, noise_N: float = 0.0) -> Array:
+def prediction_sd(
+    jacobian: Array, parameters: Array, covariance_log: Array, noise_N: Array | float = 0.0
+) -> Array:
     """Standard deviation (n,) N of a predicted force, linearised.
 
     Parameters
     ----------
     jacobian : (n, p) derivatives of the force with respect to the parameters.
     covariance_log : (p, p) covariance of the logarithms of the parameters (``Uncertainty.covariance``).
-    noise_N : standard deviation of what a new record adds: sensor noise and the model's own misfit.
+    noise_N : standard deviation, (n,) or one, of what a new record adds: noise, and the model's misfit.
     """
     scaled = jacobian * parameters
     return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
@@ -55,13 +57,14 @@ class Known:
     """What a prediction interval needs of a stored uncertainty (``Uncertainty``, ``ResidualModel.to_dict``).
 
     ``sites`` are noise and misfit of the fitted sites; ``known_scale`` the independent residuals on which the
-    size of the misfit rests.
+    size of the misfit rests; ``site_factor`` how much farther than expected whole sites are off.
     """
 
     covariance_log: Array
     sites: dict[str, dict[str, Any]]
     misfit_elsewhere: float
     known_scale: float
+    site_factor: float = 1.0
 
     @classmethod
     def of(cls, uncertainty: dict[str, Any]) -> Known:
@@ -72,6 +75,7 @@ class Known:
             residuals["sites"],
             float(residuals["misfit_elsewhere"]),
             float(residuals["known_scale"]),
+            float(residuals["site_factor"] or 1.0),
         )
 
     def residual(self, site: str, unit: str = "N") -> tuple[float, float]:
@@ -87,16 +91,24 @@ class Known:
         return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
     def half_width_95(
-        self, jacobian: Array, parameters: Array, peak_N: float, site: str, unit: str = "N"
+        self,
+        jacobian: Array,
+        parameters: Array,
+        peak_N: float,
+        site: str,
+        unit: str = "N",
+        site_N: Array | float = 0.0,
     ) -> Array:
         """Half the 95 % interval (n,) N of a new record at a site: parameters, misfit of the model, noise.
 
         In mm for one that compares depths (``unit``). As few residuals as the misfit is known from widen it
-        (Student; Satterthwaite's freedom).
+        (Student; Satterthwaite's freedom). ``site_N`` (n,) is one standard deviation of what is expected of
+        the stiffness of a site that was not fitted.
         """
         noise_N, misfit = self.residual(site, unit)
         misfit_N = misfit * peak_N
-        sd = prediction_sd(jacobian, parameters, self.covariance_log, float(np.hypot(noise_N, misfit_N)))
+        own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
+        sd = prediction_sd(jacobian, parameters, self.covariance_log, own_N)
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
         freedom = np.clip(self.known_scale / np.maximum(share, 1e-3) ** 2, 3.0, 1e6)
         return stdtrit(freedom, 0.975) * sd

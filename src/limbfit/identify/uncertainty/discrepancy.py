@@ -4,6 +4,9 @@ The residuals of a good fit are mostly the model's: they wander along the record
 site gets a Gaussian process of its own (Kennedy and O'Hagan 2001; Matern 3/2), with a standard deviation in
 shares of its largest force and a correlation in shares of the record, common to all sites. Both are found by
 restricted maximum likelihood (Patterson and Thompson 1971), which counts what the parameters have absorbed.
+
+A site as a whole may be off as well: its tissue differs, its surfaces are not where the image shows them.
+That is a random effect of every site on the stiffness of all its tissue, whose size is estimated, too.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ Array = NDArray[np.float64]
 
 CORRELATIONS = (0.04, 0.07, 0.12, 0.2, 0.35, 0.6)  # of a record; longer ones cannot be told from an offset
 _LEAST, _MOST = 1e-5, 1.0  # of the largest force
+_FACTOR_SD = np.log(2.0)  # of the log of how far sites are off, over what was expected
+_FACTORS = (0.2, 10.0)
 _ALIKE = 0.5  # sd of log(sd) between sites: a site with a lucky fit is not trusted beyond its fellows
 
 
@@ -39,6 +44,8 @@ class ResidualModel:
 
     ``mesh_N`` (n,) per record is one standard deviation of the mesh's error, none where it was not measured:
     the records of one of the ``sites`` (records,) have one mesh, whose error is one deviation of them all.
+    ``site_N`` (n,) is the same for the stiffness of a site's tissue, as it was expected to differ, and
+    ``site_factor`` how many times as much it does; none: it is left out.
     ``misfit`` (records,) is the standard deviation of the misfit over the largest force ``peaks_N``
     (records,). ``known_scale`` is the number of independent residuals on which the size of the misfit rests.
     """
@@ -51,6 +58,8 @@ class ResidualModel:
     criterion: float = field(default=0.0, repr=False)
     mesh_N: tuple[Array, ...] = ()
     sites: tuple[str, ...] = ()
+    site_N: tuple[Array, ...] = ()
+    site_factor: float = 1.0
 
     @property
     def misfit_elsewhere(self) -> float:
@@ -73,29 +82,41 @@ class ResidualModel:
                     "compared_noise_sd_N": float(np.sqrt(np.trace(noise.covariance) / len(noise.times_s))),
                     "misfit_sd_N": float(misfit * peak),
                     "misfit_share": float(misfit),
-                    "mesh_share": self._mesh_share(i),
+                    "mesh_share": self._share(self.mesh_N, i),
+                    "site_share": self._share([self.site_factor * one for one in self.site_N], i),
                 }
                 for i, (noise, misfit, peak) in enumerate(zip(self.noise, self.misfit, self.peaks_N))
             },
+            "site_factor": self.site_factor if self.site_N else None,
             "misfit_elsewhere": self.misfit_elsewhere,
             "correlation": self.correlation,
             "known_scale": self.known_scale,
             "effective_samples": self.effective_samples(),
         }
 
-    def _mesh_share(self, i: int) -> float | None:
-        """Root mean square of the mesh's error over the largest force of site i; None where not measured."""
-        return float(np.sqrt(np.mean(self.mesh_N[i] ** 2)) / self.peaks_N[i]) if self.mesh_N else None
+    def _share(self, sd_N: Sequence[Array], i: int) -> float | None:
+        """Root mean square over the largest force of record i; None where there is nothing."""
+        return float(np.sqrt(np.mean(sd_N[i] ** 2)) / self.peaks_N[i]) if sd_N else None
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """The sites, each once."""
+        return tuple(dict.fromkeys(self.sites or tuple(noise.name for noise in self.noise)))
 
     @property
     def shared(self) -> tuple[Array, ...]:
-        """What records have in common, per record (n, q): one standard deviation of each of q deviations."""
+        """What records have in common, per record (n, q): one standard deviation of each of q deviations.
+
+        First those of the meshes, then those of the sites, each as many as there are `places` or none.
+        """
         of = self.sites or tuple(noise.name for noise in self.noise)
-        places = list(dict.fromkeys(of)) if self.mesh_N else []
-        found = [np.zeros((len(noise.times_s), len(places))) for noise in self.noise]
-        for mesh, site, columns in zip(self.mesh_N, of, found):
-            columns[:, places.index(site)] = mesh
-        return tuple(found)
+        kinds = [(self.mesh_N, 1.0), (self.site_N, self.site_factor)]
+        kinds = [(rows, factor) for rows, factor in kinds if rows]
+        found = [np.zeros((len(noise.times_s), len(kinds), len(self.places))) for noise in self.noise]
+        for k, (rows, factor) in enumerate(kinds):
+            for row, site, columns in zip(rows, of, found, strict=True):
+                columns[:, k, self.places.index(site)] = factor * row
+        return tuple(columns.reshape(len(columns), -1) for columns in found)
 
     def own(self, i: int) -> Array:
         """Covariance (n, n) of what record i shares with no other: its noise and its misfit."""
@@ -164,23 +185,28 @@ def estimate_discrepancy(
     precision: Array,
     mesh_N: Sequence[Array] = (),
     sites: Sequence[str] = (),
+    site_N: Sequence[Array] = (),
 ) -> ResidualModel:
     """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per record.
 
     Derivatives are with respect to the logarithms of the parameters, ``precision`` (p, p) is what is known of
     them beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one of the ``sites``
-    (by default each its own) have in common. Misfits are alike within a factor of about two unless residuals
-    say otherwise.
+    (by default each its own) have in common, ``site_N`` (n,) what is expected of the site's own stiffness.
+    Misfits are alike, and sites as far off as expected, within a factor of about two unless residuals say
+    otherwise.
     """
     best: tuple[float, Array, float, _Rows] | None = None
     unit = np.ones(len(noise))
     model = ResidualModel(
-        tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0, mesh_N=tuple(mesh_N), sites=tuple(sites)
-    )
+        tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0,
+        mesh_N=tuple(mesh_N), sites=tuple(sites), site_N=tuple(site_N),
+    )  # fmt: skip
     start = np.array([_first_guess(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
+    bounds = [(np.log(_LEAST), np.log(_MOST))] * len(start)
+    if site_N:
+        start, bounds = np.append(start, 0.0), [*bounds, tuple(np.log(_FACTORS))]
     for correlation in CORRELATIONS:
         rows = _Rows(residuals, jacobians, replace(model, correlation=correlation), precision)
-        bounds = [(np.log(_LEAST), np.log(_MOST))] * len(start)
         found = minimize(rows.criterion, start, jac=True, method="L-BFGS-B", bounds=bounds)
         if best is None or found.fun < best[0]:
             best = float(found.fun), found.x, correlation, rows
@@ -189,7 +215,8 @@ def estimate_discrepancy(
     value, logs, correlation, rows = best
     return replace(
         model,
-        misfit=np.exp(logs),
+        misfit=np.exp(logs[: len(noise)]),
+        site_factor=float(np.exp(logs[-1])) if site_N else 1.0,
         correlation=correlation,
         known_scale=rows.known_scale(logs),
         criterion=value,
@@ -204,49 +231,67 @@ def _first_guess(residual: Array, noise: SiteNoise, peak: float) -> float:
 class _Rows:
     """All records in coordinates in which ``unit``, with misfits of the largest forces, is diagonal.
 
-    What records share counts as further unknowns, known beforehand to one standard deviation.
+    What records share counts as further unknowns, known beforehand to one standard deviation. The logarithms
+    are those of the misfits, and last, where sites may be off as a whole, that of the factor on how far.
     """
 
     def __init__(
         self, residuals: Sequence[Array], jacobians: Sequence[Array], unit: ResidualModel, precision: Array
     ) -> None:
         spectra = unit.spectra()
+        self.records = len(spectra)
         self.site = np.concatenate([np.full(len(s.values), i) for i, s in enumerate(spectra)])
         self.values = np.concatenate([s.values for s in spectra])
         self.residual = np.concatenate([s.transform @ r for s, r in zip(spectra, residuals)])
         both = [np.hstack([J, E]) for J, E in zip(jacobians, unit.shared, strict=True)]
         self.jacobian = np.concatenate([s.transform @ J for s, J in zip(spectra, both)])
-        self.precision = block_diag(precision, np.eye(unit.shared[0].shape[1]))
+        self.known = block_diag(precision, np.eye(unit.shared[0].shape[1]))
+        self.places = len(unit.places) if unit.site_N else 0  # the last unknowns
 
     def variances(self, logs: Array) -> Array:
-        return 1.0 + np.exp(2 * logs)[self.site] * self.values
+        return 1.0 + np.exp(2 * logs[: self.records])[self.site] * self.values
+
+    def precision(self, logs: Array) -> Array:
+        """What is known of the unknowns beforehand."""
+        found = self.known.copy()
+        if self.places:
+            last = np.arange(len(found))[-self.places :]
+            found[last, last] = np.exp(-2 * logs[-1])
+        return found
 
     def criterion(self, logs: Array) -> tuple[float, Array]:
-        """Minus twice the restricted log-likelihood, with what keeps sites alike; its gradient (sites,)."""
-        variances = self.variances(logs)
+        """Minus twice the restricted log-likelihood, with what keeps sites alike; its gradient."""
+        variances, precision = self.variances(logs), self.precision(logs)
         share = (variances - 1) / variances
         J = self.jacobian / variances[:, None]
-        A = self.jacobian.T @ J + self.precision
+        A = self.jacobian.T @ J + precision
         inverse = np.linalg.inv(A)
         step = inverse @ (J.T @ self.residual)
         left = self.residual - self.jacobian @ step
         fit = left**2 / variances
         leverage = np.einsum("ni,ij,nj->n", J, inverse, self.jacobian)
-        from_mean = logs - logs.mean()
+        misfits = logs[: self.records]
+        from_mean = misfits - misfits.mean()
         value = (
-            float(fit.sum() + step @ self.precision @ step + np.log(variances).sum())
+            float(fit.sum() + step @ precision @ step + np.log(variances).sum())
             + float(np.linalg.slogdet(A)[1])
             + float(from_mean @ from_mean) / _ALIKE**2
         )
-        slope = 2 * np.bincount(self.site, share * (1 - fit - leverage), minlength=len(logs))
-        return value, slope + 2 * from_mean / _ALIKE**2
+        slope = 2 * np.bincount(self.site, share * (1 - fit - leverage), minlength=self.records)
+        slope = slope + 2 * from_mean / _ALIKE**2
+        if not self.places:
+            return value, slope
+        moved = step[-self.places :] ** 2 + np.diag(inverse)[-self.places :]
+        value += 2 * self.places * logs[-1] + (logs[-1] / _FACTOR_SD) ** 2
+        of_sites = 2 * (self.places - np.exp(-2 * logs[-1]) * moved.sum() + logs[-1] / _FACTOR_SD**2)
+        return value, np.append(slope, of_sites)
 
     def known_scale(self, logs: Array) -> float:
         """Twice the information on the logarithm of the misfit's variance (Satterthwaite's freedom)."""
         variances = self.variances(logs)
         share = (variances - 1) / variances
         half = self.jacobian / np.sqrt(variances)[:, None]
-        A = half.T @ half + self.precision
+        A = half.T @ half + self.precision(logs)
         inner = half.T @ (share[:, None] * half)
         solved = np.linalg.solve(A, inner)
         double = np.linalg.solve(A, half.T @ (share[:, None] ** 2 * half))

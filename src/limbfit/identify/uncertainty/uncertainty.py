@@ -99,6 +99,7 @@ def estimate_uncertainty(
     grouping: Grouping | None = None,
     settings: CalibrationSettings | None = None,
     mesh_N: Sequence[Array] = (),
+    site_N: Sequence[Array] = (),
 ) -> Uncertainty:
     """Covariance, intervals and verdicts at calibrated ``parameters`` (p,).
 
@@ -110,6 +111,7 @@ def estimate_uncertainty(
     grouping : of the last stage; by default every parameter is free.
     settings : with which the parameters were found: the covariance is that of this estimator.
     mesh_N : (n,) per site, one standard deviation of the mesh's error in the force; none: it is left out.
+    site_N : (n,) per site, what its force as a whole is expected to be off by; residuals correct the size.
     """
     left = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
     if noise is None:
@@ -123,7 +125,7 @@ def estimate_uncertainty(
     prior = Beliefs.of(unknowns, space)
     peaks = np.array([site.force_N.max() for site in measured])
     sites = [site.where for site in measured]
-    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N, sites)
+    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N, sites, site_N)
     estimator = Estimator.at(left, scaled, measured, prior.rows, settings or CalibrationSettings())
     linear = _Linear.at(left, scaled, estimator, model, prior, space, z)
     return _told(np.asarray(parameters), linear, model, unknowns, space, prior)

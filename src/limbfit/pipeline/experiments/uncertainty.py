@@ -76,7 +76,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     best = study.vector(calibration["stages"][-1]["parameters"])
     earlier = _earlier_points(context, calibration)
     sites = FittedSites(context, folder, best, earlier)
-    known = linearised(study, sites.records, best, sites.at_best)
+    known = linearised(context, sites.records, best, sites.at_best)
     table, grouping = study.uncertainty, groupings(study)[-1]
     space = search_space(unknowns(study), grouping)
     settings = ExploreSettings(table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
-from ...mesh import read_vtu
 from ...study import Indentation, Record, Site
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
 from ..shared.tabular import write_curves
+from ..stages.site_scatter import tissue_over_bone
 
 Array = NDArray[np.float64]
 
@@ -106,21 +106,6 @@ def _with_role(chosen: ChosenSite, role: str) -> ChosenSite:
 def _chosen(context: Context, one: Indentation) -> ChosenSite:
     model = model_of(context, one)
     return ChosenSite(context.study.site(model.site), model, tissue_over_bone(model), "")
-
-
-def tissue_over_bone(model: SiteModel) -> float:
-    """Distance in mm from a site to the nearest point of a bone in its mesh.
-
-    Raises
-    ------
-    InputError
-        Where the mesh has no bone.
-    """
-    mesh = read_vtu(model.mesh)
-    bone = mesh.node_sets.get("fixed_bone", np.zeros(0, dtype=int))
-    if not len(bone):
-        raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
-    return float(np.linalg.norm(mesh.points[bone] - np.array(model.position), axis=1).min())
 
 
 def run_variants(

@@ -31,6 +31,7 @@ from .doubted import Doubted
 from .mesh import mesh_settings
 from .record_noise import site_noise
 from .remesh import meshed_meanwhile, meshed_models, scaled_edges
+from .site_scatter import site_deviation
 from .traces import SiteRecord, all_compared, as_searched, site_record
 
 Array = NDArray[np.float64]
@@ -177,7 +178,7 @@ class Laboratory:
             lacking = self._mesh_error(found.parameters, searched, self._coarser(meshes))
             anchored = replace(anchored, mesh_N=lacking)
             spent = self.simulated
-        known = linearised(study, self.records, found.parameters, anchored)
+        known = linearised(self.context, self.records, found.parameters, anchored)
         kept = KeptRuns()
         for point, run in zip(self.kept.points, self.kept.responses, strict=True):
             kept.add(point, anchored.as_fine(list(run)))
@@ -306,8 +307,11 @@ class Laboratory:
         return corrected.calibration, corrected.rounds
 
 
-def linearised(study: Study, records: Sequence[SiteRecord], parameters: Array, at: Anchored) -> Uncertainty:
+def linearised(
+    context: Context, records: Sequence[SiteRecord], parameters: Array, at: Anchored
+) -> Uncertainty:
     """What fitted records tell about ``parameters`` (p,), whose responses are given."""
+    study = context.study
     pairs = zip(records, at.responses, strict=True)
     noise = [site_noise(study, record, response.force_N) for record, response in pairs]
     measured = [record.measured for record in records]
@@ -320,6 +324,7 @@ def linearised(study: Study, records: Sequence[SiteRecord], parameters: Array, a
         groupings(study)[-1],
         settings(study),
         at.mesh_N,
+        site_deviation(context, records, at.responses, parameters),
     )
 
 

@@ -52,7 +52,7 @@ def record_flags(
             one,
             records[one.name],
             steps_s[one.name],
-            _radius(study.indenter_of(one)),
+            contact_radius(study.indenter_of(one)),
             placed.get(one.site.name),
             anatomy,
         )
@@ -67,7 +67,7 @@ def _flag(site: str, remark: Mapping[str, Any]) -> Flag:
     return Flag((site,), **remark)
 
 
-def _radius(indenter: IndenterTable) -> float:
+def contact_radius(indenter: IndenterTable) -> float:
     """Of a circle with the indenter's section, mm; a sphere touches with less."""
     tool = read_indenter(indenter, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
     return float(np.sqrt(tool.body.section / np.pi))

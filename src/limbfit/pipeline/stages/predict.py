@@ -25,6 +25,7 @@ from ..shared.simulations import SimulationCache
 from ..shared.store import write_json
 from ..shared.tabular import write_curves
 from .outliers import outlier_record
+from .site_scatter import site_deviation
 from .traces import SiteRecord, all_compared, as_response, as_searched, site_record
 
 Array = NDArray[np.float64]
@@ -69,7 +70,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     whole = [job for site, job in zip(sites, jobs) if site.own.completed]
     _write_fields(context, folder, whole, len(jobs))
     for site in sites:
-        _write_curves(folder, site, best, known)
+        _write_curves(context, folder, site, best, known)
     rows = [_row(site) for site in sites]
     for i, site in enumerate(sites):
         rows[i]["layers"] = _layers(context, folder, site, None if near is None else near[i], best, known)
@@ -174,7 +175,7 @@ def _write_fields(context: Context, folder: Path, jobs: Sequence[SimulationJob],
         context.tell("predict", before + i + 1, total, f"fields of site {name}")
 
 
-def _write_curves(folder: Path, site: SitePrediction, best: Array, known: Known) -> None:
+def _write_curves(context: Context, folder: Path, site: SitePrediction, best: Array, known: Known) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
     record, ours, missing = site.record, site.ours, site.missing
     name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
@@ -188,7 +189,8 @@ def _write_curves(folder: Path, site: SitePrediction, best: Array, known: Known)
     if site.one is not None and "one_material" not in missing:
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
-        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name, unit)
+        own = 0.0 if record.site.fitted else site_deviation(context, [record], [ours], best)[0]
+        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name, unit, own)
         columns[f"{name}_low_{unit}"] = np.maximum(ours.force_N - half, 0.0)
         columns[f"{name}_high_{unit}"] = ours.force_N + half
     write_curves(folder / f"{record.name}.csv", **columns)

@@ -1,0 +1,97 @@
+"""How far the force of a site as a whole may be off, before its residuals are seen.
+
+The image places skin and bone to a share of its voxels, and tissue that is thinner by so much is stiffer: by
+what a flat punch on a bonded incompressible layer says (Hayes et al. 1972).  How much more tissue differs
+from site to site the residuals themselves must tell (`limbfit.identify.uncertainty.discrepancy`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...identify.checks.plausibility import layer_factor
+from ...identify.fit.objective import SiteResponse
+from ...indentation import SiteModel
+from ...mesh import read_vtu
+from ...study import Study
+from ..shared.context import Context
+from .plausible import contact_radius
+from .traces import SiteRecord
+
+Array = NDArray[np.float64]
+
+# Root mean square error of a tibia's surface near a site, over the edge of the image's voxels: 0.16 to 0.19
+# for synthetic patients (docs/uncertainty.md).
+OF_A_VOXEL = 0.17
+GIVEN_MM = 0.3  # of surfaces that come as files
+LEAST_SHARE = 0.01  # of the force: what is left on the true surfaces of those patients
+_STEP = 1.1
+
+
+def site_deviation(
+    context: Context, records: Sequence[SiteRecord], responses: Sequence[SiteResponse], parameters: Array
+) -> tuple[Array, ...]:
+    """One standard deviation (n,) of what each record would be off by, as its site's tissue were stiffer.
+
+    In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,).
+    """
+    surface_mm = surface_error_mm(context)
+    moduli = parameters * _is_modulus(context.study)
+    return tuple(
+        response.jacobian @ moduli * expected_share(context.study, record, surface_mm)
+        for record, response in zip(records, responses, strict=True)
+    )
+
+
+def expected_share(study: Study, record: SiteRecord, surface_mm: float) -> float:
+    """Standard deviation of the force at a record's site over the force itself."""
+    radius = contact_radius(study.indenter_of(record.record))
+    try:
+        thickness = tissue_over_bone(record.model)
+    except InputError:  # a half-space has no thickness to be wrong
+        return LEAST_SHARE
+    return float(np.hypot(LEAST_SHARE, by_thickness(radius, thickness) * surface_mm / thickness))
+
+
+def by_thickness(radius_mm: float, thickness_mm: float) -> float:
+    """``-d log F / d log h`` of a flat punch on a bonded layer."""
+    ratio = radius_mm / thickness_mm
+    return float(np.log(layer_factor(ratio * _STEP) / layer_factor(ratio / _STEP)) / np.log(_STEP**2))
+
+
+def surface_error_mm(context: Context) -> float:
+    """Standard deviation of where the study's surfaces are: as stated, by the voxels, or of files."""
+    stated = context.study.calibration.surface_error_mm
+    labels = context.store["segment"] / "labels.seg.nrrd"
+    if stated is not None:
+        return stated
+    if not labels.is_file():
+        return GIVEN_MM
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(labels))
+    reader.ReadImageInformation()
+    return OF_A_VOXEL * float(np.prod(reader.GetSpacing()[:3])) ** (1 / 3)
+
+
+def tissue_over_bone(model: SiteModel) -> float:
+    """Distance in mm from a site to the nearest point of a bone in its mesh.
+
+    Raises
+    ------
+    InputError
+        Where the mesh has no bone.
+    """
+    mesh = read_vtu(model.mesh)
+    bone = mesh.node_sets.get("fixed_bone", np.zeros(0, dtype=int))
+    if not len(bone):
+        raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
+    return float(np.linalg.norm(mesh.points[bone] - np.array(model.position), axis=1).min())
+
+
+def _is_modulus(study: Study) -> NDArray[np.bool_]:
+    return np.array([name in study.law.moduli for _, name in study.parameters])
