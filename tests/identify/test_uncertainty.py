@@ -30,24 +30,29 @@ def fitted(data, run=simulate):
     return found, estimate_uncertainty(found.parameters, found.responses, data, PAPER)
 
 
-def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=()):
+def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=(), site_N=()):
     """How far one Gauss-Newton step from the truth goes, in logarithms, and the uncertainty there."""
     responses = [site.respond(truth) for site in sites]
     J = np.concatenate([r.jacobian * truth * d.scale for r, d in zip(responses, data)])
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
-    found = estimate_uncertainty(truth, moved, data, unknowns, mesh_N=mesh_N)
+    found = estimate_uncertainty(truth, moved, data, unknowns, mesh_N=mesh_N, site_N=site_N)
     return step, found
 
 
-def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER):
-    """Share of repeats in which each combination's 95 % interval holds the truth, the best known half."""
+def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER, stiffer=0.0, expected=0.0):
+    """Share of repeats in which each combination's 95 % interval holds the truth, the best known half.
+
+    Sites are ``stiffer`` at random, by one standard deviation, where ``expected`` is what is said of that.
+    """
     inside, clean = [], records(truth=truth, sites=sites)
     for seed in range(repeats):
         rng = np.random.default_rng(seed)
-        data = [Measured(d.name, d.force_N + noise_of(rng, d.force_N.size)) for d in clean]
-        off, u = linear_fit(data, truth, sites, unknowns)
+        forces = [(1 + stiffer * rng.standard_normal()) * d.force_N for d in clean]
+        data = [Measured(d.name, f + noise_of(rng, f.size)) for d, f in zip(clean, forces)]
+        site_N = [expected * d.force_N for d in clean] if expected else ()
+        off, u = linear_fit(data, truth, sites, unknowns, site_N=site_N)
         best = u.combinations[: len(truth) // 2]
         inside.append([abs(c.weights @ off) < np.log(c.factor_95) for c in best])
     return np.mean(inside, axis=0)
@@ -81,6 +86,32 @@ def test_intervals_cover_the_truth_where_the_model_is_wrong():
     shares = coverage(smooth_misfit, repeats=100)
     assert np.all(shares > 0.86), shares
     assert 0.90 < shares.mean() < 0.99
+
+
+@pytest.mark.parametrize("stiffer", [0.02, 0.06])
+def test_intervals_cover_the_truth_where_sites_are_of_other_stiffness(stiffer):
+    """Stiffness that scatters from site to site by as much as expected, or three times as much."""
+    shares = coverage(
+        lambda rng, n: 0.02 * rng.standard_normal(n), repeats=60, stiffer=stiffer, expected=0.02
+    )
+    assert shares.mean() > 0.9, shares
+    without = coverage(lambda rng, n: 0.02 * rng.standard_normal(n), repeats=60, stiffer=stiffer)
+    assert without.mean() < shares.mean() - 0.1, without
+
+
+def test_how_far_sites_are_off_is_found():
+    """Twelve sites tell it; four leave it near what was expected."""
+    factors = []
+    for sites in (SITES, 3 * SITES):
+        rng = np.random.default_rng(3)
+        clean = records(sites=sites)
+        data = [replace(d, force_N=(1 + 0.1 * rng.standard_normal()) * d.force_N) for d in clean]
+        data = [replace(d, force_N=d.force_N + 0.01 * rng.standard_normal(60)) for d in data]
+        data = [replace(d, name=f"s{i}") for i, d in enumerate(data)]
+        _, found = linear_fit(data, sites=sites, site_N=[0.02 * d.force_N for d in clean])
+        factors.append(found.residual_model.site_factor)
+    assert 1.0 < factors[0] < factors[1]
+    assert 3.0 < factors[1] < 7.0
 
 
 def test_the_error_of_the_mesh_is_in_the_intervals():
@@ -288,15 +319,17 @@ def test_the_error_is_the_papers():
     assert np.isnan(summarise([]).mean_percent)
 
 
+@pytest.mark.parametrize("site", [(), [0.03 * np.linspace(0, 1, 60) ** 2] * 4], ids=["same", "sites"])
 @pytest.mark.parametrize("mesh", [(), [0.02 * np.linspace(0, 1, 60)] * 4], ids=["no mesh", "mesh"])
-def test_the_slope_of_the_restricted_likelihood_is_its_derivative(mesh):
+def test_the_slope_of_the_restricted_likelihood_is_its_derivative(mesh, site):
     data = records(0.02, seed=1)
     left = [r.force_N - d.force_N for r, d in zip(simulate(TRUTH), data)]
     noise = [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
     peaks = np.array([d.force_N.max() for d in data])
     scaled = [r.jacobian * TRUTH for r in simulate(TRUTH)]
-    unit = ResidualModel(tuple(noise), peaks, np.ones(4), 0.2, 0.0, mesh_N=tuple(mesh))
+    unit = ResidualModel(tuple(noise), peaks, np.ones(4), 0.2, 0.0, mesh_N=tuple(mesh), site_N=tuple(site))
     rows = _Rows(left, scaled, unit, np.eye(8))
-    at, h = np.log([0.01, 0.02, 0.005, 0.03]), 1e-5
-    slopes = [(rows.criterion(at + h * e)[0] - rows.criterion(at - h * e)[0]) / (2 * h) for e in np.eye(4)]
+    at, h = np.log([0.01, 0.02, 0.005, 0.03, 1.5][: 5 if site else 4]), 1e-5
+    steps = h * np.eye(len(at))
+    slopes = [(rows.criterion(at + e)[0] - rows.criterion(at - e)[0]) / (2 * h) for e in steps]
     assert rows.criterion(at)[1] == pytest.approx(np.array(slopes), rel=1e-4)

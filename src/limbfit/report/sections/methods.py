@@ -337,11 +337,13 @@ def _unit(name: str) -> str:
     return f" {unit_of(name)}" if unit_of(name) != NOTHING else ""
 
 
-def _mesh_error(sites: Json) -> str:
-    """The meshes' part of the residuals' covariance, in words; nothing where it was not measured."""
-    shares = [100 * one["mesh_share"] for one in sites.values() if one.get("mesh_share") is not None]
-    ends = f"{fixed(min(shares), 1)} to {fixed(max(shares), 1)}" if shares else ""
-    return f", and for the error of the meshes: {ends} % of the largest force" if shares else ""
+def _of_sites(sites: Json) -> str:
+    """What a site's records share of the residuals' covariance, in words; nothing where it is not known."""
+    words = ""
+    for key, what in (("mesh_share", "the error of the meshes"), ("site_share", "that of a site as a whole")):
+        if shares := [100 * one[key] for one in sites.values() if one.get(key) is not None]:
+            words += f", and for {what}: {fixed(min(shares), 1)} to {fixed(max(shares), 1)} %"
+    return words and f"{words} of the largest force"
 
 
 def _uncertainty(store: Results) -> str:
@@ -354,7 +356,7 @@ def _uncertainty(store: Results) -> str:
     words = ", ".join(f"{n} {a} and {b} {unit}" for n, (a, b), unit in zip(sites, said, units, strict=True))
     return (
         "Residuals at the fitted sites are taken for noise of the records and a smooth misfit of the model, "
-        f"correlated along the record (standard deviations, site by site: {words}){_mesh_error(sites)}. 95 % "
+        f"correlated along the record (standard deviations, site by site: {words}){_of_sites(sites)}. 95 % "
         "intervals follow from their covariance and the exact derivatives, in the logarithms of the "
         "parameters."
     )

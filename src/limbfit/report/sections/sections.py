@@ -171,7 +171,7 @@ def parameters(store: Results) -> Section:
 
 
 def _residuals(store: Results) -> str:
-    """What the intervals rest on: noise, misfit of the model and error of the mesh, site by site."""
+    """What the intervals rest on: noise, misfit of the model, errors of meshes and surfaces, by site."""
     found = (store.calibration.get("uncertainty") or {}).get("residuals") or {}
     rows = found.get("sites") or {}
     if not rows:
@@ -180,10 +180,13 @@ def _residuals(store: Results) -> str:
         f"{name} {fixed(site['noise_sd_N'], 3)} and {fixed(site['misfit_sd_N'], 3)} {site.get('unit', 'N')}"
         for name, site in rows.items()
     )
-    meshes = ", ".join(
-        f"{name} {fixed(100 * site['mesh_share'], 1)} %"
-        for name, site in rows.items()
-        if site.get("mesh_share") is not None
+    meshes, own = (
+        ", ".join(
+            f"{name} {fixed(100 * site[share], 1)} %"
+            for name, site in rows.items()
+            if site.get(share) is not None
+        )
+        for share in ("mesh_share", "site_share")
     )
     return (
         "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
@@ -193,6 +196,12 @@ def _residuals(store: Results) -> str:
             f"The error of the meshes is added, in percent of the largest force: {meshes}."
             if meshes
             else "The error of the meshes is not in them: no other mesh was simulated."
+        )
+        + (
+            " So is what tissue and surfaces make a site as a whole stiffer or softer, root mean square over "
+            f"the record: {own}; {fixed(found['site_factor'], 1)} times what its thickness lets expect."
+            if own
+            else ""
         )
     )
 

@@ -1,0 +1,84 @@
+"""What is expected of a site's stiffness: by its tissue's thickness, and how well surfaces are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+
+from layered import block_context, block_study
+from limbfit.identify.fit.objective import SiteResponse
+from limbfit.mesh import read_vtu, write_vtu
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.stages.site_scatter import (
+    GIVEN_MM,
+    LEAST_SHARE,
+    OF_A_VOXEL,
+    by_thickness,
+    expected_share,
+    site_deviation,
+    surface_error_mm,
+)
+from limbfit.pipeline.stages.traces import SiteRecord, site_record
+
+TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
+TRUTH["muscle"] = TRUTH["skin"] | {"c_kPa": 4.0}
+
+
+def context(folder: Path, more: str = "") -> Context:
+    return block_context(block_study(folder, "", more), TRUTH)
+
+
+def over_bone(context: Context) -> SiteRecord:
+    """The block of 18 mm, whose bottom is bone."""
+    record = site_record(context, context.study.recorded[0])
+    mesh = read_vtu(record.model.mesh)
+    bone = {"fixed_bone": mesh.node_sets["fixed_bottom"]}
+    file = record.model.mesh.with_name("bone.vtu")
+    write_vtu(replace(mesh, node_sets=bone), file)
+    return replace(record, model=replace(record.model, mesh=file))
+
+
+def test_thin_tissue_is_stiffer_by_its_thickness() -> None:
+    """Hayes's table between a / h = 0.8 and 1.0; a thin layer goes with the cube, a thick one is none."""
+    assert by_thickness(0.9, 1.0) == pytest.approx(np.log(3.609 / 2.855) / np.log(1.0 / 0.8), rel=0.1)
+    assert by_thickness(10.0, 1.0) == pytest.approx(3.0)
+    assert by_thickness(0.01, 1.0) < 0.03
+
+
+def test_a_site_is_off_by_its_surfaces_and_a_little_more(tmp_path: Path) -> None:
+    found = context(tmp_path)
+    radius = 20.0 / np.sqrt(np.pi)
+    share = expected_share(found.study, over_bone(found), 0.5)
+    assert share == pytest.approx(np.hypot(LEAST_SHARE, by_thickness(radius, 18.0) * 0.5 / 18.0), rel=0.02)
+    assert expected_share(found.study, site_record(found, found.study.recorded[0]), 0.5) == LEAST_SHARE
+
+
+def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
+    """Of files, of an image by its voxels, or as stated."""
+    (tmp_path / "stated").mkdir()
+    found = context(tmp_path)
+    assert surface_error_mm(found) == GIVEN_MM
+    labels = sitk.Image(4, 4, 4, sitk.sitkUInt8)
+    labels.SetSpacing((1.0, 1.0, 8.0))
+    found.store["segment"].mkdir(parents=True)
+    sitk.WriteImage(labels, str(found.store["segment"] / "labels.seg.nrrd"))
+    assert surface_error_mm(found) == pytest.approx(2.0 * OF_A_VOXEL)
+    stated = context(tmp_path / "stated", "[calibration]\nsurface_error_mm = 0.1\n")
+    assert surface_error_mm(stated) == 0.1
+
+
+def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None:
+    """Derivatives by both c times c, as much of it as is expected; exponents and times have no part."""
+    found = context(tmp_path)
+    record = over_bone(found)
+    parameters = found.study.vector(TRUTH)
+    moduli = [i for i, (_, name) in enumerate(found.study.parameters) if name == "c_kPa"]
+    jacobian = np.zeros((5, len(parameters)))
+    jacobian[:, moduli] = np.linspace(0, 1, 5)[:, None]
+    jacobian[:, moduli[0] + 1] = 7.0
+    (off,) = site_deviation(found, [record], [SiteResponse(np.ones(5), jacobian)], parameters)
+    assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * expected_share(found.study, record, GIVEN_MM))
