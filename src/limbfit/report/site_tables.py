@@ -1,4 +1,4 @@
-"""Table 2 of the paper: largest force and error of every record, and their means over sites."""
+"""Table 2 of the paper: largest force and error of every record, their means over sites, their residuals."""
 
 from __future__ import annotations
 
@@ -101,3 +101,11 @@ def _number_of_sites(rows: list[Json]) -> str:
     sites = len({row["site"] for row in rows})
     lacking = sites - len(_by_site(rows, "error_percent"))
     return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
+
+
+def noise_and_misfit(sites: Json) -> str:
+    """Standard deviations of each fitted record's noise and of the model's misfit, in words."""
+    rows = [(name, one.get("noise_sd_N"), one.get("misfit_sd_N"), one) for name, one in sites.items()]
+    return ", ".join(
+        f"{name} {fixed(a, 3)} and {fixed(b, 3)} {one.get('unit', 'N')}" for name, a, b, one in rows
+    )

@@ -11,7 +11,7 @@ from ...laws import OGDEN
 from ...shapes import SHAPES
 from ..formats import fixed, friction, held, number, symbol, unit_of
 from ..page import Prose, Section
-from ..site_tables import mean_and_deviation
+from ..site_tables import mean_and_deviation, noise_and_misfit
 from ..store import Json, Results
 from ..tables import NOTHING, flatten
 from .priors import constraints
@@ -351,13 +351,10 @@ def _uncertainty(store: Results) -> str:
     if not residuals:
         return ""
     sites = residuals.get("sites") or {}
-    said = [(fixed(one.get("noise_sd_N"), 3), fixed(one.get("misfit_sd_N"), 3)) for one in sites.values()]
-    units = [one.get("unit", "N") for one in sites.values()]
-    words = ", ".join(f"{n} {a} and {b} {unit}" for n, (a, b), unit in zip(sites, said, units, strict=True))
     return (
         "Residuals at the fitted sites are taken for noise of the records and a smooth misfit of the model, "
-        f"correlated along the record (standard deviations, site by site: {words}){_of_sites(sites)}. 95 % "
-        "intervals follow from their covariance and the exact derivatives, in the logarithms of the "
+        "correlated along the record (standard deviations, site by site: "
+        f"{noise_and_misfit(sites)}){_of_sites(sites)}. 95 % intervals follow from their covariance and the exact derivatives, in the logarithms of the "
         "parameters."
     )
 

@@ -176,10 +176,6 @@ def _residuals(store: Results) -> str:
     rows = found.get("sites") or {}
     if not rows:
         return ""
-    sites = ", ".join(
-        f"{name} {fixed(site['noise_sd_N'], 3)} and {fixed(site['misfit_sd_N'], 3)} {site.get('unit', 'N')}"
-        for name, site in rows.items()
-    )
     meshes, own = (
         ", ".join(
             f"{name} {fixed(100 * site[share], 1)} %"
@@ -190,7 +186,8 @@ def _residuals(store: Results) -> str:
     )
     return (
         "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
-        f"as recorded and of the smooth misfit of the model: {sites}. A misfit lasts about "
+        f"as recorded and of the smooth misfit of the model: {site_tables.noise_and_misfit(rows)}. "
+        "A misfit lasts about "
         f"{fixed(100 * found['correlation'], 0)} % of a record. "
         + (
             f"The error of the meshes is added, in percent of the largest force: {meshes}."
