@@ -354,8 +354,8 @@ def _uncertainty(store: Results) -> str:
     return (
         "Residuals at the fitted sites are taken for noise of the records and a smooth misfit of the model, "
         "correlated along the record (standard deviations, site by site: "
-        f"{noise_and_misfit(sites)}){_of_sites(sites)}. 95 % intervals follow from their covariance and the exact derivatives, in the logarithms of the "
-        "parameters."
+        f"{noise_and_misfit(sites)}){_of_sites(sites)}. 95 % intervals follow from their covariance and the "
+        "exact derivatives, in the logarithms of the parameters."
     )
 
 
