@@ -156,7 +156,7 @@ class Limb:
             result = solve(replace(problem, element=TRUE_ELEMENT), steps=steps, store="all")
             if not result.completed:
                 raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
-            times = model.curve_times(401)
+            times = model.curve_times(2001)
             lost, _ = compressions(result, model, times)
             told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
             told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}

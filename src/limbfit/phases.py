@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Kind = Literal["approach", "load", "hold", "unload"]
 
+# Of the points of a record those of its holds beside the others, and the power of its number that a point's
+# time in a hold goes with.
+_HELD, DENSER = 0.375, 2.5
 SHARE = 0.005  # of the travel: a smaller change is none
 
 
@@ -122,14 +125,21 @@ def spread(phases: Sequence[MotionPhase], points: int, among: Array | None = Non
     """About ``points`` times (k,) s, evenly over the phases, their boundaries and all ``among`` included.
 
     A phase that is short beside the others has ten steps nevertheless, or its part of half of the points.
+    Holds have times of their own, the denser the nearer to their start: most of what relaxes does so there.
     """
-    ends = boundaries(phases)
-    whole = float(np.ptp(ends))
+    holds = sum(phase.kind == "hold" for phase in phases)
+    moving = sum(phase.duration_s for phase in phases if phase.kind != "hold")
     least = min(10, max(points // (2 * len(phases)), 2))
-    grid = [ends[:1]]
-    for a, b in pairwise(ends):
-        steps = max(round((points - 1) * (b - a) / whole), least)
+    grid = [np.array([phases[0].start_s])]
+    for phase in phases:
+        a, b = phase.start_s, phase.end_s
         inner = np.array([]) if among is None else among[(among > a) & (among < b)]
+        if phase.kind == "hold":
+            count = max(round(_HELD * points / holds), 2 * least)
+            part = a + (b - a) * (np.arange(1, count + 1) / count) ** DENSER
+            grid.append(np.union1d(part, inner))
+            continue
+        steps = max(round((points - 1) * (b - a) / moving), least)
         for start, end in pairwise(np.r_[a, inner, b]):
             count = max(round(steps * (end - start) / (b - a)), 2)
             grid.append(np.linspace(start, end, count + 1)[1:])

@@ -14,7 +14,7 @@ from ..phases import MotionPhase, boundaries, find_phases, spread
 from .displacement import broken_line
 from .numerics import Array, rms
 from .record import Trace
-from .regularise import Regularised, SmoothCurve, with_samples
+from .regularise import Regularised, SmoothCurve, held, with_samples
 from .touchdown import TouchDown
 
 END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes may be anywhere
@@ -35,12 +35,12 @@ class Creep(Regularised):
         return float(self.displacement_mm.max())
 
     def resample(self, points: int) -> Creep:
-        """The same curves at about ``points`` times, spread evenly in time, every corner among them."""
+        """The same curves at about ``points`` times (`spread`), every corner among them."""
         time = spread(self.phases, points, self.knots_s)
         return replace(
             self,
             time_s=time,
-            displacement_mm=np.interp(time, self.time_s, self.displacement_mm),
+            displacement_mm=self.curve(time),
             force_N=np.interp(time, self.knots_s, self.knots_N),
         )
 
@@ -71,7 +71,8 @@ def regularise_creep(
     knots_N[0] = 0.0
     of_force = find_phases(knots, knots_N)
     moved = trace.displacement_mm - touch_down.displacement_mm
-    curve = SmoothCurve(since, moved, with_samples(boundaries(of_force), since), smoothing)
+    parts = with_samples(boundaries(of_force), since)
+    curve = SmoothCurve(since, moved, parts, smoothing, held(parts, of_force))
     inside = (since >= 0.0) & (since <= end)
     phases = tuple(_as_moved(phase, curve) for phase in of_force)
     time = spread(phases, 1000, knots)

@@ -19,9 +19,12 @@ def rms(residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2)))
 
 
-def bins(x: Array, y: Array, most: int) -> tuple[Array, Array, Array]:
-    """Averages of x and y over at most ``most`` runs of samples, and how many samples are in each."""
-    edges = np.unique(np.linspace(0, len(x), min(most, len(x)) + 1).astype(int))
+def bins(x: Array, y: Array, most: int, power: float = 1.0) -> tuple[Array, Array, Array]:
+    """Averages of x and y over at most ``most`` runs of samples, and how many samples are in each.
+
+    Runs are as long, or with a ``power`` the shorter the nearer to the start.
+    """
+    edges = np.unique((len(x) * np.linspace(0, 1, min(most, len(x)) + 1) ** power).astype(int))
     n = np.diff(edges).astype(float)
     return np.add.reduceat(x, edges[:-1]) / n, np.add.reduceat(y, edges[:-1]) / n, n
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
-from ..phases import MotionPhase, boundaries, find_phases, spread, way_in
+from ..phases import DENSER, MotionPhase, boundaries, find_phases, spread, way_in
 from .displacement import broken_line
 from .numerics import Array, bins, curved, rms
 from .record import Trace
@@ -70,13 +70,13 @@ class Regularised:
         return next((abs(phase.rate_mm_s) for phase in self.phases if phase.kind == kind), float("nan"))
 
     def resample(self, points: int) -> Regularised:
-        """The same curves at about ``points`` times, spread evenly in time, every corner among them."""
+        """The same curves at about ``points`` times (`spread`), every corner among them."""
         time = spread(self.phases, points, self.knots_s)
         return replace(
             self,
             time_s=time,
             displacement_mm=np.interp(time, self.knots_s, self.knots_mm),
-            force_N=np.interp(time, self.time_s, self.force_N),
+            force_N=np.maximum(self.curve(time), 0.0),
         )
 
 
@@ -113,7 +113,7 @@ def regularise(
     if ((trace.time_s >= start) & (trace.time_s <= line.peak_s)).sum() < 8:
         raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
     corners = with_samples(boundaries(phases), trace.time_s - start)
-    curve = SmoothCurve(trace.time_s - start, force, corners, smoothing)
+    curve = SmoothCurve(trace.time_s - start, force, corners, smoothing, held(corners, phases))
     inside = (trace.time_s >= start) & (trace.time_s <= end)
     time = spread(phases, 1000, knots - start)
     return Regularised(
@@ -143,16 +143,45 @@ def with_samples(corners: Array, time: Array) -> Array:
     return np.array(kept)
 
 
+def held(corners: Array, phases: Sequence[MotionPhase]) -> tuple[bool, ...]:
+    """Whether each part between the corners is a hold."""
+    middles = (corners[1:] + corners[:-1]) / 2
+    return tuple(any(p.kind == "hold" and p.start_s < middle < p.end_s for p in phases) for middle in middles)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Time since a part's start, as it goes for the part: in a hold slower and slower, as what relaxes."""
+
+    start_s: float
+    end_s: float
+    power: float
+
+    def __call__(self, time_s: Array | float) -> Array:
+        whole = self.end_s - self.start_s
+        share = np.clip((np.asarray(time_s) - self.start_s) / whole, 0.0, 1.0)
+        return np.asarray(whole * share ** (1.0 / self.power))
+
+
 class SmoothCurve:
     """Force over time: smoothing splines per part that meet at the corners; the first starts from zero.
 
-    Called with times (n,) s from touch-down on it gives forces (n,) N.  Once the penalties are chosen it is
-    linear in the record: ``response`` says what the same smoothing makes of another force.
+    In parts that are ``held`` they are splines of a power of the time since its start, in which a relaxation
+    is as smooth there as later on.  Called with times (n,) s from touch-down on it gives forces (n,) N.  Once
+    the penalties are chosen it is linear in the record: ``response`` says what the same smoothing makes of
+    another force.
     """
 
-    def __init__(self, time: Array, force: Array, corners: Array, smoothing: float | None) -> None:
-        parts = [(time >= a) & (time <= b) for a, b in pairwise(corners)]
-        self._bins = [bins(time[part], force[part], _BINS) for part in parts]
+    def __init__(
+        self, time: Array, force: Array, corners: Array, smoothing: float | None, held: Sequence[bool]
+    ) -> None:
+        powers = [DENSER if hold else 1.0 for hold in held]
+        self._clocks = [_Clock(a, b, p) for (a, b), p in zip(pairwise(corners), powers, strict=True)]
+        parts = [(time >= clock.start_s) & (time <= clock.end_s) for clock in self._clocks]
+        self._bins = [
+            bins(clock(time[part]), force[part], _BINS, clock.power)
+            for clock, part in zip(self._clocks, parts)
+        ]
         self._corners = corners
         given = [(smoothing, smoothing)] * len(self._bins)
         self._splines, self._penalties = self._fitted([averages for _, averages, _ in self._bins], given)
@@ -167,10 +196,10 @@ class SmoothCurve:
         Straight between, a convex force would be too large everywhere.
         """
         given = []
-        for (x, _, _), start, end in zip(self._bins, self._corners, self._corners[1:]):
-            near = np.flatnonzero((at >= start - _SAME_S) & (at <= end + _SAME_S))
+        for (x, _, _), clock in zip(self._bins, self._clocks):
+            near = np.flatnonzero((at >= clock.start_s - _SAME_S) & (at <= clock.end_s + _SAME_S))
             matrix = np.zeros((len(x), len(at)))
-            matrix[:, near] = curved(x, at[near])
+            matrix[:, near] = curved(x, clock(at[near]))
             given.append(matrix)
         splines, _ = self._fitted(given, self._penalties)
         return self._joined(splines, at)
@@ -178,7 +207,7 @@ class SmoothCurve:
     def _joined(self, splines: Sequence[BSpline], at: Array) -> Array:
         """At each of the times (n,) the spline of its part (n, ...)."""
         part = np.clip(np.searchsorted(self._corners, at, side="left") - 1, 0, len(splines) - 1)
-        values: Array = np.stack([spline(at) for spline in splines])
+        values: Array = np.stack([spline(clock(at)) for spline, clock in zip(splines, self._clocks)])
         return values[part, np.arange(len(at))]
 
     def _fitted(
@@ -187,13 +216,13 @@ class SmoothCurve:
         """Splines of averages (bins of a part, ...) per part; their penalties, free and with ends given."""
         data = [(x, y, w) for (x, _, w), y in zip(self._bins, values)]
         free = [_spline(*d, penalty, {}) for d, (penalty, _) in zip(data, penalties)]
-        ends = dict.fromkeys(map(float, self._corners), np.zeros(values[0].shape[1:]))
         # The way up to a corner is smooth; the way from it starts with the fastest relaxation, which a spline
         # blunts.
-        ends |= {float(at): before(at) for at, (before, _) in zip(self._corners[1:], free)}
+        ends = [np.zeros(values[0].shape[1:])]
+        ends += [before(clock(clock.end_s)) for clock, (before, _) in zip(self._clocks, free)]
         pinned = []
-        for k, (d, (_, penalty)) in enumerate(zip(data, penalties)):
-            own = {float(c): ends[float(c)] for c in self._corners[k : k + 2]}
+        for k, (d, clock, (_, penalty)) in enumerate(zip(data, self._clocks, penalties)):
+            own = {0.0: ends[k], clock.end_s - clock.start_s: ends[k + 1]}
             pinned.append(_spline(*d, penalty, own))
         return [spline for spline, _ in pinned], [(f, p) for (_, f), (_, p) in zip(free, pinned)]
 
