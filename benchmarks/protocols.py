@@ -196,13 +196,20 @@ class Limb:
 
 
 def write_case(
-    folder: Path, limb: Limb, takes: Sequence[Take], edge_mm: float, prior: bool, held_out: Sequence[Take]
+    folder: Path,
+    limb: Limb,
+    takes: Sequence[Take],
+    edge_mm: float | None,
+    prior: bool,
+    held_out: Sequence[Take],
 ) -> None:
     """A study with these records of its fitted sites, and those that are ``held_out``."""
     every = (*takes, *held_out)
     save_anatomy(folder / "limb", Stump().anatomy(STUDY_SPACING_MM))
     text = HEAD.replace("edge_near_mm = 6.0", f"edge_near_mm = {edge_mm}")
     text = text.replace("load_steps = 5\nunload_steps = 4", "load_steps = 8\nunload_steps = 12")
+    if edge_mm is None:  # a study that states nothing but its data
+        text = HEAD[: HEAD.index("[solver]")] + "[calibration]\n"
     if prior:
         text = text.replace("[calibration]\n", f"[calibration]\n{PRIORS}")
     text += BALL_TABLE if any(take.ball for take in takes) else ""
@@ -226,7 +233,7 @@ def minutes_of(takes: Sequence[Take]) -> float:
     return (sum(take.knots[0][-1] + REST_S for take in takes) + SETUP_S * len(places)) / 60.0
 
 
-def plan_study(folder: Path, limb: Limb, edge_mm: float) -> Study:
+def plan_study(folder: Path, limb: Limb, edge_mm: float | None) -> Study:
     """The fitted sites as they are before anybody is indented but for a ramp at each, with both indenters."""
     place = folder / "plan"
     if not (place / "study.toml").is_file():
@@ -238,7 +245,7 @@ def plan_study(folder: Path, limb: Limb, edge_mm: float) -> Study:
     return study
 
 
-def designed(folder: Path, limb: Limb, edge_mm: float, ultrasound: bool) -> tuple[Take, ...]:
+def designed(folder: Path, limb: Limb, edge_mm: float | None, ultrasound: bool) -> tuple[Take, ...]:
     """The protocol that limbfit designs before anybody is indented: at the start and two more tissues."""
     seen = ULTRASOUND_NOISE_MM if ultrasound else None
     found = plan_protocol(
@@ -262,7 +269,7 @@ def designed(folder: Path, limb: Limb, edge_mm: float, ultrasound: bool) -> tupl
 
 
 def told_of(
-    folder: Path, limb: Limb, edge_mm: float, takes: Sequence[Take], misfit: float
+    folder: Path, limb: Limb, edge_mm: float | None, takes: Sequence[Take], misfit: float
 ) -> dict[Take, Option]:
     """What records tell of the true tissue where the model's own error is ``misfit`` of the largest value.
 
@@ -293,13 +300,13 @@ def told_of(
     return found
 
 
-def wanted_of(folder: Path, limb: Limb, edge_mm: float) -> Wanted:
+def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> Wanted:
     """All eight parameters, given the study's bounds."""
     return Wanted(prior_information(unknowns(plan_study(folder, limb, edge_mm))), tuple(range(8)))
 
 
 def best_at_truth(
-    folder: Path, limb: Limb, edge_mm: float, minutes: float, misfit: float, seen: bool
+    folder: Path, limb: Limb, edge_mm: float | None, minutes: float, misfit: float, seen: bool
 ) -> tuple[Take, ...]:
     """The protocol of so many minutes that linear theory prefers at the true tissue."""
     ways = product(FITTED, (SLOW, FAST), (0.0, HOLD_S), (False, True))
@@ -309,7 +316,7 @@ def best_at_truth(
     return tuple(every[i] for i in best)
 
 
-def expected(folder: Path, limb: Limb, edge_mm: float) -> list[dict[str, Any]]:
+def expected(folder: Path, limb: Limb, edge_mm: float | None) -> list[dict[str, Any]]:
     """What linear theory expects of every protocol at the true tissue, by the size of the model's own error.
 
     The designed ones are the best that fit into the session; all within the study's bounds.
@@ -364,7 +371,7 @@ def judged(folder: Path, limb: Limb, takes: Sequence[Take]) -> dict[str, Any]:
     }
 
 
-def run_case(folder: Path, name: str, seed: int, edge_mm: float) -> dict[str, Any]:
+def run_case(folder: Path, name: str, seed: int, edge_mm: float | None) -> dict[str, Any]:
     limb = Limb(folder, seed)
     place = folder / f"{seed}-{name.replace(' ', '-')}"
     began = resource.getrusage(resource.RUSAGE_SELF).ru_utime
@@ -407,7 +414,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("runs/protocols"))
     parser.add_argument("--only", nargs="+", choices=CASES, default=CASES)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--edge", type=float, default=6.0, help="of the study's meshes near a site, mm")
+    parser.add_argument(
+        "--edge", type=float, help="of the study's meshes near a site, mm; else limbfit's own"
+    )
     parser.add_argument("--json", type=Path, help="write every case here; cases found there are kept")
     parser.add_argument("--expected", action="store_true", help="linear theory at the truth instead of fits")
     given = parser.parse_args()
