@@ -16,6 +16,8 @@ MAX_SAMPLES = 20_000_000
 SPEED_MM_S = (0.05, 50.0)
 TRAVEL_MM = (0.2, 60.0)
 PEAK_N = (0.05, 200.0)
+_RUNS = 200  # of samples whose mean force is looked at
+_FIRST, _STILL = 5, 0.02  # samples at the least that tell the force at the start; of the travel
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,10 @@ def check_trace(
 
 def _check_contact(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
     noise = noise_level(trace.force_N)
-    _, force, _ = bins(trace.time_s, trace.force_N, 60)
-    start = float(np.median(force[: max(len(force) // 20, 1)]))
+    _, force, _ = bins(trace.time_s, trace.force_N, _RUNS)
+    travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_FIRST]))
+    moving = np.flatnonzero(travel > _STILL * travel.max())  # before a fast ramp there are few samples
+    start = float(np.median(trace.force_N[: max(int(moving[0]) if moving.size else 0, _FIRST)]))
     rise, fall = float(force.max()) - start, start - float(force.min())
     if rise <= 5 * noise and fall > 5 * noise and fall > 2 * rise:
         remedy = "pushing must be positive: change the sign"
