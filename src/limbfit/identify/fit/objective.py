@@ -1,7 +1,8 @@
 """What is compared: forces simulated and measured, as a vector of residuals and its derivatives.
 
 Two objectives. ``pointwise`` takes every force difference, over the site's largest measured force and the
-root of its number of points, so that each site counts alike whatever its stiffness or sampling. ``paper``
+root of its number of points, so that each site counts alike whatever its stiffness or sampling; what a
+doubtful touch-down does to a record counts for less (generalised least squares on that one shape). ``paper``
 takes equation 8 as printed, one mean squared difference per site, which least squares then squares again.
 """
 
@@ -27,7 +28,9 @@ class Measured:
     """A record at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost.
 
     ``site`` is where it is from, the same for all records of a site; by default its own. Under a stated
-    force the depth is compared: ``force_N`` is that, and ``unit`` mm.
+    force the depth is compared: ``force_N`` is that, and ``unit`` mm. ``doubt_N`` (n,) is one standard
+    deviation of what its touch-down may have done to it, beside which it may be off by ``error_share`` of its
+    largest force throughout.
     """
 
     name: str
@@ -35,6 +38,8 @@ class Measured:
     weight: float = 1.0
     site: str = ""
     unit: str = "N"
+    doubt_N: Array | None = None
+    error_share: float = 0.01
 
     def __post_init__(self) -> None:
         if self.force_N.size < 2 or not np.all(np.isfinite(self.force_N)) or self.force_N.max() <= 0:
@@ -49,6 +54,14 @@ class Measured:
     def scale(self) -> float:
         """1 / (largest force x sqrt(n)), times the root of the weight."""
         return float(np.sqrt(self.weight / self.force_N.size) / self.force_N.max())
+
+    def discounted(self, rows: Array, power: float = 0.5) -> Array:
+        """Rows (n, ...) times a power of the inverse covariance that the touch-down's doubt alone gives."""
+        if self.doubt_N is None or not (size := float(np.linalg.norm(self.doubt_N))):
+            return rows
+        shape = self.doubt_N / size
+        variance = 1.0 + (size / self.force_N.max() / self.error_share) ** 2 / self.force_N.size
+        return np.asarray(rows - np.multiply.outer(shape, (1.0 - variance**-power) * (shape @ rows)))
 
 
 @dataclass(frozen=True)
@@ -132,7 +145,8 @@ def residuals(
 
 
 def _pointwise(response: SiteResponse, site: Measured) -> tuple[Array, Array]:
-    return (response.force_N - site.force_N) * site.scale, response.jacobian * site.scale
+    difference = response.force_N - site.force_N
+    return site.discounted(difference) * site.scale, site.discounted(response.jacobian) * site.scale
 
 
 def _mean_squares(response: SiteResponse, site: Measured) -> tuple[Array, Array]:
@@ -159,6 +173,6 @@ def curvature(objective: Objective, difference_N: Array, site: Measured) -> Arra
     """
     n = difference_N.size
     if objective == "pointwise":
-        return site.scale**2 * np.eye(n)
+        return site.scale**2 * site.discounted(np.eye(n), power=1.0)
     square = max(float(difference_N @ difference_N), n * (_EXACT * float(site.force_N.max())) ** 2)
     return 2 * (site.weight / n) ** 2 * (square * np.eye(n) + 2 * np.outer(difference_N, difference_N))

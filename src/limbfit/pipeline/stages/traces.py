@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...errors import TraceError
 from ...identify.fit.objective import Measured, SiteResponse
+from ...identify.uncertainty.noise import depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...phases import MotionPhase, in_words
 from ...study import Record, Site, Study
@@ -120,7 +121,8 @@ class SiteRecord:
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
     blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
     same mesh. With ``seen`` it is what ultrasound saw of one tissue meanwhile that is compared, of the same
-    simulation; ``weight`` is how much that counts beside a force.
+    simulation; ``weight`` is how much that counts beside a force. ``touch_down_sd_mm`` is how far the
+    touch-down may be off, ``error_share`` how far forces may be beside that.
     """
 
     record: Record
@@ -133,6 +135,8 @@ class SiteRecord:
     nested_mm: float | None = None
     seen: Thinning | None = None
     weight: float = 1.0
+    touch_down_sd_mm: float = 0.0
+    error_share: float = 0.01
 
     @property
     def name(self) -> str:
@@ -152,7 +156,15 @@ class SiteRecord:
     def measured(self) -> Measured:
         """What the calibration compares with."""
         weight = self.weight * self.record.weight
-        return Measured(self.name, self.compared, weight, self.site.name, self.unit)
+        doubt = self.touch_down_sd_mm * self._by_depth if self.seen is None else None
+        return Measured(self.name, self.compared, weight, self.site.name, self.unit, doubt, self.error_share)
+
+    @property
+    def _by_depth(self) -> Array:
+        """How the record (n,) changes with the place of its touch-down, N/mm, or mm/mm."""
+        if self.record.forced:
+            return np.ones_like(self.times_s)
+        return self.smoothing @ depth_slope(self.times_s, self.displacement_mm, self.force_N)
 
     @property
     def compared(self) -> Array:
@@ -211,6 +223,7 @@ def as_response(simulation: Simulation) -> SiteResponse:
 def site_record(context: Context, record: Record) -> SiteRecord:
     """A stored record and its site's model, on the whole of its own mesh."""
     curves = read_curves(context.store["traces"] / f"{record.name}.csv")
+    facts = context.stored("traces", "traces.json")["sites"][record.name]
     return SiteRecord(
         record=record,
         tissues=context.study.tissues,
@@ -220,6 +233,8 @@ def site_record(context: Context, record: Record) -> SiteRecord:
         force_N=curves["force_N"],
         smoothing=np.load(context.store["traces"] / SMOOTHING.format(record.name)),
         nested_mm=context.study.within_mm if context.study.mesh.coarse is None else None,
+        touch_down_sd_mm=facts["touch_down_uncertainty_mm"],
+        error_share=context.study.calibration.force_error_percent / 100.0,
     )
 
 
