@@ -101,7 +101,7 @@ def test_drawn_cases_complete_and_keep_to_the_laws(robustness, number):
 @pytest.mark.slow
 def test_folds_of_a_soft_skin_on_a_stiff_muscle_are_gone_through(robustness):
     """Directions that only a small part of can be used: undamped it was not done after 120 s."""
-    outcome = robustness.run_case(0, 6, "tet10p0")
+    outcome = robustness.run_case(0, 6)
     assert outcome.outcome == "completed", outcome.reason
 
 
