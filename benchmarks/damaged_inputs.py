@@ -29,6 +29,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import damage_dicom  # noqa: F401
+import damage_enhanced  # noqa: F401
 import damage_files  # noqa: F401
 import damage_labels  # noqa: F401
 import damage_surfaces  # noqa: F401

@@ -18,93 +18,33 @@ import json
 import os
 import resource
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from identification_cases import (
-    HEAD,
-    INDENTER,
-    NOISE_N,
-    SPOTS,
-    STUDY_SPACING_MM,
-    TRUE_ELEMENT,
-    TRUE_MESH,
-    TRUE_SPACING_MM,
-    TRUE_STEPS,
-    Spot,
-    Stump,
-    parameters_of,
-)
+from identification_cases import SPOTS, parameters_of
+from protocols_limb import BALL_TABLE, SLOW, TISSUES, Limb, Take, write_case
 
 from limbfit import load_study, plan_protocol, run_study
-from limbfit.anatomy.meshing.meshing import base_mesh, mesh_site
-from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
-from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.execution import SerialExecutor
-from limbfit.fe import solve
 from limbfit.identify.checks.design import NoiseModel, information_of, prior_information
 from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan
 from limbfit.identify.fit.objective import SiteResponse
-from limbfit.indentation import SiteModel, build_problem, compressions, to_vector
-from limbfit.mesh import Mesh, gauges_along, read_vtu, write_vtu
-from limbfit.phantom.record import (
-    CLEARANCE_MM,
-    DISPLACEMENT_NOISE_MM,
-    HEADER,
-    RATE_HZ,
-    ULTRASOUND_HZ,
-    ULTRASOUND_NOISE_MM,
-)
+from limbfit.indentation import to_vector
+from limbfit.phantom.record import ULTRASOUND_NOISE_MM
 from limbfit.pipeline.experiments.protocol import DETERMINED
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
-from limbfit.pipeline.shared.store import Store, write_json
+from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.laboratory import unknowns
-from limbfit.study import IndenterTable, Study
+from limbfit.study import Study
 
-SLOW, FAST, HOLD_S = 0.96, 4.8, 30.0
-BALL = IndenterTable(shape="sphere", width_mm=12.0)
-BALL_TABLE = '\n[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
-PRIORS = 'priors = "population"\n'
+FAST, HOLD_S = 4.8, 30.0
 REST_S, SETUP_S, MINUTES = 30.0, 60.0, 25.0
-AFTER_S = 0.4
 # Of linear theory: noise of a compared force, and the model's own error, which drifts along a record.
 EXPECTED_N, EXPECTED_CORRELATION, MISFITS = 0.015, 0.95, (0.02, 0.01, 0.005, 0.002)
-TISSUES = ("skin", "muscle")
-
-
-@dataclass(frozen=True)
-class Take:
-    """One record: where, with what, how fast and held for how long; ``seen``: with ultrasound."""
-
-    site: str
-    speed: float = SLOW
-    hold_s: float = 0.0
-    ball: bool = False
-    depth: float | None = None
-    seen: bool = False
-
-    @property
-    def name(self) -> str:
-        depth = "" if self.depth is None else f"-{self.depth:g}mm"
-        return f"{self.site}-{'ball' if self.ball else 'punch'}-{self.speed:g}-{self.hold_s:g}s{depth}"
-
-    @property
-    def spot(self) -> Spot:
-        return next(spot for spot in SPOTS if spot.name == self.site)
-
-    @property
-    def knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        depth = self.depth or self.spot.depth
-        ramp = depth / self.speed
-        if not self.hold_s:
-            return (0.0, ramp, 2 * ramp), (0.0, depth, 0.0)
-        return (0.0, ramp, ramp + self.hold_s, 2 * ramp + self.hold_s), (0.0, depth, depth, 0.0)
-
-
 FITTED = tuple(spot.name for spot in SPOTS if spot.fitted)
 HELD_OUT = tuple(Take(spot.name) for spot in SPOTS if not spot.fitted)
 RAMPS = tuple(Take(site) for site in FITTED)
@@ -119,112 +59,6 @@ INGREDIENTS: dict[str, tuple[Take, ...]] = {
 DESIGNED = ("designed", "designed without ultrasound", "designed with prior")
 SHORT, SHORT_MINUTES = "8 minutes", 8.0  # the best at the true tissue
 CASES = (*INGREDIENTS, *DESIGNED, SHORT)
-
-
-@dataclass(frozen=True)
-class Limb:
-    """The true limb of a seed, whose meshes and answers are kept in a folder."""
-
-    folder: Path
-    seed: int
-
-    def _mesh(self, site: str) -> tuple[Mesh, tuple[float, ...], tuple[float, ...]]:
-        file, place = self.folder / "truth" / f"{site}.vtu", self.folder / "truth" / f"{site}.json"
-        if not place.is_file():
-            anatomy = Stump().anatomy(TRUE_SPACING_MM)
-            spot = Take(site).spot
-            position, _ = project_to_skin(anatomy, Stump().at(spot.degrees, spot.height))
-            axis = indenter_axis(anatomy.skin, position, INDENTER.width_mm)
-            mesh, _ = mesh_site(anatomy, position, axis, TRUE_MESH, base_mesh(anatomy, TRUE_MESH))
-            write_vtu(mesh, file)
-            write_json(place, {"position": list(map(float, position)), "axis": list(map(float, axis))})
-        known = json.loads(place.read_text())
-        return read_vtu(file), tuple(known["position"]), tuple(known["axis"])
-
-    def answer(self, take: Take) -> dict[str, np.ndarray]:
-        """Times from touch-down, true force and compressions, and the layers' thickness; simulated once."""
-        file = self.folder / "truth" / f"{self.seed}-{take.name}.npz"
-        if not file.is_file():
-            file.parent.mkdir(parents=True, exist_ok=True)
-            mesh, position, axis = self._mesh(take.site)
-            indenter = BALL if take.ball else INDENTER
-            model = SiteModel(take.name, Path(), "", position, axis, *take.knots, indenter=indenter)
-            gauges = gauges_along(mesh, np.array(position), np.array(axis))
-            model = replace(model, layers=tuple(one.region for one in gauges))
-            problem = build_problem(model, mesh, parameters_of(self.seed))
-            steps = replace(TRUE_STEPS, load_steps=12, unload_steps=20)  # holds take those of unloading
-            result = solve(replace(problem, element=TRUE_ELEMENT), steps=steps, store="all")
-            if not result.completed:
-                raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
-            times = model.curve_times(2001)
-            lost, _ = compressions(result, model, times)
-            told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
-            told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}
-            np.savez(file, times=times, force=result.force_at(times), **told)
-        with np.load(file) as stored:
-            return dict(stored)
-
-    def write(self, folder: Path, take: Take) -> None:
-        """What the robot writes of a record, and what ultrasound sees."""
-        found = self.answer(take)
-        random = np.random.default_rng([self.seed, *take.name.encode()])
-        clearance = random.uniform(*CLEARANCE_MM)
-        touch = clearance / take.speed
-        knots_s, knots_mm = take.knots
-        path_s = np.array([0.0, *(touch + t for t in knots_s), knots_s[-1] + 2 * touch])
-        path_mm = np.array([0.0, *(clearance + d for d in knots_mm), 0.0])
-        time = np.arange(0.0, path_s[-1] + AFTER_S, 1 / RATE_HZ)
-        moved = np.interp(time, path_s, path_mm) + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size)
-        force = np.interp(time - touch, found["times"], found["force"], left=0.0, right=0.0)
-        force = force + NOISE_N * random.standard_normal(time.size)
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savetxt(
-            folder / f"{take.name}.csv", np.column_stack([time, moved, force]), fmt=("%.3f", "%.4f", "%.4f"),
-            delimiter=",", header=HEADER, comments="",
-        )  # fmt: skip
-        if take.seen:
-            time = np.arange(0.0, path_s[-1], 1 / ULTRASOUND_HZ)
-            columns = [time]
-            for tissue in TISSUES:
-                lost = np.interp(time - touch, found["times"], found[f"compression_{tissue}"], left=0.0)
-                noise = ULTRASOUND_NOISE_MM * random.standard_normal(time.size)
-                columns.append(float(found[f"thickness_{tissue}"]) - lost + noise)
-            np.savetxt(
-                folder / f"{take.name}-layers.csv", np.column_stack(columns), fmt="%.3f", delimiter=",",
-                header=",".join(["time_s", *(f"{tissue}_mm" for tissue in TISSUES)]), comments="",
-            )  # fmt: skip
-
-
-def write_case(
-    folder: Path,
-    limb: Limb,
-    takes: Sequence[Take],
-    edge_mm: float | None,
-    prior: bool,
-    held_out: Sequence[Take],
-) -> None:
-    """A study with these records of its fitted sites, and those that are ``held_out``."""
-    every = (*takes, *held_out)
-    save_anatomy(folder / "limb", Stump().anatomy(STUDY_SPACING_MM))
-    text = HEAD.replace("edge_near_mm = 6.0", f"edge_near_mm = {edge_mm}")
-    text = text.replace("load_steps = 5\nunload_steps = 4", "load_steps = 8\nunload_steps = 12")
-    if edge_mm is None:  # a study that states nothing but its data
-        text = HEAD[: HEAD.index("[solver]")] + "[calibration]\n"
-    if prior:
-        text = text.replace("[calibration]\n", f"[calibration]\n{PRIORS}")
-    text += BALL_TABLE if any(take.ball for take in takes) else ""
-    for spot in SPOTS:
-        if any(take.site == spot.name for take in every):
-            text += f'\n[[sites]]\nname = "{spot.name}"\nregion = "{spot.region}"\n'
-            text += f"fitted = {json.dumps(spot.fitted)}\n"
-            text += f"position = {Stump().at(spot.degrees, spot.height).tolist()}\n"
-    for take in every:
-        limb.write(folder / "traces", take)
-        name = take.name.removeprefix(f"{take.site}-")
-        text += f'\n[[records]]\nsite = "{take.site}"\nname = "{name}"\ntrace = "traces/{take.name}.csv"\n'
-        text += 'indenter = "ball"\n' if take.ball else ""
-        text += f'ultrasound = "traces/{take.name}-layers.csv"\n' if take.seen else ""
-    (folder / "study.toml").write_text(text, encoding="utf-8")
 
 
 def minutes_of(takes: Sequence[Take]) -> float:

@@ -12,7 +12,7 @@ from limbfit.anatomy.imaging import Volume
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 from damage import Whole
-from damage_dicom import write_enhanced
+from damage_enhanced import write_enhanced
 from damage_labels import write_rtstruct, write_seg
 
 __all__ = ["enhanced", "write_rtstruct", "write_seg"]

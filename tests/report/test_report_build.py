@@ -1,4 +1,4 @@
-"""The report of a finished study, and of studies in which something is missing or hostile."""
+"""The report of a finished study."""
 
 from __future__ import annotations
 
@@ -6,46 +6,18 @@ import base64
 import hashlib
 import json
 import re
-import shutil
 import subprocess
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from stored_results import SITES, add_fat, write_results
+from page_outline import Outline, section_of, without_scripts
+from stored_results import SITES, write_results
 
-from limbfit import compress_cube
-from limbfit.errors import InputError
 from limbfit.report import build_report
 from limbfit.report.formats import held
 from limbfit.web.arrays import unpack
-
-SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
-VOID = {"meta", "link", "br", "img", "input", "hr", "path", "image", "use", "line", "circle"}
-
-
-class Outline(HTMLParser):
-    """Collects tags with attributes, identifiers, and checks that what opens also closes."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str]]] = []
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, {name: value or "" for name, value in attrs}))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag not in VOID:
-            assert self.open.pop() == tag
-
-    def all(self, tag: str) -> list[dict[str, str]]:
-        return [attrs for name, attrs in self.tags if name == tag]
 
 
 @pytest.fixture(scope="module")
@@ -58,32 +30,15 @@ def report(results: Path) -> str:
     return build_report(results, results / "report").read_text(encoding="utf-8")
 
 
-@pytest.fixture
-def copy(results: Path, tmp_path: Path) -> Path:
-    """The results without the geometry that only pictures need, to change and to break."""
-    left_out = shutil.ignore_patterns("report", "*.vtu", "*.stl")
-    return Path(shutil.copytree(results, tmp_path / "results", ignore=left_out))
-
-
-def _section(text: str, name: str) -> str:
-    found = re.search(rf'<section id="{name}".*?</section>', text, re.DOTALL)
-    assert found, name
-    return found.group()
-
-
 def test_one_file_without_requests(report: str) -> None:
     outline = Outline(report)
     links = [a.get(key, "") for _, a in outline.tags for key in ("src", "href", "xlink:href", "srcset")]
     assert [link[:40] for link in links if link and not link.startswith(("#", "data:"))] == []
-    written = _without_scripts(report)
+    written = without_scripts(report)
     assert "http:" not in written
     assert "https:" not in written
     assert re.findall(r"@import|url\((?!#)", written) == []
     assert [a for a in outline.all("script") if "src" in a] == []
-
-
-def _without_scripts(text: str) -> str:
-    return re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
 
 
 def test_only_the_reports_own_script_may_run(report: str) -> None:
@@ -140,7 +95,7 @@ def test_one_small_file(results: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("section", ["model", "meshes", "records", "prediction", "solver"])
 def test_every_site_in_every_table(report: str, section: str) -> None:
-    text = _section(report, section)
+    text = section_of(report, section)
     for site, *_ in SITES:
         assert f'<th scope="row">{site}</th>' in text
 
@@ -170,30 +125,6 @@ def test_parameter_table_shows_start_both_stages_interval_and_truth(report: str)
     assert len(cells) == 9
 
 
-def test_three_tissues_stand_in_every_table_and_curve(copy: Path) -> None:
-    text = build_report(add_fat(copy), copy / "report").read_text(encoding="utf-8")
-    assert Outline(text).open == []
-    table = re.search(r'<table id="table-parameters">.*?</table>', text, re.DOTALL)
-    assert table
-    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table.group(), re.DOTALL)
-    cells = [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
-    assert cells[0][4:6] == ["One material", "Three materials"]
-    assert [row[0] for row in cells[1:]] == ["Skin"] * 4 + ["Fat"] * 4 + ["Muscle"] * 4
-    assert cells[5][3:] == ["4.70", "4.71", "1.80", "0.900 to 3.60", "not determined", "1.80"]
-    assert "fat, long-term shear modulus c (0.900 to 3.60 kPa)" in text
-    assert "first as one material, then as skin, fat and muscle." in text
-    assert "three materials predict better." in text
-    assert "Error, three materials (%)" in _section(text, "prediction")
-    assert "skin 1.50 ± 0.01, fat 4.72 ± 1.31" in _section(text, "meshes")
-    assert "skin (1.5 mm), fat (as thick as the segmented fat, at least 1.0 mm)" in text
-    convergence = _section(text, "convergence")
-    assert convergence.count("var(--third)") >= 4  # the third tissue's curve, a panel for each parameter
-    assert ">truth, fat</text>" in convergence
-    assert _section(text, "parameters").count('scope="col"') >= 12
-    assert "two materials" not in text
-    assert "two tissues" not in text
-
-
 def test_site_table_marks_the_fitted(report: str) -> None:
     table = re.search(r'<table id="table-sites">.*?</table>', report, re.DOTALL)
     assert table
@@ -203,14 +134,14 @@ def test_site_table_marks_the_fitted(report: str) -> None:
 
 
 def test_mesh_facts(report: str) -> None:
-    text = _section(report, "meshes")
+    text = section_of(report, "meshes")
     assert "3.00 ± 0.02" in text
     assert '<td class="number">412</td>' in text
     assert "<li>Site TI-2: the layer is thin at the tibial crest</li>" in text
 
 
 def test_correlations_are_coloured_by_sign(report: str) -> None:
-    text = _section(report, "parameters")
+    text = section_of(report, "parameters")
     assert re.search(r'class="number cold" style="--shade:68%">−0\.90<', text)
     assert re.search(r'class="number warm" style="--shade:75%">1\.00<', text)
 
@@ -223,142 +154,14 @@ def test_pictures_show_the_model(report: str) -> None:
     assert min(len(image) for image in images) > 20_000  # an empty picture compresses to far less
 
 
-def test_names_are_escaped(copy: Path) -> None:
-    evil = '<script>alert("x")</script> & $x^2$'
-    for file in copy.rglob("*.json"):
-        text = file.read_text()
-        file.write_text(
-            text.replace('"tibia"', json.dumps(evil)).replace("Phantom 7 (coarse)", "a <b>bold</b> limb")
-        )
-    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
-    assert "<script>alert" not in text
-    assert "<b>" not in _without_scripts(text)
-    assert "a &lt;b&gt;bold&lt;/b&gt; limb" in text
-    assert "&lt;script&gt;" in text
-    assert Outline(text).open == []
-
-
-@pytest.mark.parametrize(
-    ("gone", "section", "sentence"),
-    [
-        ("surfaces", "model", "Label map (cm³)"),
-        ("mesh", "meshes", "No meshes are stored yet."),
-        ("traces", "records", "No indentation records are stored yet."),
-        ("calibrate", "parameters", "No parameters have been identified yet."),
-        ("predict", "prediction", "No predictions are stored yet."),
-        ("run.json", "timing", "No times are stored."),
-    ],
-)
-def test_missing_parts_are_said(copy: Path, gone: str, section: str, sentence: str) -> None:
-    path = copy / gone
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
-    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
-    assert sentence in _section(text, section)
-    assert Outline(text).open == []
-
-
-def test_an_empty_folder_gives_a_report_that_says_so(tmp_path: Path) -> None:
-    text = build_report(tmp_path, tmp_path / "report").read_text(encoding="utf-8")
-    assert "Nothing has been computed yet" in text
-    assert text.count('role="note"') >= 9
-
-
-def test_no_truth_no_uncertainty_no_band(copy: Path) -> None:
-    (copy / "truth.json").unlink()
-    file = copy / "calibrate" / "calibration.json"
-    content = json.loads(file.read_text())
-    del content["uncertainty"]
-    file.write_text(json.dumps(content))
-    for curve in (copy / "predict").glob("*.csv"):
-        rows = [",".join(line.split(",")[:4]) for line in curve.read_text().splitlines()]
-        curve.write_text("\n".join(rows))
-    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
-    assert "Truth" not in text
-    assert "No uncertainty is stored" in text
-    assert ">95 % interval</text>" not in text
-
-
-def test_a_failed_simulation_is_named(copy: Path) -> None:
-    file = copy / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    content["sites"][5] |= {
-        "completed": False,
-        "reason": "the step fell below its limit",
-        "error_percent": None,
-    }
-    file.write_text(json.dumps(content))
-    text = _section(build_report(copy, copy / "report").read_text(encoding="utf-8"), "solver")
-    assert "did not reach the end of the record at: PO-6" in text
-    assert "no: the step fell below its limit" in text
-
-
-def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
-    file = copy / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    row = content["sites"][5]
-    why = "in the search: went over its limits"
-    row |= {"error_one_material_percent": None, "not_predicted": {"interval": why, "one_material": why}}
-    row["warnings"] = [f"no force with one material: {why}"]
-    content |= {"flags": [], "failed": ["site PO-6, one material: lost"]}
-    file.write_text(json.dumps(content))
-    curve = copy / "predict" / "PO-6.csv"
-    rows = [",".join(line.split(",")[:3]) for line in curve.read_text().splitlines()]
-    curve.write_text("\n".join(rows))  # no simulated force either
-    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
-    assert f"interval: {why}; one material: {why}" in _section(text, "solver")
-    assert f"Site PO-6: no force with one material: {why}" in _section(text, "solver")
-    assert "Sites not compared with the others: PO-6." in _section(text, "doubts")
-    assert "Not simulated: site PO-6, one material: lost." in _section(text, "doubts")
-    assert "not predicted" in text
-
-
-def test_indentations_without_records(copy: Path) -> None:
-    for part in ("traces", "calibrate", "predict"):
-        shutil.rmtree(copy / part)
-    facts = {
-        "site": "TI-2",
-        "peak_force_N": 7.126,
-        "depth_mm": 6.0,
-        "penetration_mm": 0.02,
-        "completed": True,
-    }
-    folder = copy / "simulate"
-    folder.mkdir()
-    (folder / "TI-2.json").write_text(json.dumps(facts | {"parameters_from": "start of the study"}))
-    (folder / "TI-2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n6.25,6,7.126\n")
-    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
-    section = _section(text, "simulated")
-    assert ">7.13<" in section
-    assert "Force of the simulated indentations." in section
-    assert "no parameters have been identified" in _section(text, "summary")
-
-
 def test_the_summary_tells_what_is_determined_best_first_and_the_parameters_each_product(report: str) -> None:
-    summary, parameters = _section(report, "summary"), _section(report, "parameters")
+    summary, parameters = section_of(report, "summary"), section_of(report, "parameters")
     places = [summary.index(word) for word in ("Determined: ", "Weakly determined: ", "Not determined: ")]
     assert places == sorted(places)
     assert "Determined together: 1 of 2 products of them" in summary
     assert "^" not in summary
     assert "muscle c^0.82 · muscle γ^0.57: determined" in parameters
     assert "skin m^0.71 · muscle m^-0.70: not determined by these data" in parameters
-
-
-def test_broken_summary_names_the_file(copy: Path) -> None:
-    (copy / "predict" / "predict.json").write_text('{"sites": [')
-    with pytest.raises(InputError, match=r"predict\.json: not readable.*run its stage again"):
-        build_report(copy, copy / "report")
-    assert not (copy / "report").exists()
-
-
-def test_broken_curve_names_the_file(copy: Path) -> None:
-    (copy / "predict" / "PT-1.csv").write_text("time_s,force_measured_N\n1.0\n")
-    with pytest.raises(InputError, match=r"PT-1\.csv: its rows do not fit its header"):
-        build_report(copy, copy / "report")
-
-
-def test_no_results_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no results there; run the study first"):
-        build_report(tmp_path / "nowhere", tmp_path)
 
 
 def test_the_report_never_loads_a_solver() -> None:
@@ -413,16 +216,3 @@ def test_methods_say_what_moved_the_limb_before():
         "Before the indenter touched the limb, pins of 20.0 mm clamped it with 15.0 N each for 7.0 s and "
         "muscle contracted and tissue was pre-stretched (skin by 1.1)."
     )
-
-
-@pytest.mark.slow
-def test_experiments_are_shown_unless_stale(copy, tmp_path):
-    compress_cube(copy / "cube", parameters={"skin": SKIN, "muscle": SKIN})
-    run = json.loads((copy / "run.json").read_text())
-    states = {"cube": {"state": "done", "options": {}}, "regions": {"state": "stale"}}
-    (copy / "run.json").write_text(json.dumps(run | {"experiments": states}))
-    page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
-    assert '<section id="cube"' in page
-    assert "pig skin, along the spine" in page
-    assert '<section id="regions"' not in page
-    assert "limbfit regions” are left out" in page

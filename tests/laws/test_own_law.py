@@ -20,7 +20,7 @@ from limbfit.fe.system import Increment
 from limbfit.laws import LAWS, Parameter, TissueLaw, register_law
 from limbfit.pipeline.verbs.run import keys
 
-sys.path.insert(0, str(Path(__file__).parent / "fe"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "fe"))
 from blocks import block, check_tangent, punch
 from samples import point
 

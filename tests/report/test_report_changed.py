@@ -1,0 +1,195 @@
+"""Reports of studies in which something is more, missing, broken or hostile."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from page_outline import Outline, section_of, without_scripts
+from stored_results import add_fat, write_results
+
+from limbfit import compress_cube
+from limbfit.errors import InputError
+from limbfit.report import build_report
+
+SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_results(tmp_path_factory.mktemp("study") / "results")
+
+
+@pytest.fixture
+def copy(results: Path, tmp_path: Path) -> Path:
+    """The results without the geometry that only pictures need, to change and to break."""
+    left_out = shutil.ignore_patterns("report", "*.vtu", "*.stl")
+    return Path(shutil.copytree(results, tmp_path / "results", ignore=left_out))
+
+
+def test_three_tissues_stand_in_every_table_and_curve(copy: Path) -> None:
+    text = build_report(add_fat(copy), copy / "report").read_text(encoding="utf-8")
+    assert Outline(text).open == []
+    table = re.search(r'<table id="table-parameters">.*?</table>', text, re.DOTALL)
+    assert table
+    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table.group(), re.DOTALL)
+    cells = [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
+    assert cells[0][4:6] == ["One material", "Three materials"]
+    assert [row[0] for row in cells[1:]] == ["Skin"] * 4 + ["Fat"] * 4 + ["Muscle"] * 4
+    assert cells[5][3:] == ["4.70", "4.71", "1.80", "0.900 to 3.60", "not determined", "1.80"]
+    assert "fat, long-term shear modulus c (0.900 to 3.60 kPa)" in text
+    assert "first as one material, then as skin, fat and muscle." in text
+    assert "three materials predict better." in text
+    assert "Error, three materials (%)" in section_of(text, "prediction")
+    assert "skin 1.50 ± 0.01, fat 4.72 ± 1.31" in section_of(text, "meshes")
+    assert "skin (1.5 mm), fat (as thick as the segmented fat, at least 1.0 mm)" in text
+    convergence = section_of(text, "convergence")
+    assert convergence.count("var(--third)") >= 4  # the third tissue's curve, a panel for each parameter
+    assert ">truth, fat</text>" in convergence
+    assert section_of(text, "parameters").count('scope="col"') >= 12
+    assert "two materials" not in text
+    assert "two tissues" not in text
+
+
+def test_names_are_escaped(copy: Path) -> None:
+    evil = '<script>alert("x")</script> & $x^2$'
+    for file in copy.rglob("*.json"):
+        text = file.read_text()
+        file.write_text(
+            text.replace('"tibia"', json.dumps(evil)).replace("Phantom 7 (coarse)", "a <b>bold</b> limb")
+        )
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "<b>" not in without_scripts(text)
+    assert "a &lt;b&gt;bold&lt;/b&gt; limb" in text
+    assert "&lt;script&gt;" in text
+    assert Outline(text).open == []
+
+
+@pytest.mark.parametrize(
+    ("gone", "section", "sentence"),
+    [
+        ("surfaces", "model", "Label map (cm³)"),
+        ("mesh", "meshes", "No meshes are stored yet."),
+        ("traces", "records", "No indentation records are stored yet."),
+        ("calibrate", "parameters", "No parameters have been identified yet."),
+        ("predict", "prediction", "No predictions are stored yet."),
+        ("run.json", "timing", "No times are stored."),
+    ],
+)
+def test_missing_parts_are_said(copy: Path, gone: str, section: str, sentence: str) -> None:
+    path = copy / gone
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert sentence in section_of(text, section)
+    assert Outline(text).open == []
+
+
+def test_an_empty_folder_gives_a_report_that_says_so(tmp_path: Path) -> None:
+    text = build_report(tmp_path, tmp_path / "report").read_text(encoding="utf-8")
+    assert "Nothing has been computed yet" in text
+    assert text.count('role="note"') >= 9
+
+
+def test_no_truth_no_uncertainty_no_band(copy: Path) -> None:
+    (copy / "truth.json").unlink()
+    file = copy / "calibrate" / "calibration.json"
+    content = json.loads(file.read_text())
+    del content["uncertainty"]
+    file.write_text(json.dumps(content))
+    for curve in (copy / "predict").glob("*.csv"):
+        rows = [",".join(line.split(",")[:4]) for line in curve.read_text().splitlines()]
+        curve.write_text("\n".join(rows))
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert "Truth" not in text
+    assert "No uncertainty is stored" in text
+    assert ">95 % interval</text>" not in text
+
+
+def test_a_failed_simulation_is_named(copy: Path) -> None:
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    content["sites"][5] |= {
+        "completed": False,
+        "reason": "the step fell below its limit",
+        "error_percent": None,
+    }
+    file.write_text(json.dumps(content))
+    text = section_of(build_report(copy, copy / "report").read_text(encoding="utf-8"), "solver")
+    assert "did not reach the end of the record at: PO-6" in text
+    assert "no: the step fell below its limit" in text
+
+
+def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    row = content["sites"][5]
+    why = "in the search: went over its limits"
+    row |= {"error_one_material_percent": None, "not_predicted": {"interval": why, "one_material": why}}
+    row["warnings"] = [f"no force with one material: {why}"]
+    content |= {"flags": [], "failed": ["site PO-6, one material: lost"]}
+    file.write_text(json.dumps(content))
+    curve = copy / "predict" / "PO-6.csv"
+    rows = [",".join(line.split(",")[:3]) for line in curve.read_text().splitlines()]
+    curve.write_text("\n".join(rows))  # no simulated force either
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert f"interval: {why}; one material: {why}" in section_of(text, "solver")
+    assert f"Site PO-6: no force with one material: {why}" in section_of(text, "solver")
+    assert "Sites not compared with the others: PO-6." in section_of(text, "doubts")
+    assert "Not simulated: site PO-6, one material: lost." in section_of(text, "doubts")
+    assert "not predicted" in text
+
+
+def test_indentations_without_records(copy: Path) -> None:
+    for part in ("traces", "calibrate", "predict"):
+        shutil.rmtree(copy / part)
+    facts = {
+        "site": "TI-2",
+        "peak_force_N": 7.126,
+        "depth_mm": 6.0,
+        "penetration_mm": 0.02,
+        "completed": True,
+    }
+    folder = copy / "simulate"
+    folder.mkdir()
+    (folder / "TI-2.json").write_text(json.dumps(facts | {"parameters_from": "start of the study"}))
+    (folder / "TI-2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n6.25,6,7.126\n")
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    section = section_of(text, "simulated")
+    assert ">7.13<" in section
+    assert "Force of the simulated indentations." in section
+    assert "no parameters have been identified" in section_of(text, "summary")
+
+
+def test_broken_summary_names_the_file(copy: Path) -> None:
+    (copy / "predict" / "predict.json").write_text('{"sites": [')
+    with pytest.raises(InputError, match=r"predict\.json: not readable.*run its stage again"):
+        build_report(copy, copy / "report")
+    assert not (copy / "report").exists()
+
+
+def test_broken_curve_names_the_file(copy: Path) -> None:
+    (copy / "predict" / "PT-1.csv").write_text("time_s,force_measured_N\n1.0\n")
+    with pytest.raises(InputError, match=r"PT-1\.csv: its rows do not fit its header"):
+        build_report(copy, copy / "report")
+
+
+def test_no_results_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no results there; run the study first"):
+        build_report(tmp_path / "nowhere", tmp_path)
+
+
+@pytest.mark.slow
+def test_experiments_are_shown_unless_stale(copy, tmp_path):
+    compress_cube(copy / "cube", parameters={"skin": SKIN, "muscle": SKIN})
+    run = json.loads((copy / "run.json").read_text())
+    states = {"cube": {"state": "done", "options": {}}, "regions": {"state": "stale"}}
+    (copy / "run.json").write_text(json.dumps(run | {"experiments": states}))
+    page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
+    assert '<section id="cube"' in page
+    assert "pig skin, along the spine" in page
+    assert '<section id="regions"' not in page
+    assert "limbfit regions” are left out" in page

@@ -1,0 +1,136 @@
+"""Holds, rates and cycles: every phase of a record is found and smoothed by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_records import RELAXATION, needs_relaxation, path_record
+
+from limbfit.errors import TraceError
+from limbfit.phases import boundaries
+from limbfit.traces import TouchDown, Trace, check_trace, find_touch_down, read_trace, regularise
+
+PROTOCOLS = {
+    "flat hold": ([0, 5, 35, 40], [0, 5.4, 5.4, 0], "load hold unload"),
+    "creeping hold": ([0, 5, 35, 40], [0, 5.4, 5.406, 0], "load hold unload"),
+    "long hold": ([0, 0.5, 60.5, 61], [0, 5.4, 5.4, 0], "load hold unload"),
+    "two rates": ([0, 1, 6, 7], [0, 3, 5.4, 0], "load load unload"),
+    "steps": ([0, 3, 13, 16, 26, 30], [0, 3, 3, 5.4, 5.4, 0], "load hold load hold unload"),
+    "three cycles": (
+        [0, 5, 10, 15, 20, 25, 30],
+        [0, 5.4, 0, 5.4, 0, 5.4, 0],
+        "load unload load unload load unload",
+    ),
+    "cycles in contact": (
+        [0, 5, 8, 11, 14, 17, 22],
+        [0, 5.4, 2, 5.4, 2, 5.4, 0],
+        "load unload load unload load unload",
+    ),
+    "growing cycles": (
+        [0, 2, 4, 8, 12, 18, 24],
+        [0, 2, 0, 4, 0, 6, 0],
+        "load unload load unload load unload",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
+    corners_s, corners_mm, expected = PROTOCOLS[name]
+    trace, truth = path_record(corners_s, corners_mm)
+    check_trace(trace)
+    touch = find_touch_down(trace)
+    assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
+    curve = regularise(trace, touch)
+    assert [phase.kind for phase in curve.phases] == expected.split()
+    ends = boundaries(curve.phases)[1:-1] + touch.time_s
+    assert ends == pytest.approx(corners_s[1:-1], abs=0.01)
+    error = curve.force_N - truth(curve.time_s + touch.time_s)
+    assert np.sqrt(np.mean(error**2)) < 0.01
+    assert np.abs(error).max() < 0.1
+    for at in ends:  # the corners are kept
+        assert np.interp(at - touch.time_s, curve.time_s, curve.force_N) == pytest.approx(truth(at), abs=0.06)
+
+
+def test_cycles_that_leave_the_skin_have_no_force_between():
+    trace, _ = path_record(*PROTOCOLS["three cycles"][:2])
+    touch = find_touch_down(trace)
+    curve = regularise(trace, touch)
+    assert curve.knots_mm[2] == pytest.approx(-touch.displacement_mm, abs=0.01)
+    away = np.abs(curve.time_s + touch.time_s - 10.0) < 0.3
+    assert curve.force_N[away].max() < 0.03
+    assert curve.time_s[-1] + touch.time_s == pytest.approx(29.6, abs=0.1)
+
+
+def test_a_long_hold_takes_no_points_of_comparison_from_the_ramps():
+    trace, _ = path_record(*PROTOCOLS["long hold"][:2])
+    even = regularise(trace, find_touch_down(trace)).resample(81)
+    counts = [
+        int(((even.time_s > phase.start_s) & (even.time_s <= phase.end_s)).sum()) for phase in even.phases
+    ]
+    assert counts == [40, 30, 40]
+    held = np.diff(even.time_s[41:71])
+    assert (np.diff(held) > 0).all()  # densest where most relaxes
+    assert held[0] < 0.1
+
+
+def test_the_start_of_a_relaxation_is_smoothed_alike_in_record_and_simulation():
+    """In a hold of 120 s, with a time of relaxation of half a second: of both within 0.3 % of the peak."""
+    trace, truth = path_record(*PROTOCOLS["long hold"][:2], noise_N=0.005)
+    touch = find_touch_down(trace)
+    even = regularise(trace, touch).resample(81)
+    true = truth(even.time_s + touch.time_s)
+    start = even.phases[1].start_s
+    early = (even.time_s > start) & (even.time_s < start + 2.0)
+    assert early.sum() >= 5
+    simulated = even.curve.response(even.time_s) @ true
+    assert np.abs(even.force_N - true)[early].max() < 0.003 * true.max()
+    assert np.abs(simulated - even.force_N)[early].max() < 0.003 * true.max()
+
+
+def test_the_response_of_the_smoothing_follows_every_phase():
+    trace, _ = path_record(*PROTOCOLS["cycles in contact"][:2])
+    curve = regularise(trace, find_touch_down(trace))
+    times = curve.resample(81).time_s
+    matrix = curve.curve.response(times)
+    force = np.interp(times, curve.knots_s, curve.knots_mm)
+    assert matrix @ force == pytest.approx(force, abs=0.03 * force.max())
+
+
+def test_a_stated_peak_is_that_of_the_first_cycle():
+    trace, _ = path_record(*PROTOCOLS["cycles in contact"][:2])
+    touch = find_touch_down(trace)
+    moved = regularise(trace, touch, peak_s=5.05)
+    assert moved.peak_s + touch.time_s == pytest.approx(5.05)
+    assert len(moved.phases) == 6
+
+
+def test_a_displacement_that_wanders_is_refused():
+    time = np.arange(0, 40, 0.01)
+    wander = np.abs(0.2 * np.cumsum(np.random.default_rng(1).standard_normal(time.size)))
+    with pytest.raises(TraceError, match=r"displacement: the displacement wanders: 40 .* cut out the part"):
+        regularise(Trace(time, wander, wander), TouchDown(0.0, 0.0, 0.1, 1.0, 0.0, True))
+
+
+def test_a_record_that_is_only_held_or_drawn_back_is_refused():
+    time = np.linspace(0, 10, 1000)
+    with pytest.raises(TraceError, match="displacement: the displacement never advances"):
+        find_touch_down(Trace(time, 5.0 - 0.5 * time, time))
+
+
+@needs_relaxation
+@pytest.mark.parametrize(
+    "name", ["230403-FF1A", "230403-FF1b", "230403-RDG1A", "230411-RDG1A", "230411-RDG1B", "230411-RDG1C"]
+)
+def test_real_ramp_and_hold_records(name):
+    trace = read_trace(RELAXATION / f"{name}.csv")
+    touch = find_touch_down(trace)
+    curve = regularise(trace, touch)
+    assert curve.peak_force_N == pytest.approx(trace.force_N.max() - touch.baseline_N, rel=0.02)
+    assert np.isnan(curve.speed_unload_mm_s)
+    ramp = np.max(np.diff(trace.displacement_mm) / np.diff(trace.time_s))
+    assert 0.85 * ramp < curve.speed_load_mm_s < ramp
+    end = trace.force_N[-5:].mean() - touch.baseline_N
+    assert curve.force_N[-1] == pytest.approx(end, rel=0.02)
+    held = np.interp(np.arange(curve.peak_s, curve.time_s[-1], 0.5), curve.time_s, curve.force_N)
+    assert np.all(np.diff(held) < 0)
