@@ -145,6 +145,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "calibration.prior.skin.c_kPa.factor": ("calibrate", 1.5),
     "calibration.priors": ("calibrate", "population"),
     "calibration.force_error_percent": ("calibrate", 2.0),
+    "calibration.surface_error_mm": ("calibrate", 0.7),
     "calibration.starts": ("calibrate", 3),
     "calibration.seed": ("calibrate", 1),
     "calibration.search_radius_mm": ("calibrate", 50.0),
