@@ -3,7 +3,9 @@
 ``F = baseline + k [s^p + gamma (s^p relaxed with tau)]``, with ``s`` the depth since touch-down: a power of
 the depth, as a body that is met at a point or at an edge gives, in a material with memory (quasi-linear
 viscoelasticity, one term). Memory bends the onset down as another exponent does: without it the touch-down
-comes out too late, and too well known.
+comes out too late, and too well known.  A small ball first bends the skin and then finds the bone below, so
+that its force starts straight and stiffens: ``s + a L (s / L)^q`` over a part of length L.  Without these its
+touch-down comes out a quarter of a millimetre early.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from .numerics import Array
 from .scatter import Scatter
 
 EXPONENTS = np.linspace(1.0, 2.5, 13)  # flat punch full on: 1; sphere: 1.5; cone, or an edge coming in: 2
+STIFFENING = ((1.0, 2.5), (4.0, 2.5), (2.0, 2.0), (8.0, 2.0))  # a and q
+STARTS = np.r_[EXPONENTS, np.ones(len(STIFFENING))]  # exponents at the very start
 TAU_S = (0.1, 0.3, 1.0, 3.0)
 GAMMA = (0.5, 1.5, 4.0)
 _PLACES = 60  # of touch-down
@@ -75,7 +79,7 @@ def _weighed(part: OnsetPart, whiten: Array, places: Array) -> Onset:
     """Every onset that starts at one of the places (m,), weighed by its likelihood."""
     shapes = _shapes(part, places) @ whiten.T
     one, force = whiten.sum(axis=1), whiten @ part.force_N
-    # Normal equations of baseline and stiffness, for all shapes (memories, m, exponents) together.
+    # Normal equations of baseline and stiffness, for all shapes (memories, m, forms) together.
     oo, oy, yy = one @ one, one @ force, force @ force
     oa, ay, aa = shapes @ one, shapes @ force, np.einsum("...n,...n", shapes, shapes)
     determinant = np.maximum(oo * aa - oa**2, 1e-300)
@@ -92,14 +96,16 @@ def _weighed(part: OnsetPart, whiten: Array, places: Array) -> Onset:
     along = share.sum(axis=(0, 2))
     mean, step = float(along @ places), places[1] - places[0]
     sd = float(np.sqrt(along @ (places - mean) ** 2 + step**2 / 12))
-    exponent = float(share.sum(axis=(0, 1)) @ EXPONENTS)
+    exponent = float(share.sum(axis=(0, 1)) @ STARTS)
     return Onset(mean, sd, exponent, float((share * baseline).sum()), least / free)
 
 
 def _shapes(part: OnsetPart, places: Array) -> Array:
-    """Onsets (memories, places, exponents, n) for all memories and exponents, one at the part's end."""
+    """Onsets (memories, places, forms, n) for all memories and elastic forms, one at the part's end."""
     depth = np.maximum(part.travel_mm - places[:, None, None], 0.0)
-    elastic = depth ** EXPONENTS[:, None]
+    whole = np.maximum(depth[..., -1:], 1e-300)
+    stiffening = [depth + a * whole * (depth / whole) ** q for a, q in STIFFENING]
+    elastic = np.concatenate([depth ** EXPONENTS[:, None], *stiffening], axis=1)
     shapes = [elastic]
     for tau in TAU_S:
         memory = _memory(part.time_s, elastic, tau)
