@@ -111,7 +111,7 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     assert facts["peak_s"] == pytest.approx(0.3 + knots_s[1], abs=0.02)
 
     record = site_record(context, study.indentation(name))
-    assert len(record.times_s) <= 1.3 * CURVE_POINTS
+    assert len(record.times_s) <= 1.4 * CURVE_POINTS  # a hold has its own
     response = record.respond(simulate(record.job(np.array(truth))))
     error = response.force_N - record.force_N
     peak = record.force_N.max()
