@@ -75,7 +75,7 @@ class Known:
             residuals["sites"],
             float(residuals["misfit_elsewhere"]),
             float(residuals["known_scale"]),
-            float(residuals["site_factor"] or 1.0),
+            float(residuals.get("site_factor") or 1.0),
         )
 
     def residual(self, site: str, unit: str = "N") -> tuple[float, float]:

@@ -21,7 +21,6 @@ from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..shared.store import write_json
 from ..shared.tabular import write_table
-from ..stages.site_scatter import tissue_over_bone
 from ..stages.traces import as_searched, site_record
 from .variants import (
     ChosenSite,
@@ -29,6 +28,7 @@ from .variants import (
     choose_sites,
     compared,
     run_variants,
+    tissue_over_bone,
     write_variants,
 )
 from .volumes import NO_VOLUME, volume_cache

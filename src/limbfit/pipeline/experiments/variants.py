@@ -16,7 +16,7 @@ from ...study import Indentation, Record, Site
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
 from ..shared.tabular import write_curves
-from ..stages.site_scatter import tissue_over_bone
+from ..stages.site_scatter import bone_distance_mm
 
 Array = NDArray[np.float64]
 
@@ -106,6 +106,20 @@ def _with_role(chosen: ChosenSite, role: str) -> ChosenSite:
 def _chosen(context: Context, one: Indentation) -> ChosenSite:
     model = model_of(context, one)
     return ChosenSite(context.study.site(model.site), model, tissue_over_bone(model), "")
+
+
+def tissue_over_bone(model: SiteModel) -> float:
+    """Distance in mm from a site to the nearest point of a bone in its mesh.
+
+    Raises
+    ------
+    InputError
+        Where the mesh has no bone.
+    """
+    found = bone_distance_mm(model)
+    if found is None:
+        raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
+    return found
 
 
 def run_variants(

@@ -8,12 +8,13 @@ from site to site the residuals themselves must tell (`limbfit.identify.uncertai
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
-from ...errors import InputError
 from ...identify.checks.plausibility import layer_factor
 from ...identify.fit.objective import SiteResponse
 from ...indentation import SiteModel
@@ -51,9 +52,8 @@ def site_deviation(
 def expected_share(study: Study, record: SiteRecord, surface_mm: float) -> float:
     """Standard deviation of the force at a record's site over the force itself."""
     radius = contact_radius(study.indenter_of(record.record))
-    try:
-        thickness = tissue_over_bone(record.model)
-    except InputError:  # a half-space has no thickness to be wrong
+    thickness = bone_distance_mm(record.model)
+    if thickness is None:  # a half-space has no thickness to be wrong
         return LEAST_SHARE
     return float(np.hypot(LEAST_SHARE, by_thickness(radius, thickness) * surface_mm / thickness))
 
@@ -78,19 +78,19 @@ def surface_error_mm(context: Context) -> float:
     return OF_A_VOXEL * float(np.prod(reader.GetSpacing()[:3])) ** (1 / 3)
 
 
-def tissue_over_bone(model: SiteModel) -> float:
-    """Distance in mm from a site to the nearest point of a bone in its mesh.
+def bone_distance_mm(model: SiteModel) -> float | None:
+    """From a site to the nearest point of a bone in its mesh; None where the mesh has none."""
+    return _distance(model.mesh, model.mesh_digest, model.position)
 
-    Raises
-    ------
-    InputError
-        Where the mesh has no bone.
-    """
-    mesh = read_vtu(model.mesh)
+
+@lru_cache(maxsize=64)
+def _distance(file: Path, digest: str, position: tuple[float, float, float]) -> float | None:
+    """All records of a site share its mesh, which is read once."""
+    mesh = read_vtu(file)
     bone = mesh.node_sets.get("fixed_bone", np.zeros(0, dtype=int))
     if not len(bone):
-        raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
-    return float(np.linalg.norm(mesh.points[bone] - np.array(model.position), axis=1).min())
+        return None
+    return float(np.linalg.norm(mesh.points[bone] - np.array(position), axis=1).min())
 
 
 def _is_modulus(study: Study) -> NDArray[np.bool_]:
