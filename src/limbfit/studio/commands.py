@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import IO
@@ -17,6 +18,7 @@ import psutil
 from ..execution import SAFE_PATH
 
 PROGRAM = ("-m", "limbfit")  # for this Python
+STARTING_S = 2.0  # a process that is younger has begun nothing that would have to be kept
 
 
 def find_command(begin: Sequence[str]) -> tuple[int, list[str]] | None:
@@ -59,9 +61,16 @@ def _is_known(process: int) -> bool:
 def interrupt(process: int) -> None:
     """What Ctrl-C in its terminal would do.
 
+    A process that only starts is terminated too: Python may lose an interrupt then.
+
     Raises
     ------
     psutil.Error
         Where there is no such process, or it belongs to somebody else.
     """
-    psutil.Process(process).send_signal(signal.SIGINT)
+    found = psutil.Process(process)
+    starts = time.time() - found.create_time() < STARTING_S
+    found.send_signal(signal.SIGINT)
+    if starts:
+        with suppress(psutil.NoSuchProcess):
+            found.terminate()

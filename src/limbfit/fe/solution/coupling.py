@@ -23,11 +23,12 @@ from .direction import preconditioner, touching
 from .factor import Factor
 from .linear import NotPositiveDefiniteError
 from .newton import Equilibrium, NewtonControl, reaction_scale, residual_norm
-from .sensitivity import TOLERANCE, solve_with_adjoint
+from .sensitivity import solve_with_adjoint
 
 Array = NDArray[np.float64]
-# GMRES: vectors that it keeps, and how often it starts anew; the residual of Newton's directions.
-VECTORS, RESTARTS, FORCING = 40, 4, 1e-2
+# GMRES: vectors that it keeps, and how often it starts anew; the residual of Newton's directions, and of
+# derivatives, which no adjoint corrects.
+VECTORS, RESTARTS, FORCING, TOLERANCE = 40, 4, 1e-2, 2e-5
 # Newton's iterations, halvings of its step, and the share by which a full step must lower the residual.
 MOST_ITERATIONS, MOST_HALVINGS, LOWERED = 20, 6, 0.1
 
@@ -88,7 +89,7 @@ def solve_coupled(
     if not coupling:
         x, advanced = solve_with_adjoint(at, factor, b, guess, advance)
         return x, -advanced
-    x = _gmres(at, factor, coupling, b, guess, 0.1 * TOLERANCE)
+    x = _gmres(at, factor, coupling, b, guess, TOLERANCE)
     return x, coupling.along(x) - advance @ x
 
 
