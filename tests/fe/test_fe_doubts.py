@@ -9,9 +9,11 @@ import pytest
 from blocks import punch
 
 from limbfit.fe import Problem, Result, StepControl, solve
+from limbfit.fe.doubts import folded
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import contact_pressure
 from limbfit.fe.system import Increment
+from limbfit.mesh import node_jacobians
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +105,13 @@ def test_folded_elements_are_told_whatever_states_are_kept(problem):
     kept, dropped = solve(soft), solve(soft, store="none")
     assert "folded" in kinds(kept)
     assert dropped.doubts == kept.doubts
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.005, False), (0.02, True)])
+def test_folded_elements_are_told_where_they_matter(problem, share, told):
+    mesh, u = problem.mesh, np.zeros_like(problem.mesh.points)
+    u[mesh.corners[0][0], 2] = -40.0
+    inverted = (node_jacobians(mesh.with_points(mesh.points + u)) <= 0.0).any(axis=1)
+    energy = np.where(inverted, share / inverted.sum(), (1.0 - share) / (~inverted).sum())
+    doubts = folded(mesh, u, lambda: energy, 3.0, np.array([0.0, 3.0]))
+    assert ["2 % of the strain energy" in doubt.text for doubt in doubts] == [True] * told

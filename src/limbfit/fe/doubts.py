@@ -5,7 +5,7 @@ Those who use a simulation decide by the kind what to do with it; the text is fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 Kind = Literal["folded", "slipped", "sunk", "unbalanced", "unsettled", "inexact"]
 
 SLIP = 0.9  # force over the one before, in an advancing step, that is no relaxation
+# Share of the strain energy that folded elements may hold: their stiffness lost, the force would fall by
+# about as much, and less than by the error of the mesh.
+FOLDED_ENERGY = 0.01
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Doubt:
 
     Parameters
     ----------
-    kind : ``folded`` (elements inside out at a node), ``slipped`` (the force falls in loading), ``sunk`` (the
+    kind : ``folded`` (elements inside out at a node that matter), ``slipped`` (the force falls in loading), ``sunk`` (the
         indenter is deeper in the skin than allowed), ``unbalanced`` (equilibrium to less than the tolerance),
         ``unsettled`` (friction of another normal force than there is), ``inexact`` (sensitivities).
     text : one sentence, with its remedy.
@@ -47,18 +50,27 @@ def _doubt(kind: Kind, text: str, count: int, depth_mm: float, displacement: Arr
     return (Doubt(kind, text, count, float(depth_mm), float(depth_mm) / most if most else 0.0),)
 
 
-def folded(mesh: Mesh, u: Array, depth_mm: float, displacement: Array) -> tuple[Doubt, ...]:
+def folded(
+    mesh: Mesh, u: Array, energy: Callable[[], Array], depth_mm: float, displacement: Array
+) -> tuple[Doubt, ...]:
     """Elements that are inside out at a node of theirs at the displacements ``u (n, 3)`` of a depth.
 
     The quadrature of ``tet10`` lies inside and does not see it; the element has lost part of its stiffness.
+    Not doubted where they hold less than `FOLDED_ENERGY` of all ``energy (m,)``, N mm.
     """
     shape = mesh.with_points(mesh.points + u)
-    count = int((node_jacobians(shape) <= 0.0).any(axis=1).sum())
-    if not count:
+    inverted = (node_jacobians(shape) <= 0.0).any(axis=1)
+    if not inverted.any():
         return ()
+    held = energy()
+    share = float(held[inverted].sum() / held.sum())
+    if share < FOLDED_ENERGY:
+        return ()
+    count = int(inverted.sum())
     text = (
-        f"{count} elements are inside out at a node at {depth_mm:.3g} mm and the force may be "
-        "too small: use element tet10v, a rounded edge of the indenter or a finer mesh at its edge"
+        f"{count} elements are inside out at a node at {depth_mm:.3g} mm; they hold {100 * share:.2g} % of "
+        "the strain energy, and the force may be too small by about as much: use element tet10v, a rounded "
+        "edge of the indenter or a finer mesh at its edge"
     )
     return _doubt("folded", text, count, depth_mm, displacement)
 

@@ -35,8 +35,9 @@ Array = NDArray[np.float64]
 # A factor in single precision that needs more iterations at its own matrix has too few digits.
 MOST_REFINEMENTS = 12
 MOST_MINRES, MOST_RESTARTS = 100, 8
-# With fewer unknowns a factor costs no more than multigrid; with more cycles than this it is given up.
-FEWEST_MULTIGRID, MOST_CYCLES = 60_000, 150
+# With fewer unknowns a factor costs no more than multigrid, with more of them in many steps, which a factor
+# outlasts as they are short; with more cycles than the last number multigrid is given up.
+FEWEST_MULTIGRID, FEWEST_IN_MANY_STEPS, MANY_STEPS, MOST_CYCLES = 33_000, 60_000, 25, 150
 # Smallest and largest shear stiffness added to a tangent that is not positive definite, as a share of each
 # tissue's own: tissues differ by up to a hundredfold, and a common one would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 0.1, 1e6
@@ -56,18 +57,19 @@ class Factor:
 
     ``counts`` and ``seconds`` tell what was done.  ``name`` auto is `Multigrid` for quadratic tetrahedra,
     unless they are few or the factor is to be ``lasting``, and factors are not dear here.
-    ``moduli (r,)``: shear modulus of each region, MPa.
+    ``moduli (r,)``: shear modulus of each region, MPa; ``steps``: of the simulation, as planned.
     """
 
     def __init__(
         self, system: System, moduli: Array, name: str = "auto", threads: int = 1, lasting: bool = False,
-        last: Index = NONE,
+        last: Index = NONE, steps: int = 0,
     ) -> None:  # fmt: skip
         self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
         self._last = last
         moving = system.bodies is not None and system.bodies.free > 0
         suits = not moving and system.cells.shape[1] == 10
-        many = system.unknowns >= FEWEST_MULTIGRID and not lasting
+        fewest = FEWEST_IN_MANY_STEPS if steps > MANY_STEPS else FEWEST_MULTIGRID
+        many = system.unknowns >= fewest and not lasting
         if name == "auto" and suits and (many or factors_are_dear()):
             self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]

@@ -71,7 +71,10 @@ class SteppedRun:
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, touched(self.system, problem)
-        self.factor = Factor(self.system, moduli, control.linear_solver, threads, last=last)
+        self.planned = schedule(problem.history, control, problem.turns)
+        self.factor = Factor(
+            self.system, moduli, control.linear_solver, threads, last=last, steps=len(self.planned)
+        )
         # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
         apart = sensitivities and not self.factor.lasting and not factors_are_dear()
         self.slopes = self.factor
@@ -104,7 +107,7 @@ class SteppedRun:
 
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
-        planned = schedule(self.problem.history, self.control, self.problem.turns)
+        planned = self.planned
         targets = list(planned)
         pace, why = Pace(self.control.max_iterations), ""
         if len(self.system.prestretch) and not self._rested():

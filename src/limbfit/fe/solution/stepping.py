@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced, unsettled
+from ..observables import element_fields
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import System
@@ -134,9 +135,16 @@ def _doubts(
     run: SteppedRun, deepest: State | None, displacement: Array, force: Array, penetration: Array
 ) -> tuple[Doubt, ...]:
     """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
+
+
+    def energy() -> Array:
+        assert deepest is not None
+        density = element_fields(run.system, run.laws, deepest).energy
+        return density * run.system.weights.sum(axis=1)
+
     folds: tuple[Doubt, ...] = ()
     if deepest is not None:
-        folds = folded(run.problem.mesh, deepest.u, deepest.displacement, displacement)
+        folds = folded(run.problem.mesh, deepest.u, energy, deepest.displacement, displacement)
     return (
         *folds,
         *slipped(displacement, force),
