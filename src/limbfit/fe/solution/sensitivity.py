@@ -147,12 +147,12 @@ def independent(b: Array) -> tuple[list[int], Array]:
     unit = b / np.where(size > 0.0, size, 1.0)
     products = unit.T @ unit
     kept: list[int] = []
-    weights = np.zeros((0, b.shape[1]))
+    weights: Array = np.zeros((0, b.shape[1]))
     for j in range(b.shape[1]):
         left = products[j, j] - products[j, kept] @ weights[:, j]
         if left > TOLERANCE**2:
             kept.append(j)
-            weights = np.linalg.solve(products[np.ix_(kept, kept)], products[kept])
+            weights = np.asarray(np.linalg.solve(products[np.ix_(kept, kept)], products[kept]), dtype=float)
     return kept, weights * size / size[kept, None]
 
 

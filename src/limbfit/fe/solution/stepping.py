@@ -136,7 +136,6 @@ def _doubts(
 ) -> tuple[Doubt, ...]:
     """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
 
-
     def energy() -> Array:
         assert deepest is not None
         density = element_fields(run.system, run.laws, deepest).energy
