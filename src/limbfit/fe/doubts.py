@@ -31,7 +31,8 @@ class Doubt:
     ----------
     kind : ``folded`` (elements that matter are inside out at a node), ``slipped`` (the force falls in
         loading), ``sunk`` (the indenter is deeper in the skin than allowed), ``unbalanced`` (equilibrium to
-        less than the tolerance), ``unsettled`` (friction of another normal force than there is), ``inexact`` (sensitivities).
+        less than the tolerance), ``unsettled`` (friction of another normal force than there is), ``inexact``
+        (sensitivities).
     text : one sentence, with its remedy.
     count : elements (``folded``), or steps.
     depth_mm : indentation where it is first seen; of folded elements, where they were counted.
