@@ -44,7 +44,8 @@ SLOW = 0.96
 BALL = IndenterTable(shape="sphere", width_mm=12.0)
 BALL_TABLE = '\n[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
 PRIORS = 'priors = "population"\n'
-AFTER_S = 0.4
+# At rest before an indenter moves (`acquire.pause_s` is longer: 5 s), and after it is back, s.
+BEFORE_S, AFTER_S = 1.0, 0.4
 TISSUES = ("skin", "muscle")
 
 
@@ -125,10 +126,11 @@ class Limb:
         found = self.answer(take)
         random = np.random.default_rng([self.seed, *take.name.encode()])
         clearance = random.uniform(*CLEARANCE_MM)
-        touch = clearance / take.speed
+        approach = clearance / take.speed
+        touch = BEFORE_S + approach
         knots_s, knots_mm = take.knots
-        path_s = np.array([0.0, *(touch + t for t in knots_s), knots_s[-1] + 2 * touch])
-        path_mm = np.array([0.0, *(clearance + d for d in knots_mm), 0.0])
+        path_s = np.array([0.0, BEFORE_S, *(touch + t for t in knots_s), touch + knots_s[-1] + approach])
+        path_mm = np.array([0.0, 0.0, *(clearance + d for d in knots_mm), 0.0])
         time = np.arange(0.0, path_s[-1] + AFTER_S, 1 / RATE_HZ)
         moved = np.interp(time, path_s, path_mm) + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size)
         force = np.interp(time - touch, found["times"], found["force"], left=0.0, right=0.0)
