@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -65,6 +65,38 @@ ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
     "fine": (_edges(3.0, 24.0, 14.0, 0.6, 1.6), _edges(5.5, 30.0, 12.0, 0.9, 1.6)),
 }
 _OWN = ACCURACIES["standard"][0]
+USUAL_MM = 20.0  # width of the indenter for which those edges are made
+
+
+def stated_widths(content: Mapping[str, Any]) -> list[float]:
+    """Widths of the indenters of a study file's ``content``, mm; its tables refuse those that are none."""
+    more = content.get("indenters", {})
+    tables = [content.get("indenter", {}), *(more.values() if isinstance(more, Mapping) else ())]
+    widths = [table.get("width_mm", USUAL_MM) for table in tables if isinstance(table, Mapping)]
+    return [float(width) for width in widths if isinstance(width, int | float) and width > 0] or [USUAL_MM]
+
+
+def suited_to(mesh: Any, widths_mm: Sequence[float]) -> Any:
+    """The table ``mesh`` as stated, with what it leaves open made for indenters narrower than usual.
+
+    Edges near a site are as much shorter as the narrowest of ``widths_mm`` is, and hold as much less far as
+    the widest is.
+    """
+    if not isinstance(mesh, Mapping):  # or a table already, or nothing that could be one
+        return mesh
+    narrow, wide = (min(1.0, width / USUAL_MM) for width in (min(widths_mm), max(widths_mm)))
+    own, coarse = ACCURACIES.get(str(mesh.get("accuracy", "standard")), ACCURACIES["standard"])
+
+    def suited(edges: Mapping[str, float]) -> dict[str, float]:
+        near, radius = narrow * edges["edge_near_mm"], wide * edges["near_radius_mm"]
+        return {"edge_near_mm": round(near, 3), "near_radius_mm": round(radius, 3)}
+
+    if narrow == 1.0:
+        return mesh
+    out = {**suited(own), **mesh}
+    if coarse is not None and "coarse" not in mesh:
+        out["coarse"] = {**coarse, **suited(coarse)}
+    return out
 
 
 class CoarseMeshTable(TomlTable):
@@ -118,12 +150,12 @@ class MeshTable(TomlTable):
         _refuse_too_many(self)
         return self
 
-    @property
-    def stands_for(self) -> str | None:
-        """The ``accuracy`` whose edges these are; none where the study states others."""
-        for name, (own, coarse) in ACCURACIES.items():
-            table = None if self.coarse is None else self.coarse.model_dump()
-            if table == coarse and all(getattr(self, key) == edge for key, edge in own.items()):
+    def stands_for(self, widths_mm: Sequence[float]) -> str | None:
+        """The ``accuracy`` whose edges for such indenters these are; none where the study states others."""
+        edges = self.model_dump(exclude={"element", "engine", "time_limit_s"})
+        for name in ACCURACIES:
+            usual = MeshTable.model_validate(suited_to({"accuracy": name}, widths_mm))
+            if edges == usual.model_dump(exclude={"element", "engine", "time_limit_s"}):
                 return name
         return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .clamps import ClampsTable
 from .material import MaterialTable
-from .meshing import MeshTable
+from .meshing import MeshTable, stated_widths, suited_to
 from .records import Indentation, Record, RecordTable, Site, records_of
 from .socket import SocketTable
 from .tables import (
@@ -76,6 +76,11 @@ class Study(TomlTable):
     socket: SocketTable = SocketTable()
     file: Path = Field(default=Path("study.toml"), exclude=True)
     notes: tuple[str, ...] = Field(default=(), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _suit_the_mesh(cls, given: dict[str, Any]) -> dict[str, Any]:
+        return {**given, "mesh": suited_to(given.get("mesh", {}), stated_widths(given))}
 
     @property
     def folder(self) -> Path:
@@ -322,9 +327,8 @@ class Study(TomlTable):
     def _stretched_unseen(self) -> Study:
         seen = [record.name for record in self.recorded if record.ultrasound is not None]
         if self.material.prestretch and seen:
-            raise ValueError(
-                f"material.prestretch: {seen[0]} has ultrasound, which sees no pre-stretch; leave it out"
-            )
+            why = f"{seen[0]} has ultrasound, which sees no pre-stretch"
+            raise ValueError(f"material.prestretch: {why}; leave it out")
         return self
 
     @model_validator(mode="after")

@@ -46,6 +46,10 @@ def stated(tmp_path: Path) -> Any:
     return load
 
 
+def accuracy(study: Study) -> Any:
+    return settings_record(study, dict.fromkeys(study.inputs, "0" * 64))["mesh"]["accuracy"]
+
+
 def edges(settings: object) -> tuple[float, ...]:
     return tuple(asdict(settings)[key] for key in EDGES)  # type: ignore[call-overload]
 
@@ -59,14 +63,14 @@ def test_a_bare_study_is_searched_on_less_and_corrected(stated: Any) -> None:
     assert study.within_mm == 65.0
     assert study.is_searched_apart
     assert (study.solver.load_steps, study.solver.unload_steps, study.solver.penalty_per_mm) == (8, 10, None)
-    assert settings_record(study, dict.fromkeys(study.inputs, "0" * 64))["mesh"]["accuracy"] == "standard"
+    assert accuracy(study) == "standard"
 
 
 def test_a_finer_accuracy_has_more_cells(stated: Any) -> None:
     counts = []
     for name in ("fast", "standard", "fine"):
         table = stated(f'[mesh]\naccuracy = "{name}"\n').mesh
-        assert table.stands_for == name
+        assert table.stands_for([20.0]) == name
         counts.append(
             estimated_cells(table.edge_near_mm, table.edge_far_mm, table.near_radius_mm, table.growth)
         )
@@ -83,10 +87,29 @@ def test_what_is_stated_goes_before_the_knob(stated: Any) -> None:
     study = stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 2.5\ngrowth = 0.5\n')
     assert edges(mesh_settings(study)) == (2.5, 24.0, 14.0, 0.5, 1.6)
     assert coarse_settings(study) is not None  # it is the knob's still
-    assert study.mesh.stands_for is None
+    assert accuracy(study) is None
     other = stated('[mesh]\naccuracy = "fine"\n[mesh.coarse]\nedge_near_mm = 4.5\n')
     assert edges(coarse_settings(other)) == (4.5, 30.0, 12.0, 0.9, 1.6)
-    assert other.mesh.stands_for is None
+    assert accuracy(other) is None
+
+
+@pytest.mark.parametrize(
+    ("widths", "near", "radius"), [((12.0,), 2.1, 8.4), ((16.0, 12.0), 2.1, 11.2), ((30.0, 20.0), 3.5, 14.0)]
+)
+def test_edges_suit_the_indenters(stated: Any, widths: tuple[float, ...], near: float, radius: float) -> None:
+    """As much shorter as the narrowest is, as far as the widest; what is stated stays."""
+    first, *more = widths
+    indenters = f"[indenter]\nwidth_mm = {first}\n"
+    indenters += "".join(f'[indenters.ball]\nshape = "sphere"\nwidth_mm = {width}\n' for width in more)
+    study = stated(indenters)
+    assert edges(mesh_settings(study)) == pytest.approx((near, 30.0, radius, 0.9, 1.6))
+    assert accuracy(study) == "standard"
+    fine = coarse_settings(stated('[mesh]\naccuracy = "fine"\n' + indenters))
+    assert fine is not None
+    assert fine.edge_near_mm == pytest.approx(5.5 * min(1.0, min(widths) / 20.0))
+    own = stated("[mesh]\nedge_near_mm = 3.0\n" + indenters)
+    assert own.mesh.edge_near_mm == 3.0
+    assert accuracy(own) is None
 
 
 def test_no_coarse_mesh_is_finer_than_the_own(stated: Any) -> None:

@@ -101,7 +101,8 @@ def settings_record(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
     for key in ("series", "markers_series"):
         if record["image"] and record["image"][key]:
             record["image"][key] = f"sha256:{digest(record['image'][key])}"
-    record["mesh"]["accuracy"] = study.mesh.stands_for
+    widths_mm = [indenter.width_mm for indenter in study.all_indenters.values()]
+    record["mesh"]["accuracy"] = study.mesh.stands_for(widths_mm)
     control = StepControl()
     record["solver"] |= {key: getattr(control, key) for key in ("tolerance", "max_cuts", "penetration")}
     return record
