@@ -76,27 +76,26 @@ def stated_widths(content: Mapping[str, Any]) -> list[float]:
     return [float(width) for width in widths if isinstance(width, int | float) and width > 0] or [USUAL_MM]
 
 
-def suited_to(mesh: Any, widths_mm: Sequence[float]) -> Any:
-    """The table ``mesh`` as stated, with what it leaves open made for indenters narrower than usual.
+def with_edges(mesh: Any, widths_mm: Sequence[float] = (USUAL_MM,)) -> Any:
+    """The table ``mesh`` as stated, with the edge lengths that it leaves open.
 
-    Edges near a site are as much shorter as the narrowest of ``widths_mm`` is, and hold as much less far as
-    the widest is.
+    They are those of its accuracy. Near a site they are as much shorter as the narrowest of ``widths_mm`` is
+    narrower than usual, and hold as much less far as the widest is.
     """
-    if not isinstance(mesh, Mapping):  # or a table already, or nothing that could be one
+    if not isinstance(mesh, Mapping):  # a table already, or nothing that could be one
         return mesh
     narrow, wide = (min(1.0, width / USUAL_MM) for width in (min(widths_mm), max(widths_mm)))
-    own, coarse = ACCURACIES.get(str(mesh.get("accuracy", "standard")), ACCURACIES["standard"])
 
     def suited(edges: Mapping[str, float]) -> dict[str, float]:
         near, radius = narrow * edges["edge_near_mm"], wide * edges["near_radius_mm"]
-        return {"edge_near_mm": round(near, 3), "near_radius_mm": round(radius, 3)}
+        return {**edges, "edge_near_mm": round(near, 3), "near_radius_mm": round(radius, 3)}
 
-    if narrow == 1.0:
-        return mesh
-    out = {**suited(own), **mesh}
-    if coarse is not None and "coarse" not in mesh:
-        out["coarse"] = {**coarse, **suited(coarse)}
-    return out
+    own, second = ACCURACIES.get(str(mesh.get("accuracy", "standard")), ACCURACIES["standard"])
+    coarse = None if second is None else suited(second)
+    near = mesh.get("edge_near_mm", 0.0)
+    if coarse and isinstance(near, int | float) and near >= coarse["edge_near_mm"]:
+        coarse = None  # it would be no coarser
+    return {**suited(own), "coarse": coarse, **mesh}
 
 
 class CoarseMeshTable(TomlTable):
@@ -137,13 +136,7 @@ class MeshTable(TomlTable):
     @model_validator(mode="before")
     @classmethod
     def _from_accuracy(cls, given: Any) -> Any:
-        if not isinstance(given, Mapping):
-            return given
-        own, coarse = ACCURACIES.get(str(given.get("accuracy", "standard")), ACCURACIES["standard"])
-        near = given.get("edge_near_mm", 0.0)
-        if coarse and isinstance(near, int | float) and near >= coarse["edge_near_mm"]:
-            coarse = None  # it would be no coarser
-        return {**own, "coarse": coarse, **given}
+        return with_edges(given)
 
     @model_validator(mode="after")
     def _few_enough(self) -> MeshTable:
@@ -152,10 +145,11 @@ class MeshTable(TomlTable):
 
     def stands_for(self, widths_mm: Sequence[float]) -> str | None:
         """The ``accuracy`` whose edges for such indenters these are; none where the study states others."""
-        edges = self.model_dump(exclude={"element", "engine", "time_limit_s"})
+        apart = {"element", "engine", "time_limit_s"}
+        edges = self.model_dump(exclude=apart)
         for name in ACCURACIES:
-            usual = MeshTable.model_validate(suited_to({"accuracy": name}, widths_mm))
-            if edges == usual.model_dump(exclude={"element", "engine", "time_limit_s"}):
+            usual = MeshTable.model_validate(with_edges({"accuracy": name}, widths_mm))
+            if edges == usual.model_dump(exclude=apart):
                 return name
         return None
 

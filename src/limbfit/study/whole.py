@@ -27,7 +27,7 @@ from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .clamps import ClampsTable
 from .material import MaterialTable
-from .meshing import MeshTable, stated_widths, suited_to
+from .meshing import MeshTable, stated_widths, with_edges
 from .records import Indentation, Record, RecordTable, Site, records_of
 from .socket import SocketTable
 from .tables import (
@@ -80,7 +80,7 @@ class Study(TomlTable):
     @model_validator(mode="before")
     @classmethod
     def _suit_the_mesh(cls, given: dict[str, Any]) -> dict[str, Any]:
-        return {**given, "mesh": suited_to(given.get("mesh", {}), stated_widths(given))}
+        return {**given, "mesh": with_edges(given.get("mesh", {}), stated_widths(given))}
 
     @property
     def folder(self) -> Path:

@@ -114,6 +114,8 @@ def test_edges_suit_the_indenters(stated: Any, widths: tuple[float, ...], near: 
 
 def test_no_coarse_mesh_is_finer_than_the_own(stated: Any) -> None:
     assert coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 6.0\n')) is None
+    narrow = "[indenter]\nwidth_mm = 12.0\n"  # its coarse edges are 3.3 mm
+    assert coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 4.0\n' + narrow)) is None
 
 
 def test_an_unknown_accuracy_is_refused(stated: Any) -> None:

@@ -107,8 +107,7 @@ class SteppedRun:
 
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
-        planned = self.planned
-        targets = list(planned)
+        targets = list(self.planned)
         pace, why = Pace(self.control.max_iterations), ""
         if len(self.system.prestretch) and not self._rested():
             return
@@ -138,7 +137,7 @@ class SteppedRun:
             if t == targets[0]:
                 targets = targets[1:]
                 if self.control.times is None:
-                    targets = foresee(self.problem.history, planned, targets, times, forces)
+                    targets = foresee(self.problem.history, self.planned, targets, times, forces)
             yield found
 
     def _rested(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -135,15 +136,11 @@ def _doubts(
     run: SteppedRun, deepest: State | None, displacement: Array, force: Array, penetration: Array
 ) -> tuple[Doubt, ...]:
     """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
-
-    def energy() -> Array:
-        assert deepest is not None
-        density = element_fields(run.system, run.laws, deepest).energy
-        return density * run.system.weights.sum(axis=1)
-
     folds: tuple[Doubt, ...] = ()
     if deepest is not None:
-        folds = folded(run.problem.mesh, deepest.u, energy, deepest.displacement, displacement)
+        folds = folded(
+            run.problem.mesh, deepest.u, partial(_energies, run, deepest), deepest.displacement, displacement
+        )
     return (
         *folds,
         *slipped(displacement, force),
@@ -152,6 +149,11 @@ def _doubts(
         *unsettled(displacement, run.unsettled),
         *inexact(displacement, run.slopes.counts["inexact"]),
     )
+
+
+def _energies(run: SteppedRun, state: State) -> Array:
+    """Long-term elastic strain energy (m,) of the elements, N mm."""
+    return element_fields(run.system, run.laws, state).energy * run.system.weights.sum(axis=1)
 
 
 def _statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dict[str, Any]:
