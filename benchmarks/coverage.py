@@ -40,7 +40,7 @@ from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.laboratory import unknowns
-from limbfit.pipeline.stages.traces import SiteRecord, site_record
+from limbfit.pipeline.stages.records import SiteRecord, site_record
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]

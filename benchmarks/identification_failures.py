@@ -19,9 +19,9 @@ from limbfit.execution import SerialExecutor, sharing
 from limbfit.fe import solve
 from limbfit.indentation import Simulation, SimulationJob, build_problem, steps_of, to_parameters
 from limbfit.mesh import read_vtu
+from limbfit.pipeline.shared.artefacts import digest, read_curves
 from limbfit.pipeline.shared.simulations import job_digest
-from limbfit.pipeline.shared.store import RUNS, digest
-from limbfit.pipeline.shared.tabular import read_curves
+from limbfit.pipeline.shared.store import RUNS
 
 # Newton iterations of a step, none of which may be halved: the largest with which a simulation stops early.
 LIMITS = (5, 4, 3, 2, 1)

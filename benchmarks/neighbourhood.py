@@ -26,7 +26,7 @@ from limbfit.indentation import SimulationJob, build_problem, simulate, to_param
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.traces import as_response, site_record
+from limbfit.pipeline.stages.records import as_response, site_record
 
 MOVED = np.array(
     [0.15, -0.15, 0.1, 0.1]

@@ -24,8 +24,9 @@ import numpy as np
 
 from limbfit import load_study, run_study
 from limbfit.indentation import flat_names, to_vector
+from limbfit.pipeline.shared.artefacts import read_json
 from limbfit.pipeline.shared.context import Progress
-from limbfit.pipeline.shared.store import Store, read_json
+from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.verbs.demo import make_phantom_study
 
 Record = dict[str, Any]

@@ -37,7 +37,7 @@ from limbfit.phantom.record import (
     ULTRASOUND_HZ,
     ULTRASOUND_NOISE_MM,
 )
-from limbfit.pipeline.shared.store import write_json
+from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.study import IndenterTable
 
 SLOW = 0.96

@@ -17,10 +17,11 @@ from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.mesh.boxes import SIX_TETS, boxes, upright
 from limbfit.phantom.record import Ramp, record
+from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, fibres_of
-from limbfit.pipeline.shared.store import Store, write_json
-from limbfit.pipeline.stages.traces import run_traces
+from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.curves import run_traces
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "fat", "muscle")

@@ -16,7 +16,7 @@ from limbs import leg_image, rotation, write_dicom
 from conftest import COARSE
 from limbfit import load_study
 from limbfit.cli import main
-from limbfit.pipeline.shared.store import write_json
+from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.pipeline.verbs.run import run_record
 
 IN_TAGS = {

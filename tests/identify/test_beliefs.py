@@ -12,6 +12,7 @@ from limbfit.identify import Prior, calibrate, estimate_uncertainty, separate
 from limbfit.identify.fit.parameters import search_space
 from limbfit.identify.uncertainty.beliefs import Beliefs
 from limbfit.identify.uncertainty.intervals import KeptRuns, sampled_uncertainty
+from limbfit.identify.uncertainty.noise import curve_noise
 from limbfit.priors import of_tissues
 
 PEOPLE = tuple(Prior(name, *known) for name, known in of_tissues(("skin", "muscle")).items())
@@ -41,7 +42,9 @@ def told(unknowns, seed=0):
         return [site.respond(parameters) for site in THIN]
 
     found = calibrate(kept.of(simulate), data, unknowns)
-    known = estimate_uncertainty(found.parameters, found.responses, data, unknowns)
+    known = estimate_uncertainty(
+        found.parameters, found.responses, data, unknowns, curve_noise(found.responses, data)
+    )
     space = search_space(unknowns, separate(NAMES))
     return np.log(found.parameters), sampled_uncertainty(known, data, unknowns, space, kept, simulate)
 

@@ -16,7 +16,7 @@ from limbfit.identify import (
     estimate_uncertainty,
     separate,
 )
-from limbfit.identify.fit.objective import curvature, residuals
+from limbfit.identify.fit.objective import residuals
 from limbfit.identify.fit.parameters import Prior
 from limbfit.identify.uncertainty.noise import SiteNoise
 
@@ -122,7 +122,7 @@ def test_the_curvature_is_the_second_derivative_of_the_cost(objective):
         r, J = residuals(objective, [SiteResponse(at, eye)], [site])
         return r @ J
 
-    W = curvature(objective, force - site.force_N, site)
+    W = site.curvature(objective, force - site.force_N)
     slopes = np.array([(gradient(force + h) - gradient(force - h)) / 2e-6 for h in 1e-6 * eye])
     assert slopes == pytest.approx(W, abs=1e-6 * np.abs(W).max())
     _, J = residuals(objective, [SiteResponse(force, eye)], [site])

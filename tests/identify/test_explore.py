@@ -20,7 +20,8 @@ SPACE = search_space(PAPER, separate(NAMES))
 def calibrated(noise=0.03, seed=4, **extra):
     data = records(noise, seed=seed)
     found = calibrate(simulate, data, PAPER.from_start(TRUTH), stages=(separate(NAMES),))
-    return data, found, estimate_uncertainty(found.parameters, found.responses, data, PAPER)
+    noise = curve_noise(found.responses, data)
+    return data, found, estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
 
 
 @pytest.mark.slow
@@ -84,8 +85,7 @@ def test_a_source_shifts_the_answer_as_a_new_calibration_would():
 def test_coverage_of_whole_calibrations():
     def record(repeat, forces):
         data = records(0.03, seed=repeat)
-        left = [d.force_N - f for d, f in zip(data, forces)]
-        return data, [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
+        return data, curve_noise([SiteResponse(f, np.zeros((60, 0))) for f in forces], data)
 
     found = coverage_study(simulate, TRUTH, PAPER, record, repeats=20).linearised
     assert found.determined.all()

@@ -10,7 +10,7 @@ from limbfit.identify import Measured, SiteResponse, calibrate, estimate_uncerta
 from limbfit.identify.fit.parameters import Unknowns, search_space
 from limbfit.identify.uncertainty.coverage import coverage_study
 from limbfit.identify.uncertainty.intervals import KeptRuns, further_evaluations, sampled_uncertainty
-from limbfit.identify.uncertainty.noise import SiteNoise
+from limbfit.identify.uncertainty.noise import SiteNoise, curve_noise
 from limbfit.identify.uncertainty.uncertainty import LINEARISED, SAMPLED
 
 # Forces tell log c + BEND (log m)^2 well and log m itself poorly: a valley that is bent.
@@ -54,7 +54,14 @@ def near_the_truth(noise=0.03, grouping=None):
     grouping = grouping or separate(NAMES)
     found = calibrate(kept.of(simulate), data, PAPER.from_start(TRUTH), stages=(grouping,))
     bounds = PAPER.from_start(TRUTH)
-    known = estimate_uncertainty(found.parameters, found.responses, data, bounds, grouping=grouping)
+    known = estimate_uncertainty(
+        found.parameters,
+        found.responses,
+        data,
+        bounds,
+        curve_noise(found.responses, data),
+        grouping=grouping,
+    )
     return data, kept, known, search_space(bounds, grouping)
 
 

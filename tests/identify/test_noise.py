@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from limbfit.autoregressive import block_covariance
+from limbfit.identify import Measured, SiteResponse
 from limbfit.identify.uncertainty.noise import curve_noise, depth_slope, record_noise
 
 
@@ -99,5 +100,7 @@ def test_points_that_are_close_share_the_samples():
 def test_scatter_of_a_curve_is_told_from_its_bend():
     rng = np.random.default_rng(1)
     bend = np.sin(np.linspace(0, 3, 400))
-    found = curve_noise("a", np.arange(400.0), bend + 0.01 * rng.standard_normal(400), 10 + bend)
+    measured = Measured("a", 10 + bend)
+    response = SiteResponse(10 + 2 * bend + 0.01 * rng.standard_normal(400), np.zeros((400, 0)))
+    (found,) = curve_noise([response], [measured])
     assert found.sd_N == pytest.approx(0.01, rel=0.15)

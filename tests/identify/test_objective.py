@@ -9,7 +9,7 @@ import pytest
 from bars import PAPER, TRUTH, records, simulate
 
 from limbfit.identify import Measured, calibrate
-from limbfit.identify.fit.objective import curvature, residuals
+from limbfit.identify.fit.objective import residuals
 
 N, SHARE = 50, 0.01
 DOUBTFUL = Measured("a", np.linspace(0.0, 2.0, N), doubt_N=np.linspace(0.0, 0.1, N) ** 2, error_share=SHARE)
@@ -23,7 +23,7 @@ def test_the_cost_is_the_least_over_where_the_touch_down_may_be() -> None:
     shift = shape @ rest / (shape @ shape + SHARE**2)
     least = float(np.sum((rest - shift * shape) ** 2) + (SHARE * shift) ** 2)
     assert float(np.sum((DOUBTFUL.scale * DOUBTFUL.discounted(left)) ** 2)) == pytest.approx(least)
-    assert left @ curvature("pointwise", left, DOUBTFUL) @ left == pytest.approx(least)
+    assert left @ DOUBTFUL.curvature("pointwise", left) @ left == pytest.approx(least)
 
 
 def test_a_sure_touch_down_changes_nothing() -> None:

@@ -11,7 +11,7 @@ from limbfit.identify.fit.parameters import Unknowns, search_space
 from limbfit.identify.uncertainty.discrepancy import ResidualModel
 from limbfit.identify.uncertainty.evidence import candidate, compare
 from limbfit.identify.uncertainty.likelihood import Likelihood
-from limbfit.identify.uncertainty.noise import SiteNoise
+from limbfit.identify.uncertainty.noise import SiteNoise, curve_noise
 from limbfit.identify.uncertainty.posterior import sample_posterior
 from limbfit.identify.uncertainty.profile import check_ends, profile
 
@@ -40,7 +40,7 @@ def linear_case(seed=0, sd=SD):
 
 def bars_case(noise=0.01, seed=4):
     data = records(noise, seed=seed)
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER)
+    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, curve_noise(simulate(TRUTH), data))
     rng = np.random.default_rng(0)
     points = TRUTH * np.exp(0.25 * rng.uniform(-1, 1, (24, 8)))
     emulator = Emulator.fit(NAMES, points, [simulate(p) for p in points])
@@ -111,7 +111,7 @@ def test_bars_all_three_intervals_agree_and_hold_the_truth():
 
 def two_models(truth, noise=0.003):
     data = records(noise, seed=6, truth=truth)
-    u = estimate_uncertainty(truth, simulate(truth), data, PAPER)
+    u = estimate_uncertainty(truth, simulate(truth), data, PAPER, curve_noise(simulate(truth), data))
     middle = np.sqrt(truth * np.r_[truth[4:], truth[:4]])
     rng = np.random.default_rng(0)
     points = np.vstack(

@@ -27,7 +27,8 @@ from limbfit.identify.uncertainty.noise import curve_noise
 
 def fitted(data, run=simulate):
     found = calibrate(run, data, PAPER)
-    return found, estimate_uncertainty(found.parameters, found.responses, data, PAPER)
+    noise = curve_noise(found.responses, data)
+    return found, estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
 
 
 def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=(), site_N=()):
@@ -37,7 +38,9 @@ def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=(), site_N
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
-    found = estimate_uncertainty(truth, moved, data, unknowns, mesh_N=mesh_N, site_N=site_N)
+    found = estimate_uncertainty(
+        truth, moved, data, unknowns, curve_noise(moved, data), mesh_N=mesh_N, site_N=site_N
+    )
     return step, found
 
 
@@ -138,10 +141,12 @@ def test_records_of_a_site_share_the_error_of_its_mesh():
     twice = [replace(d, name=f"{d.name}-2", site=d.name) for d in records()]
     noisy = [replace(d, force_N=d.force_N + n) for d, n in zip([*records(), *twice], 2 * scatter(0.01))]
     responses = 2 * simulate(TRUTH)
-    one = estimate_uncertainty(TRUTH, responses[:4], noisy[:4], PAPER, mesh_N=mesh)
-    both = estimate_uncertainty(TRUTH, responses, noisy, PAPER, mesh_N=2 * mesh)
+    noise = curve_noise(responses, noisy)
+    one = estimate_uncertainty(TRUTH, responses[:4], noisy[:4], PAPER, noise[:4], mesh_N=mesh)
+    both = estimate_uncertainty(TRUTH, responses, noisy, PAPER, noise, mesh_N=2 * mesh)
+    alone = [replace(d, site="") for d in noisy]
     apart = estimate_uncertainty(
-        TRUTH, responses, [replace(d, site="") for d in noisy], PAPER, mesh_N=2 * mesh
+        TRUTH, responses, alone, PAPER, curve_noise(responses, alone), mesh_N=2 * mesh
     )
     stiffness = np.eye(8)[0] + np.eye(8)[4]  # both moduli, which the mesh moves
 
@@ -259,7 +264,9 @@ def test_two_tissues_that_cannot_be_told_apart_are_correlated():
 
 def test_what_is_given_is_not_called_identified():
     data, grouping = records(0.01), (0, 1, 2, -1, 3, 4, 5, -1)
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, grouping=grouping)
+    u = estimate_uncertainty(
+        TRUTH, simulate(TRUTH), data, PAPER, curve_noise(simulate(TRUTH), data), grouping=grouping
+    )
     assert u.verdicts[3] == u.verdicts[7] == GIVEN
     assert u.sd_log[3] == 0
     assert len(u.combinations) == 6
@@ -271,14 +278,16 @@ def test_an_answer_on_its_bound_is_flagged():
     bounded = type(PAPER)(PAPER.names, PAPER.start, PAPER.lower, upper)
     data = records(0.01)
     found = calibrate(simulate, data, bounded)
-    u = estimate_uncertainty(found.parameters, found.responses, data, bounded)
+    u = estimate_uncertainty(
+        found.parameters, found.responses, data, bounded, curve_noise(found.responses, data)
+    )
     assert u.at_bound == (True,) + (False,) * 7
     assert u.intervals_95[0, 1] <= 6.0
 
 
 def test_a_perfect_fit_is_no_division_by_zero():
     data = records()
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER)
+    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, curve_noise(simulate(TRUTH), data))
     assert np.all(np.isfinite(u.covariance))
     assert set(u.verdicts) == {DETERMINED}
 
@@ -297,7 +306,8 @@ def test_prediction_intervals_match_the_spread_of_predictions():
         )
         forces.append(held_out.force(found.parameters))
         if seed == 0:
-            u = estimate_uncertainty(found.parameters, found.responses, data, PAPER)
+            noise = curve_noise(found.responses, data)
+            u = estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
             predicted = prediction_sd(
                 held_out.respond(found.parameters).jacobian, found.parameters, u.covariance
             )
@@ -324,7 +334,7 @@ def test_the_error_is_the_papers():
 def test_the_slope_of_the_restricted_likelihood_is_its_derivative(mesh, site):
     data = records(0.02, seed=1)
     left = [r.force_N - d.force_N for r, d in zip(simulate(TRUTH), data)]
-    noise = [curve_noise(d.name, np.arange(60.0), r, d.force_N) for d, r in zip(data, left)]
+    noise = curve_noise(simulate(TRUTH), data)
     peaks = np.array([d.force_N.max() for d in data])
     scaled = [r.jacobian * TRUTH for r in simulate(TRUTH)]
     unit = ResidualModel(tuple(noise), peaks, np.ones(4), 0.2, 0.0, mesh_N=tuple(mesh), site_N=tuple(site))

@@ -27,7 +27,7 @@ from .activation import Activation
 from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
 from .contact.smooth_surface import SmoothSurface
-from .doubts import Doubt
+from .doubts import Doubt, texts_of
 from .kernel.elements import ELEMENTS
 from .materials import (
     ORDER_IN_TIME,
@@ -89,5 +89,6 @@ __all__ = [
     "linear_solver",
     "solve",
     "tangent_at_rest",
+    "texts_of",
     "tractions",
 ]

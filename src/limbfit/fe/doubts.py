@@ -46,6 +46,12 @@ class Doubt:
     share: float
 
 
+def texts_of(doubts: Sequence[Doubt], *kinds: Kind) -> tuple[str, ...]:
+    """What is said of each kind; empty where it is not doubted."""
+    said = {doubt.kind: doubt.text for doubt in doubts}
+    return tuple(said.get(kind, "") for kind in kinds)
+
+
 def _doubt(kind: Kind, text: str, count: int, depth_mm: float, displacement: Array) -> tuple[Doubt]:
     most = float(np.abs(displacement).max(initial=0.0))
     return (Doubt(kind, text, count, float(depth_mm), float(depth_mm) / most if most else 0.0),)

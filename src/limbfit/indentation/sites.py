@@ -71,7 +71,6 @@ class SiteModel:
     law: str = OGDEN  # of all tissues
     fibres: tuple[tuple[str, Direction], ...] = ()  # direction in each tissue that has some
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
-    extensions_digest: str = ""
     site: str = ""
     knots_N: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
@@ -222,6 +221,12 @@ def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Ve
         surface=surface,
         measures=table.measures,
     )
+
+
+def contact_radius(indenter: IndenterTable) -> float:
+    """Of a circle with the indenter's section, mm; a sphere touches with less."""
+    tool = read_indenter(indenter, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
+    return float(np.sqrt(tool.body.section / np.pi))
 
 
 def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
-from ..fe import Problem, StepControl, System
+from ..fe import Problem, StepControl, System, texts_of
 from ..fe import solve as simulate
 from ..fe.checking import check
 from ..identify import (
@@ -21,6 +21,7 @@ from ..identify import (
     SiteResponse,
     Uncertainty,
     Unknowns,
+    curve_noise,
     error_percent,
     estimate_uncertainty,
     separate,
@@ -59,7 +60,8 @@ class Fit:
         """
         measured = _measured(self.curves)
         best = np.array(list(self.parameters.values()))
-        return estimate_uncertainty(best, self.responses, measured, self.unknowns)
+        noise = curve_noise(self.responses, measured)
+        return estimate_uncertainty(best, self.responses, measured, self.unknowns, noise)
 
     def table(self) -> str:
         """Parameters, 95 % intervals and verdicts as text."""
@@ -191,8 +193,8 @@ class _Model:
         absent = np.zeros(len(times))
         columns = [full[:, known.index(name)] if name in known else absent for name in self.names]
         answer = found.response_at(times), np.stack(columns, axis=1), found.completed, found.reason
-        doubts: dict[str, str] = {doubt.kind: doubt.text for doubt in found.doubts}
-        return SiteResponse.with_doubts(*answer, f"curve {number + 1}", doubts)
+        kinds = texts_of(found.doubts, "slipped", "folded")
+        return SiteResponse(*answer, f"curve {number + 1}", found.warnings, *kinds)
 
 
 def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple[Array, Array], ...]:

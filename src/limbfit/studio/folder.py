@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..pipeline.shared.store import Store, read_json
+from ..pipeline.shared.artefacts import read_json
+from ..pipeline.shared.store import Store
 from ..pipeline.verbs.acquire import FOLDER as ACQUIRED
 from ..study import Study, load_study
 

@@ -10,8 +10,8 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
+from ..pipeline.shared.artefacts import read_curves
 from ..pipeline.shared.simulations import newest_simulations
-from ..pipeline.shared.tabular import read_curves
 from ..study import Record
 from .folder import StudyFolder
 from .processes import running, start_run, starting, stop_run

@@ -11,8 +11,7 @@ from typing import Any
 
 from ..errors import InputError, RunError
 from ..pipeline import export_study
-from ..pipeline.shared.store import write_json
-from ..pipeline.shared.tabular import read_curves
+from ..pipeline.shared.artefacts import read_curves, write_json
 from ..study import Record
 from .folder import StudyFolder, stored
 from .study_routes import stages_of_folder

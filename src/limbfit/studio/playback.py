@@ -14,7 +14,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from ..errors import InputError
 from ..mesh import read_grid, read_vtu
 from ..phases import find_phases, loading_end
-from ..pipeline.shared.tabular import read_curves
+from ..pipeline.shared.artefacts import read_curves
 from ..web.arrays import pack
 from ..web.shapes import volume_of
 from .folder import StudyFolder, fingerprint, stored

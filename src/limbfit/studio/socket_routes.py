@@ -14,8 +14,8 @@ from pydantic import Field
 
 from ..errors import InputError
 from ..mesh import read_vtu
+from ..pipeline.shared.artefacts import digest
 from ..pipeline.shared.socket_shape import regions_of, socket_of
-from ..pipeline.shared.store import digest
 from ..socket import Socket
 from ..study import Study
 from ..web.arrays import pack

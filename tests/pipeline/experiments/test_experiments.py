@@ -11,7 +11,7 @@ from limbfit import run_experiment
 from limbfit.errors import InputError
 from limbfit.pipeline import Progress, study_status
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment, register_experiment
-from limbfit.pipeline.shared.store import write_json
+from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.pipeline.verbs.run import keys
 from limbfit.study import load_study
 

@@ -18,9 +18,10 @@ from limbfit.pipeline.experiments.sensitivity import (
 )
 from limbfit.pipeline.experiments.variants import choose_sites
 from limbfit.pipeline.experiments.volumes import volume_facts
+from limbfit.pipeline.shared.artefacts import read_json, write_json
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.shared.extrapolation import richardson
-from limbfit.pipeline.shared.store import Store, read_json, write_json
+from limbfit.pipeline.shared.store import Store
 from limbfit.study import IndenterTable, load_study
 
 SETTINGS = coarse_mesh("tet10", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"

@@ -10,15 +10,8 @@ import sys
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.shared.store import (
-    EARLIER,
-    Store,
-    disk_errors,
-    file_digest,
-    lock,
-    read_json,
-    write_json,
-)
+from limbfit.pipeline.shared.artefacts import file_digest, read_json, write_json
+from limbfit.pipeline.shared.store import EARLIER, Store, disk_errors, lock
 
 
 def test_stage_is_done_only_for_its_key(tmp_path):

@@ -15,10 +15,10 @@ from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
 from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
+from limbfit.pipeline.shared.artefacts import read_curves, write_json
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import COARSE, job_digest
-from limbfit.pipeline.shared.store import Store, write_json
-from limbfit.pipeline.shared.tabular import read_curves
+from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.study import Study, load_study
 

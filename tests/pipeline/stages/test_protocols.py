@@ -13,11 +13,13 @@ from limbfit import check_study, load_study
 from limbfit.bench.blocks import block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, simulate, to_vector
+from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import CURVE_POINTS
-from limbfit.pipeline.shared.store import Store, write_json
-from limbfit.pipeline.stages.record_noise import site_noise
-from limbfit.pipeline.stages.traces import run_traces, site_record
+from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.curves import run_traces
+from limbfit.pipeline.stages.deviations import site_noise
+from limbfit.pipeline.stages.records import site_record
 from limbfit.report.sections.records import record_figure, trace_table
 from limbfit.report.store import load_store
 

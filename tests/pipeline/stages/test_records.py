@@ -19,8 +19,8 @@ from limbfit.identify.uncertainty.noise import record_noise
 from limbfit.identify.uncertainty.sources import Gain
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.curves import read_record
 from limbfit.pipeline.stages.mesh import mesh_job, mesh_settings
-from limbfit.pipeline.stages.traces import read_record
 from limbfit.pipeline.verbs.run import keys
 from limbfit.report.site_tables import site_table
 from limbfit.report.store import load_store

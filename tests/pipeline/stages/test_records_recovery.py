@@ -18,7 +18,7 @@ from limbfit.mesh import write_vtu
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
-from limbfit.pipeline.stages.traces import as_response, site_record
+from limbfit.pipeline.stages.records import as_response, site_record
 from limbfit.study import Record, Study, load_study
 
 TRUTH = {

@@ -9,7 +9,7 @@ from layered import layered_block
 from limbfit.bench.blocks import block_site
 from limbfit.identify import FIXED, CalibrationSettings, Measured, Unknowns, calibrate
 from limbfit.indentation import SimulationJob, simulate
-from limbfit.pipeline.stages.traces import as_response
+from limbfit.pipeline.stages.records import as_response
 from limbfit.study import SolverTable
 
 TISSUES = ("skin", "muscle")

@@ -8,7 +8,7 @@ takes equation 8 as printed, one mean squared difference per site, which least s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -63,6 +63,20 @@ class Measured:
         variance = 1.0 + (size / self.force_N.max() / self.error_share) ** 2 / self.force_N.size
         return np.asarray(rows - np.multiply.outer(shape, (1.0 - variance**-power) * (shape @ rows)))
 
+    def curvature(self, objective: Objective, difference_N: Array) -> Array:
+        """Second derivative (n, n) of its cost with respect to the simulated force (n,).
+
+        ``difference_N`` (n,) is that force less the measured one. Half the square of the residuals is the
+        cost. With derivatives J of the force, its gradient changes by ``-J' W`` times a change of the record
+        and, but for the force's own second derivatives, by ``J' W J`` times a step; W is this matrix.
+        """
+        n = difference_N.size
+        if objective == "pointwise":
+            return self.scale**2 * self.discounted(np.eye(n), power=1.0)
+        square = max(float(difference_N @ difference_N), n * (_EXACT * float(self.force_N.max())) ** 2)
+        both = square * np.eye(n) + 2 * np.outer(difference_N, difference_N)
+        return np.asarray(2 * (self.weight / n) ** 2 * both)
+
 
 @dataclass(frozen=True)
 class SiteResponse:
@@ -81,20 +95,6 @@ class SiteResponse:
     doubts: tuple[str, ...] = ()
     slipped: str = ""
     folded: str = ""
-
-    @classmethod
-    def with_doubts(
-        cls,
-        force_N: Array,
-        jacobian: Array,
-        completed: bool,
-        reason: str,
-        site: str,
-        doubts: Mapping[str, str],
-    ) -> SiteResponse:
-        """A response from the texts of its doubts, by kind."""
-        kinds = doubts.get("slipped", ""), doubts.get("folded", "")
-        return cls(force_N, jacobian, completed, reason, site, tuple(doubts.values()), *kinds)
 
 
 Simulate = Callable[[Array], Sequence[SiteResponse]]
@@ -162,17 +162,3 @@ def _mean_squares(response: SiteResponse, site: Measured) -> tuple[Array, Array]
     slope = share * difference @ response.jacobian
     bend = np.sqrt(share * value) * response.jacobian
     return np.r_[value, np.zeros(difference.size)], np.vstack([slope, bend])
-
-
-def curvature(objective: Objective, difference_N: Array, site: Measured) -> Array:
-    """Second derivative (n, n) of a site's cost with respect to its force (n,).
-
-    ``difference_N`` (n,) is that force less the measured one. Half the square of the residuals is the cost.
-    With derivatives J of the force, its gradient changes by ``-J' W`` times a change of the record and, but
-    for the force's own second derivatives, by ``J' W J`` times a step; W is this matrix.
-    """
-    n = difference_N.size
-    if objective == "pointwise":
-        return site.scale**2 * site.discounted(np.eye(n), power=1.0)
-    square = max(float(difference_N @ difference_N), n * (_EXACT * float(site.force_N.max())) ** 2)
-    return 2 * (site.weight / n) ** 2 * (square * np.eye(n) + 2 * np.outer(difference_N, difference_N))

@@ -43,7 +43,7 @@ class ResidualModel:
     """Covariance of the residuals: noise of each record, its misfit of the model, and what records share.
 
     ``mesh_N`` (n,) per record is one standard deviation of the mesh's error, none where it was not measured:
-    the records of one of the ``sites`` (records,) have one mesh, whose error is one deviation of them all.
+    records of one site (`SiteNoise.where`) have one mesh, whose error is one deviation of them all.
     ``site_N`` (n,) is the same for the stiffness of a site's tissue, as it was expected to differ, and
     ``site_factor`` how many times as much it does; none: it is left out.
     ``misfit`` (records,) is the standard deviation of the misfit over the largest force ``peaks_N``
@@ -57,7 +57,6 @@ class ResidualModel:
     known_scale: float
     criterion: float = field(default=0.0, repr=False)
     mesh_N: tuple[Array, ...] = ()
-    sites: tuple[str, ...] = ()
     site_N: tuple[Array, ...] = ()
     site_factor: float = 1.0
 
@@ -101,7 +100,7 @@ class ResidualModel:
     @property
     def places(self) -> tuple[str, ...]:
         """The sites, each once."""
-        return tuple(dict.fromkeys(self.sites or tuple(noise.name for noise in self.noise)))
+        return tuple(dict.fromkeys(noise.where for noise in self.noise))
 
     @property
     def shared(self) -> tuple[Array, ...]:
@@ -109,13 +108,12 @@ class ResidualModel:
 
         First those of the meshes, then those of the sites, each as many as there are `places` or none.
         """
-        of = self.sites or tuple(noise.name for noise in self.noise)
         kinds = [(self.mesh_N, 1.0), (self.site_N, self.site_factor)]
         kinds = [(rows, factor) for rows, factor in kinds if rows]
         found = [np.zeros((len(noise.times_s), len(kinds), len(self.places))) for noise in self.noise]
         for k, (rows, factor) in enumerate(kinds):
-            for row, site, columns in zip(rows, of, found, strict=True):
-                columns[:, k, self.places.index(site)] = factor * row
+            for row, noise, columns in zip(rows, self.noise, found, strict=True):
+                columns[:, k, self.places.index(noise.where)] = factor * row
         return tuple(columns.reshape(len(columns), -1) for columns in found)
 
     def own(self, i: int) -> Array:
@@ -184,14 +182,13 @@ def estimate_discrepancy(
     peaks_N: Array,
     precision: Array,
     mesh_N: Sequence[Array] = (),
-    sites: Sequence[str] = (),
     site_N: Sequence[Array] = (),
 ) -> ResidualModel:
     """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per record.
 
     Derivatives are with respect to the logarithms of the parameters, ``precision`` (p, p) is what is known of
-    them beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one of the ``sites``
-    (by default each its own) have in common, ``site_N`` (n,) what is expected of the site's own stiffness.
+    them beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one site have in
+    common, ``site_N`` (n,) what is expected of the site's own stiffness.
     Misfits are alike, and sites as far off as expected, within a factor of about two unless residuals say
     otherwise.
     """
@@ -199,7 +196,7 @@ def estimate_discrepancy(
     unit = np.ones(len(noise))
     model = ResidualModel(
         tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0,
-        mesh_N=tuple(mesh_N), sites=tuple(sites), site_N=tuple(site_N),
+        mesh_N=tuple(mesh_N), site_N=tuple(site_N),
     )  # fmt: skip
     start = np.array([_first_guess(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
     bounds = [(np.log(_LEAST), np.log(_MOST))] * len(start)

@@ -3,7 +3,7 @@
 At the answer the gradient of what was minimised is zero, so the implicit function theorem gives the change of
 the answer from that of the records and of the priors' medians (Huber 1967, the sandwich): ``H^-1 J' W dy``
 and ``H^-1 s^2 R' db``, with J the derivatives of a site's force, W the curvature of its cost
-(``objective.curvature``), s^2 the weight of the priors, R their rows, ``H = J' W J + s^2 R' R``. The force's
+(`Measured.curvature`), s^2 the weight of the priors, R their rows, ``H = J' W J + s^2 R' R``. The force's
 own second derivatives are left out: they meet residuals whose mean is zero.
 """
 
@@ -14,9 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from ..fit.objective import Measured, curvature
-from ..fit.state import CalibrationSettings
 
 Array = NDArray[np.float64]
 
@@ -38,20 +35,18 @@ class Estimator:
     @classmethod
     def at(
         cls,
-        left: Sequence[Array],
         scaled: Sequence[Array],
-        measured: Sequence[Measured],
+        weights: Sequence[Array],
         rows: Array,
-        settings: CalibrationSettings,
+        share: float,
     ) -> Estimator:
-        """From residuals (n,) N and derivatives (n, k) N per site at the answer.
+        """From derivatives (n, k) N and the cost's curvature (n, n) per site at the answer.
 
-        ``rows @ z`` (q, k) are the priors' logarithms in their standard deviations.
+        ``rows @ z`` (q, k) are the priors' logarithms in their standard deviations, ``share`` is how much the
+        squares of these count in the cost.
         """
-        weights = [curvature(settings.objective, r, site) for r, site in zip(left, measured, strict=True)]
         by_record = tuple(J.T @ W for J, W in zip(scaled, weights, strict=True))
         forces = np.sum([G @ J for G, J in zip(by_record, scaled)], axis=0)
-        share = (settings.force_error_percent / 100) ** 2
         return cls(forces, share * rows.T @ rows, by_record, share * rows.T)
 
     @property

@@ -7,6 +7,7 @@ which keeps what the smoothing keeps and claims no knowledge of what it removed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...autoregressive import block_covariance, lag_one
 from ...phases import find_phases
+from ..fit.objective import Measured, SiteResponse
 
 Array = NDArray[np.float64]
 
@@ -26,7 +28,8 @@ class SiteNoise:
 
     ``covariance`` (n, n) N^2; ``sd_N`` and ``autocorrelation`` of neighbours are those of the samples as
     recorded; ``touch_down_mm`` is the standard deviation of the touch-down that is part of the covariance.
-    ``unit`` is mm, and all of it, where depths are compared.
+    ``unit`` is mm, and all of it, where depths are compared. ``site``: where the record is from, by default
+    its own.
     """
 
     name: str
@@ -36,6 +39,12 @@ class SiteNoise:
     autocorrelation: float
     touch_down_mm: float = 0.0
     unit: str = "N"
+    site: str = ""
+
+    @property
+    def where(self) -> str:
+        """What records of one site have in common."""
+        return self.site or self.name
 
 
 def record_noise(
@@ -71,15 +80,19 @@ def record_noise(
     return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm, unit)
 
 
-def curve_noise(name: str, times_s: Array, residual_N: Array, force_N: Array) -> SiteNoise:
-    """White noise of a curve that was never smoothed, from how neighbouring residuals (n,) scatter.
+def curve_noise(responses: Sequence[SiteResponse], measured: Sequence[Measured]) -> tuple[SiteNoise, ...]:
+    """White noise of curves that were never smoothed, from how neighbouring residuals scatter.
 
     Second differences take what is smooth out of them.
     """
-    differences = np.diff(residual_N, 2)
-    sd = float(np.sqrt(np.mean(differences**2) / 6.0)) if differences.size else 0.0
-    sd = float(np.hypot(sd, _LEAST_SHARE * force_N.max()))
-    return SiteNoise(name, times_s, sd**2 * np.eye(len(times_s)), sd, 0.0)
+    found = []
+    for response, curve in zip(responses, measured, strict=True):
+        differences = np.diff(response.force_N - curve.force_N, 2)
+        sd = float(np.sqrt(np.mean(differences**2) / 6.0)) if differences.size else 0.0
+        sd = float(np.hypot(sd, _LEAST_SHARE * curve.force_N.max()))
+        n = curve.force_N.size
+        found.append(SiteNoise(curve.name, np.arange(float(n)), sd**2 * np.eye(n), sd, 0.0, site=curve.site))
+    return tuple(found)
 
 
 def _samples_of_points(times_s: Array, samples: int) -> NDArray[np.int64]:

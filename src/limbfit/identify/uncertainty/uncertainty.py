@@ -25,7 +25,7 @@ from ..fit.state import CalibrationSettings
 from .beliefs import Beliefs
 from .discrepancy import ResidualModel, estimate_discrepancy
 from .estimator import Estimator
-from .noise import SiteNoise, curve_noise
+from .noise import SiteNoise
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def estimate_uncertainty(
     responses: Sequence[SiteResponse],
     measured: Sequence[Measured],
     unknowns: Unknowns,
-    noise: Sequence[SiteNoise] | None = None,
+    noise: Sequence[SiteNoise],
     grouping: Grouping | None = None,
     settings: CalibrationSettings | None = None,
     mesh_N: Sequence[Array] = (),
@@ -106,27 +106,22 @@ def estimate_uncertainty(
     Parameters
     ----------
     responses : forces and derivatives there (``Calibration.responses``).
-    noise : of each site's record (``record_noise``); by default white, from the scatter of the residuals
-        (``curve_noise``), which suits curves that were not smoothed.
+    noise : of each site's record (``record_noise``), or of curves that were not smoothed (``curve_noise``).
     grouping : of the last stage; by default every parameter is free.
     settings : with which the parameters were found: the covariance is that of this estimator.
     mesh_N : (n,) per site, one standard deviation of the mesh's error in the force; none: it is left out.
     site_N : (n,) per site, what its force as a whole is expected to be off by; residuals correct the size.
     """
     left = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
-    if noise is None:
-        noise = [
-            curve_noise(site.name, np.arange(float(r.size)), r, site.force_N)
-            for site, r in zip(measured, left)
-        ]
     space = search_space(unknowns, grouping or separate(unknowns.names))
     scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
     z = space.reduce(np.log(parameters))
     prior = Beliefs.of(unknowns, space)
     peaks = np.array([site.force_N.max() for site in measured])
-    sites = [site.where for site in measured]
-    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N, sites, site_N)
-    estimator = Estimator.at(left, scaled, measured, prior.rows, settings or CalibrationSettings())
+    model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N, site_N)
+    chosen = settings or CalibrationSettings()
+    weights = [one.curvature(chosen.objective, r) for r, one in zip(left, measured, strict=True)]
+    estimator = Estimator.at(scaled, weights, prior.rows, (chosen.force_error_percent / 100) ** 2)
     linear = _Linear.at(left, scaled, estimator, model, prior, space, z)
     return _told(np.asarray(parameters), linear, model, unknowns, space, prior)
 

@@ -18,9 +18,10 @@ from ...errors import InputError
 from ...extensions import Registry
 from ...report.sections.experiments import SECTIONS, Maker
 from ...study import Study
+from ..shared.artefacts import read_json
 from ..shared.context import Context
 from ..shared.keys import Keys, Stage
-from ..shared.store import Store, read_json
+from ..shared.store import Store
 from .crossvalidation import run_crossvalidate
 from .cube import COMPRESSION_PERCENT, run_cube
 from .design import run_design

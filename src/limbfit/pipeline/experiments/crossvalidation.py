@@ -34,10 +34,9 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import error_percent
 from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
+from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
-from ..shared.store import write_json
-from ..shared.tabular import write_table
 from ..stages.laboratory import Laboratory, unknowns
 
 Array = NDArray[np.float64]

@@ -23,8 +23,8 @@ from ...indentation import materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
 from ...mesh.boxes import HEX, boxes
+from ..shared.artefacts import read_json, write_json
 from ..shared.context import Context
-from ..shared.store import read_json, write_json
 from .published import PUBLISHED
 
 Array = NDArray[np.float64]

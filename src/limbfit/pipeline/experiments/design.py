@@ -18,10 +18,9 @@ from ...identify.checks.design import prior_information as bounds_information
 from ...identify.fit.objective import SiteResponse
 from ...indentation import Parameters, SiteModel
 from ...study import Study
+from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.simulations import curve_job, experiment_cache, model_of
-from ..shared.store import write_json
-from ..shared.tabular import write_table
 from ..stages.laboratory import unknowns
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.emulator import Emulator
-from ..shared.store import atomic
+from ..shared.artefacts import atomic
 
 Array = NDArray[np.float64]
 EMULATOR = "emulator.npz"

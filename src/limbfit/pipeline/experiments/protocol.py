@@ -22,10 +22,9 @@ from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...indentation import Parameters, Simulation, SiteModel, layers_under
 from ...study import Site
+from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
-from ..shared.store import write_json
-from ..shared.tabular import write_table
 from ..stages.laboratory import unknowns
 from .design import DEEPEST_SHARE
 

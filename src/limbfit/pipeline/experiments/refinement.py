@@ -9,10 +9,10 @@ from typing import Any
 
 from ...errors import InputError
 from ...indentation import Simulation
+from ..shared.artefacts import file_digest, read_json
 from ..shared.context import Context
 from ..shared.extrapolation import MESH_ORDERS, richardson
 from ..shared.simulations import experiment_cache
-from ..shared.store import file_digest, read_json
 from ..stages.mesh import make_mesh, mesh_job, mesh_settings
 from .sensitivity import identified_parameters, store_runs
 from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants

@@ -15,12 +15,11 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.fit.regions import RegionFit, RegionRecords, fit_regions, mean_percent
 from ...identify.fit.state import Calibration
 from ...study import Site
+from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache, experiment_cache
-from ..shared.store import write_json
-from ..shared.tabular import write_table
 from ..stages.laboratory import Laboratory, groupings, unknowns
-from ..stages.traces import SiteRecord, as_response, site_record
+from ..stages.records import SiteRecord, as_response, site_record
 
 Array = NDArray[np.float64]
 CHOICES = ("all", "fitted")

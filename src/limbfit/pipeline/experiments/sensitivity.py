@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from ...indentation import Parameters
 from ...shapes import OWN, SHAPES
 from ...study import IndenterTable
+from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
-from ..shared.store import write_json
-from ..shared.tabular import write_table
-from ..stages.traces import as_searched, site_record
+from ..stages.records import as_searched, site_record
 from .variants import (
     ChosenSite,
     Variant,

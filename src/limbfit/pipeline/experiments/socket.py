@@ -12,10 +12,9 @@ from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
 from ...socket.published import published
+from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.socket_shape import socket_of
-from ..shared.store import write_json
-from ..shared.tabular import write_table
 from .socket_limb import Covariance, SocketLimb
 
 NAME = "socket"

@@ -31,12 +31,11 @@ from ...socket.rays import profile
 from ...socket.rectify import reduced_to
 from ...socket.targets import Target, zone
 from ...socket.wall import thickness, wall
+from ..shared.artefacts import digest, file_digest, write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Kept, Made
 from ..shared.socket_shape import blaming, check_regions, recipe_of
 from ..shared.sources import code_digest
-from ..shared.store import digest, file_digest, write_json
-from ..shared.tabular import write_table
 from .socket_limb import SocketLimb
 
 Array = NDArray[np.float64]

@@ -27,10 +27,10 @@ from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
 from ...socket.regions import SkinRegion
 from ...study import Study
+from ..shared.artefacts import read_json
 from ..shared.context import Context
 from ..shared.simulations import fibres_of
 from ..shared.socket_shape import load_of, regions_of
-from ..shared.store import read_json
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
 from .socket_intervals import Spread, spread_facts
 

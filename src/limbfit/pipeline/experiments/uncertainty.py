@@ -20,10 +20,10 @@ from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.sources import Gain
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
+from ..stages.deviations import site_noise
 from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
 from ..stages.predict import Answer, answer_jobs
-from ..stages.record_noise import site_noise
-from ..stages.traces import as_response, as_searched, site_record
+from ..stages.records import as_response, as_searched, site_record
 from .uncertainty_record import Found, Predicted, write_results
 from .uncertainty_sources import Change, changes, variants
 

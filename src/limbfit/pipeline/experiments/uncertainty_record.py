@@ -27,9 +27,8 @@ from ...identify.uncertainty.uncertainty import (
     product_text,
     verdict_of,
 )
-from ..shared.store import write_json
-from ..shared.tabular import write_curves, write_table
-from ..stages.traces import SiteRecord
+from ..shared.artefacts import write_curves, write_json, write_table
+from ..stages.records import SiteRecord
 from .emulator_file import EMULATOR, write_runs
 from .uncertainty_sources import Change
 

@@ -27,8 +27,8 @@ from ..shared.extrapolation import MESH_ORDERS, error_of_coarser
 from ..shared.simulations import SimulationCache
 from ..stages.laboratory import error_of_own_mesh
 from ..stages.mesh import coarse_settings, mesh_settings
+from ..stages.records import SiteRecord, site_record
 from ..stages.remesh import meshed_models, scaled_edges
-from ..stages.traces import SiteRecord, site_record
 
 Array = NDArray[np.float64]
 

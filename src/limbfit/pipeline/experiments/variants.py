@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
 from ...study import Indentation, Record, Site
+from ..shared.artefacts import write_curves
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
-from ..shared.tabular import write_curves
-from ..stages.site_scatter import bone_distance_mm
+from ..stages.deviations import bone_distance_mm
 
 Array = NDArray[np.float64]
 

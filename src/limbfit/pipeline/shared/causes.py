@@ -10,10 +10,10 @@ from typing import Any
 
 from ..._version import __version__
 from ...study import Study
+from .artefacts import digest
 from .keys import Keys, Stage, records_read
 from .provenance import input_files
 from .sources import code_parts
-from .store import digest
 
 Parts = dict[str, dict[str, str]]
 _FEW = 4  # causes of one kind that are named

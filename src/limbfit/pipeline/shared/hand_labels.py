@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from ...study import Study
-from .store import atomic, file_digest, read_json
+from .artefacts import atomic, file_digest, read_json
 
 LABELS = "labels.seg.nrrd"
 DIGEST = "labels_sha256"  # key of segment.json: the label map as the stage wrote it

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .store import EARLIER, RUNS, atomic, plain
+from .artefacts import atomic, plain
+from .store import EARLIER, RUNS
 
 Facts = dict[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]

@@ -10,9 +10,9 @@ from typing import Any
 
 from ...extensions import extensions_digest
 from ...study import Study
+from .artefacts import digest, file_digest
 from .provenance import input_files
 from .sources import code_digest
-from .store import digest, file_digest
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from typing import Any
 from ...anatomy.labels.labelfiles import sidecar
 from ...fe import StepControl
 from ...study import Study
+from .artefacts import digest, file_digest
 from .hand_labels import hand_labels
-from .store import digest, file_digest
 
 LIBRARIES = (
     "numpy",

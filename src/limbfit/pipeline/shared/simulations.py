@@ -9,18 +9,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ...errors import ProblemError
 from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
-from ...indentation import Direction, Simulation, SimulationJob, SiteModel, simulate
+from ...indentation import (
+    Direction,
+    Simulation,
+    SimulationJob,
+    SiteModel,
+    clamping_pins,
+    read_indenter,
+    simulate,
+)
 from ...mesh import read_vtu
 from ...study import Indentation, Record, Site, Study, Vector
-from .clamping import pins_met
+from .artefacts import atomic, digest, file_digest
 from .context import Context
 from .sources import code_digest
-from .store import COARSE, EARLIER, RUNS, atomic, digest, file_digest
+from .store import COARSE, EARLIER, RUNS
 
+Array = NDArray[np.float64]
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 
 
@@ -132,6 +143,7 @@ def job_digest(job: SimulationJob) -> str:
     model = {key: value for key, value in vars(job.model).items() if key not in ("mesh", "extensions")}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     clamps = None if job.model.clamps is None else job.model.clamps.model_dump()
+    model["extensions_digest"] = extensions_digest(job.model.extensions)
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump(), "clamps": clamps}
     return digest(
         code_digest(simulate),
@@ -217,12 +229,41 @@ def site_model(
         law=study.material.law,
         fibres=fibres_of(context),
         extensions=study.extensions,
-        extensions_digest=extensions_digest(study.extensions),
         layers=tuple(layers),
         course=study.material.course,
         prestretch=tuple(sorted(study.material.prestretch.items())),
         **clamped,
     )
+
+
+def pins_met(
+    study: Study,
+    one: Indentation,
+    place: tuple[Vector, Vector],
+    skin: tuple[Array, NDArray[np.int64]],
+    along: Vector,
+) -> int:
+    """How many pins hold the limb in an indentation; 0 where the study has none.
+
+    Parameters
+    ----------
+    place : position and axis of the indenter.
+    skin : points (n, 3) mm and faces (f, 3 or more).
+    along : the limb's axis, proximally.
+
+    Raises
+    ------
+    ProblemError
+        Where the pins cannot be placed, with the study's file.
+    """
+    if study.clamps is None:
+        return 0
+    indenter = read_indenter(study.indenter_of(one), *place, None)
+    try:
+        return len(clamping_pins(*skin, indenter, np.array(along), study.clamps))
+    except ProblemError as error:
+        what = f"site {one.name}: {error.what}"
+        raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
 
 
 def recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._version import __version__
-from .store import digest, file_digest
+from .artefacts import digest, file_digest
 
 PACKAGE = Path(__file__).parents[2]
 _LAZY = "_HOME"  # name of the table of an ``__init__`` that loads its names when they are first used

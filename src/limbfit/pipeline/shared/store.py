@@ -1,4 +1,4 @@
-"""Stage folders on disk: what is done, what is stale, and writes that are never half done.
+"""Stage folders on disk: what is done, what is stale, who holds them.
 
 A stage works in ``results/.work-<stage>-<key>`` and is renamed to ``results/<stage>`` when complete. The key
 is a digest of everything the stage depends on, so a run that was killed finds its own unfinished folder again
@@ -8,22 +8,20 @@ and goes on in it. Of an unfinished folder of other inputs the simulations are k
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import os
 import shutil
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
-from typing import Any, BinaryIO
+from typing import Any
 
 from filelock import FileLock, Timeout
 
 from ...errors import RunError
+from .artefacts import DRAFT, read_json, write_json
 
 STAMP = "stage.json"
 LOCK, HOLDER = ".lock", ".holder"
@@ -31,57 +29,7 @@ _PATIENCE_S = 0.5  # for one who only asks whether a study is held
 RUNS = "runs"  # a stage's kept simulations
 COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
 EARLIER = ".earlier"  # those of attempts with other inputs, while the stage is not complete
-_DRAFT, _OLD = ".part", ".old-"
-
-
-def digest(*parts: Any) -> str:
-    """A short stable digest of JSON-like values."""
-    text = json.dumps(parts, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of all files below a folder."""
-    sha = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        if path.is_dir():
-            sha.update(str(file.relative_to(path)).encode())
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                sha.update(block)
-    return sha.hexdigest()
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that a reader sees the old file or the new one, never half of it."""
-    text = json.dumps(content, indent=1, allow_nan=False, default=plain)
-    with atomic(path) as stream:
-        stream.write(text.encode())
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def plain(value: Any) -> Any:
-    """NumPy scalars and arrays as what JSON knows."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return str(value)
-
-
-@contextmanager
-def atomic(path: Path) -> Iterator[BinaryIO]:
-    """A binary stream whose content appears at ``path`` only when the block ends well."""
-    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{_DRAFT}")
-    try:
-        with draft.open("xb") as stream:
-            yield stream
-        os.replace(draft, path)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
+_OLD = ".old-"
 
 
 @dataclass(frozen=True)
@@ -145,7 +93,7 @@ class Store:
             seconds = clock.stop()
         clock.file.unlink(missing_ok=True)
         shutil.rmtree(work / EARLIER, ignore_errors=True)
-        for draft in work.rglob(f".*{_DRAFT}"):  # of attempts that were killed while writing
+        for draft in work.rglob(f".*{DRAFT}"):  # of attempts that were killed while writing
             draft.unlink()
         stamp = {
             "stage": stage,
@@ -168,7 +116,7 @@ class Store:
 
     def mend(self) -> None:
         """Put right what a run that was killed while it wrote or renamed has left."""
-        for draft in self.folder.glob(f".*{_DRAFT}"):
+        for draft in self.folder.glob(f".*{DRAFT}"):
             draft.unlink()
         for old in self.folder.glob(f"{_OLD}*"):
             place = self.folder / old.name.removeprefix(_OLD)

@@ -17,12 +17,11 @@ from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters
 from ...priors import SOURCE
 from ...study import Study
+from ..shared.artefacts import write_json
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
-from ..shared.store import write_json
 from .doubted import contact_record, doubts_record
 from .laboratory import Array, Laboratory, groupings, stage_titles, unknowns
-from .plausible import stored_flags
 
 
 def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
@@ -33,8 +32,6 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     study, table = context.study, context.study.calibration
     if not study.fitted:
         raise StudyError("no site is fitted", file=study.file, place="sites", remedy="set fitted = true")
-    for flag in stored_flags(context):
-        context.tell("calibrate", 0, 0, f"warning: {flag.text}")
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
     laboratory = Laboratory(context, cache, study.records_at(*study.fitted))
     stages = groupings(study)

@@ -12,6 +12,8 @@ from ..shared.hand_labels import hand_labels
 
 THICKNESS = "fat-depth.vtp"
 MARKED_SKIN = "skin-markers.stl"
+SMOOTHING = "{}-smoothing.npy"  # of a record, as a matrix
+LAYERS = "{}-layers.csv"  # of a record: how its tissues gave way
 
 
 def labelled_file(study: Study) -> Path:

@@ -27,12 +27,11 @@ from ...study.meshing import MeshTable
 from ..shared.context import Context
 from ..shared.extrapolation import MESH_ORDERS, error_of_finer
 from ..shared.simulations import SimulationCache
+from .deviations import site_deviation, site_noise
 from .doubted import Doubted
 from .mesh import mesh_settings
-from .record_noise import site_noise
+from .records import SiteRecord, all_compared, as_searched, site_record
 from .remesh import meshed_meanwhile, meshed_models, scaled_edges
-from .site_scatter import site_deviation
-from .traces import SiteRecord, all_compared, as_searched, site_record
 
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
@@ -71,7 +70,8 @@ class Laboratory:
     def __init__(
         self, context: Context, cache: SimulationCache, records: Sequence[Record], title: str = "calibrate"
     ) -> None:
-        self.context, self.cache, self.title = context, cache, title
+        self.context, self.cache = context, cache
+        self.title = title
         self.records = all_compared(context, [site_record(context, record) for record in records])
         self.searched = as_searched(context, self.records)
         self.evaluations = self.corrections = 0
@@ -312,8 +312,9 @@ def linearised(
 ) -> Uncertainty:
     """What fitted records tell about ``parameters`` (p,), whose responses are given."""
     study = context.study
-    pairs = zip(records, at.responses, strict=True)
+    pairs = list(zip(records, at.responses, strict=True))
     noise = [site_noise(study, record, response.force_N) for record, response in pairs]
+    off = [site_deviation(context, record, response, parameters) for record, response in pairs]
     measured = [record.measured for record in records]
     return estimate_uncertainty(
         parameters,
@@ -324,7 +325,7 @@ def linearised(
         groupings(study)[-1],
         settings(study),
         at.mesh_N,
-        site_deviation(context, records, at.responses, parameters),
+        off,
     )
 
 

@@ -18,8 +18,9 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...anatomy.surfaces.thickness import read_thickness
 from ...mesh import Mesh, write_vtu
 from ...study import Study
+from ..shared.artefacts import read_json, write_json
 from ..shared.context import Context
-from ..shared.store import COARSE, read_json, write_json
+from ..shared.store import COARSE
 from .files import THICKNESS
 
 Array = NDArray[np.float64]

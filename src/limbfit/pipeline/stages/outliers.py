@@ -18,7 +18,7 @@ from ...indentation import SimulationJob
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
 from .plausible import stored_flags
-from .traces import SiteRecord, as_response
+from .records import SiteRecord, as_response
 
 Array = NDArray[np.float64]
 

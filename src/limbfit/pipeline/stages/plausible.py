@@ -11,10 +11,10 @@ from ...anatomy.sites.sites import indenter_axis
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import Flag, RecordFacts, implausible
-from ...indentation import read_indenter
-from ...study import IndenterTable, Record, Study
+from ...indentation import contact_radius
+from ...study import Record, Study
+from ..shared.artefacts import read_curves
 from ..shared.context import Context
-from ..shared.tabular import read_curves
 
 Placed = Mapping[str, Mapping[str, Any]]
 
@@ -28,6 +28,12 @@ def stored_flags(context: Context) -> tuple[Flag, ...]:
         name: _step(read_curves(context.store["traces"] / f"{name}-raw.csv")["time_s"]) for name in traces
     }
     return record_flags(study, traces, steps, rows, load_anatomy(context.store["surfaces"]))
+
+
+def tell_flags(context: Context) -> None:
+    """Warn of what is wrong with records before parameters are identified from them."""
+    for flag in stored_flags(context):
+        context.tell("calibrate", 0, 0, f"warning: {flag.text}")
 
 
 def record_flags(
@@ -65,12 +71,6 @@ def record_flags(
 def _flag(site: str, remark: Mapping[str, Any]) -> Flag:
     """What reading a record had to say about it."""
     return Flag((site,), **remark)
-
-
-def contact_radius(indenter: IndenterTable) -> float:
-    """Of a circle with the indenter's section, mm; a sphere touches with less."""
-    tool = read_indenter(indenter, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
-    return float(np.sqrt(tool.body.section / np.pi))
 
 
 def _facts(

@@ -20,13 +20,12 @@ from ...indentation import (
     job_fields,
 )
 from ...study import Study
+from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
-from ..shared.store import write_json
-from ..shared.tabular import write_curves
+from .deviations import site_deviation
 from .outliers import outlier_record
-from .site_scatter import site_deviation
-from .traces import SiteRecord, all_compared, as_response, as_searched, site_record
+from .records import SiteRecord, all_compared, as_response, as_searched, site_record
 
 Array = NDArray[np.float64]
 _MISSING = {
@@ -189,7 +188,7 @@ def _write_curves(context: Context, folder: Path, site: SitePrediction, best: Ar
     if site.one is not None and "one_material" not in missing:
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
-        own = 0.0 if record.site.fitted else site_deviation(context, [record], [ours], best)[0]
+        own = 0.0 if record.site.fitted else site_deviation(context, record, ours, best)
         half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name, unit, own)
         columns[f"{name}_low_{unit}"] = np.maximum(ours.force_N - half, 0.0)
         columns[f"{name}_high_{unit}"] = ours.force_N + half

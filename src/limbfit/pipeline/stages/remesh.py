@@ -11,8 +11,8 @@ from pathlib import Path
 from ...anatomy.meshing.meshing import MeshSettings
 from ...execution import meanwhile
 from ...indentation import SiteModel
+from ..shared.artefacts import file_digest
 from ..shared.context import Context
-from ..shared.store import file_digest
 from .mesh import MeshJob, is_meshed, make_mesh, mesh_job
 
 

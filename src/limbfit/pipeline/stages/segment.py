@@ -11,9 +11,9 @@ from ...anatomy.imaging import LabelMap, write_labels
 from ...anatomy.labels.contours import write_contours
 from ...anatomy.labels.quality import assess
 from ...report.drawing.sheet import draw_sheet
+from ..shared.artefacts import file_digest, write_json
 from ..shared.context import Context
 from ..shared.hand_labels import DIGEST, LABELS
-from ..shared.store import file_digest, write_json
 from .inputs import automatic_labels, study_image, study_labels
 from .marked_images import second_skin, without_own_markers
 

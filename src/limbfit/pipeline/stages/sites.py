@@ -12,8 +12,8 @@ from ...anatomy.sites.sites import indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ...errors import SiteError
 from ...study import Site, Study
+from ..shared.artefacts import write_json
 from ..shared.context import Context
-from ..shared.store import write_json
 from .files import MARKED_SKIN
 
 

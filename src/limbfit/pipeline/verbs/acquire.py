@@ -34,8 +34,8 @@ from ...acquire import (
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError
 from ...study import AcquireTable, Indentation, Record, Site, Study
-from ..shared.store import Store, disk_errors, write_json
-from ..shared.tabular import read_curves, write_curves
+from ..shared.artefacts import read_curves, write_curves, write_json
+from ..shared.store import Store, disk_errors
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"

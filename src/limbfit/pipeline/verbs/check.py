@@ -10,15 +10,15 @@ from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...indentation import read_indenter
 from ...study import ClampsTable, Study
-from ..shared.clamping import pins_met
 from ..shared.context import Listener, Progress, quiet
+from ..shared.simulations import pins_met
 from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
 from ..shared.store import Store
+from ..stages.curves import read_record
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
 from ..stages.surfaces import given_anatomy
-from ..stages.traces import read_record
 from .run import keys
 
 

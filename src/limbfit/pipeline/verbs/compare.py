@@ -27,9 +27,8 @@ from ...febio import (
 )
 from ...indentation import Parameters, first_steps
 from ...study import Study
+from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Listener, quiet
-from ..shared.store import write_json
-from ..shared.tabular import write_curves
 from .simulate import Indentation, feb_settings, prepare_site, run_febio_site, site_problem
 
 Array = NDArray[np.float64]

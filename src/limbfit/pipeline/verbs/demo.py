@@ -11,9 +11,9 @@ from ...execution import make_executor
 from ...phantom.build import make_phantom
 from ...phantom.forces import site_force
 from ...study import load_study
+from ..shared.artefacts import read_json
 from ..shared.context import Listener, Progress, quiet
 from ..shared.kernels import kernels_compiling
-from ..shared.store import read_json
 from .run import run_study
 
 

@@ -13,7 +13,7 @@ from ...indentation import Parameters
 from ...study import Indentation as Planned
 from ...study import Record, Study
 from ..shared.context import Listener, quiet
-from ..stages.traces import site_record
+from ..stages.records import site_record
 from .simulate import Indentation, feb_settings, prepare_site, site_problem
 
 FORMATS = ("feb", "febio-optimize", "inp", "calculix")

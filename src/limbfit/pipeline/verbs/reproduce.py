@@ -13,11 +13,11 @@ import numpy as np
 from ..._version import __version__
 from ...errors import InputError
 from ...study import Study, load_study
+from ..shared.artefacts import read_curves, read_json
 from ..shared.context import Listener, quiet
 from ..shared.hand_labels import hand_labels
 from ..shared.provenance import input_digests, settings_record, versions
-from ..shared.store import Store, read_json
-from ..shared.tabular import read_curves
+from ..shared.store import Store
 from .run import run_study
 
 TOLERANCE = 1e-6  # of a parameter, and of the largest force of a site, relative

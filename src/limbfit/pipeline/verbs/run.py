@@ -15,21 +15,23 @@ from ..experiments.catalogue import (
     experiment_rows,
     options_of,
 )
+from ..shared.artefacts import write_json
 from ..shared.causes import causes, parts_of
 from ..shared.context import Context, Listener, executor_of, quiet
 from ..shared.hand_labels import keep_hand_labels
 from ..shared.kernels import kernels_compiling
 from ..shared.keys import Keys, Stage
 from ..shared.provenance import input_digests, machine, settings_record, versions
-from ..shared.store import Store, lock, write_json
+from ..shared.store import Store, lock
 from ..stages.calibrate import run_calibrate
+from ..stages.curves import run_traces
 from ..stages.mesh import run_mesh
+from ..stages.plausible import tell_flags
 from ..stages.predict import run_predict
 from ..stages.report import run_report
 from ..stages.segment import run_segment
 from ..stages.sites import run_sites
 from ..stages.surfaces import run_surfaces
-from ..stages.traces import run_traces
 from .journal import journal
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
@@ -186,6 +188,8 @@ def run_study(
                 if name == "calibrate":
                     compiled()
                 if name in missing:
+                    if name == "calibrate":
+                        tell_flags(context)
                     _do(context, name, known, chain)
                 else:
                     context.tell(name, 1, 1, "is up to date")

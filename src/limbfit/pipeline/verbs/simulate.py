@@ -14,10 +14,10 @@ from ...indentation import Parameters, SiteModel, build_problem, first_steps, si
 from ...mesh import read_vtu
 from ...study import Indentation as Planned
 from ...study import Study
+from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context, Listener, quiet
 from ..shared.simulations import CURVE_POINTS, model_of
-from ..shared.store import Store, write_json
-from ..shared.tabular import write_curves
+from ..shared.store import Store
 from .run import keys, run_study
 
 IDENTIFIED = "identified"

@@ -1,116 +1,27 @@
-"""Records to regularised curves (the stage ``traces``), and a record with its model for what stands on it."""
+"""Stored records with their sites' models: what is simulated, and what that is compared with."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import TraceError
+from ...fe import texts_of
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.uncertainty.noise import depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
-from ...phases import MotionPhase, in_words
-from ...study import Record, Site, Study
-from ...traces import (
-    Creep,
-    Regularised,
-    Thinning,
-    TouchDown,
-    Trace,
-    read_trace,
-    regularise,
-    regularise_creep,
-    understand,
-)
+from ...study import Record, Site
+from ...traces import Thinning
+from ..shared.artefacts import read_curves
 from ..shared.context import Context
-from ..shared.simulations import CURVE_POINTS, recorded_model
-from ..shared.store import write_json
-from ..shared.tabular import read_curves, write_curves
-from .layers import load_thinnings, read_thinnings, store_thinnings, weight_of
+from ..shared.simulations import recorded_model
+from .files import LAYERS, SMOOTHING
 
 Array = NDArray[np.float64]
-SMOOTHING = "{}-smoothing.npy"  # of a record, as a matrix
-
-
-def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
-    """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
-    table = study.traces
-    file = study.path(record.trace)
-    trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
-    try:
-        known = understand(trace, record.touch_down_s, forced=record.forced)
-        trace, touch = known.trace, known.touch_down
-        made = regularise_creep if record.forced else regularise
-        smooth = made(trace, touch, table.smoothing, record.peak_s)
-    except TraceError as error:
-        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-    facts = {
-        "site": record.site.name,
-        "control": record.control,
-        "touch_down_s": touch.time_s,
-        "touch_down_mm": touch.displacement_mm,
-        "touch_down_uncertainty_mm": touch.uncertainty_mm,
-        "peak_s": touch.time_s + smooth.peak_s,
-        "peak_force_N": smooth.peak_force_N,
-        "depth_mm": smooth.depth_mm,
-        "noise_N": smooth.noise_N,
-        "speed_load_mm_s": smooth.speed_load_mm_s,
-        "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
-        "phases": _phase_rows(trace, smooth, touch),
-        "phases_in_words": in_words(smooth.phases),
-        "knots_s": smooth.knots_s.tolist(),
-        "knots_mm": smooth.knots_mm.tolist(),
-        "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
-        "remarks": [asdict(remark) for remark in known.remarks],
-    }
-    return trace, smooth, facts
-
-
-def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
-    """What the indenter does, in times of the record and in mm from touch-down."""
-    first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
-    phases = [phase.later(touch.time_s) for phase in smooth.phases]
-    if touch.time_s > first_s:
-        phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
-    return [{**asdict(phase), "rate_mm_s": phase.rate_mm_s} for phase in phases]
-
-
-def run_traces(context: Context, folder: Path) -> dict[str, Any]:
-    """Records to regularised curves, counted from touch-down."""
-    recorded = context.study.recorded
-    facts = {}
-    for i, record in enumerate(recorded):
-        context.tell("traces", i, len(recorded), f"site {record.name}")
-        trace, smooth, told = read_record(context.study, record)
-        facts[record.name] = told
-        write_curves(
-            folder / f"{record.name}-raw.csv",
-            time_s=trace.time_s,
-            displacement_mm=trace.displacement_mm,
-            force_N=trace.force_N,
-        )
-        even = smooth.resample(CURVE_POINTS)
-        write_curves(
-            folder / f"{record.name}.csv",
-            time_s=even.time_s,
-            displacement_mm=even.displacement_mm,
-            force_N=even.force_N,
-        )
-        np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
-        if record.ultrasound is not None:
-            seen = read_thinnings(context.study, record, told["touch_down_s"], smooth)
-            told["layers"] = store_thinnings(folder, record, seen)
-            for one in seen:
-                if not one.is_seen:
-                    words = f"ultrasound of {record.name}: {one.tissue} hardly gives way, and is not compared"
-                    context.tell("traces", i, len(recorded), words)
-    write_json(folder / "traces.json", {"sites": facts})
-    return {}
 
 
 @dataclass(frozen=True)
@@ -216,8 +127,8 @@ def as_response(simulation: Simulation) -> SiteResponse:
     """A simulation as it is; derivatives (n, 0) where it has none."""
     jacobian = np.zeros((simulation.force_N.size, 0)) if simulation.jacobian is None else simulation.jacobian
     ended = simulation.completed, simulation.reason
-    doubts: dict[str, str] = {doubt.kind: doubt.text for doubt in simulation.doubts}
-    return SiteResponse.with_doubts(simulation.force_N, jacobian, *ended, simulation.site, doubts)
+    kinds = texts_of(simulation.doubts, "slipped", "folded")
+    return SiteResponse(simulation.force_N, jacobian, *ended, simulation.site, simulation.warnings, *kinds)
 
 
 def site_record(context: Context, record: Record) -> SiteRecord:
@@ -256,3 +167,34 @@ def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[Sit
     if not context.study.is_searched_apart:
         return records
     return [replace(one, model=recorded_model(context, one.record, searched=True)) for one in records]
+
+
+def load_thinnings(folder: Path, record: Record, facts: dict[str, Any]) -> tuple[Thinning, ...]:
+    """The tissues of a record that are compared, as the stage ``traces`` left them."""
+    stated = facts.get("layers", {})
+    tissues = [tissue for tissue, one in stated.items() if one["compared"]]
+    if not tissues:
+        return ()
+    curves = read_curves(folder / LAYERS.format(record.name))
+    return tuple(
+        Thinning(
+            tissue,
+            stated[tissue]["thickness_mm"],
+            curves["time_s"],
+            curves[f"{tissue}_mm"],
+            curves["samples"],
+            stated[tissue]["before"],
+            stated[tissue]["sd_mm"],
+        )
+        for tissue in tissues
+    )
+
+
+def weight_of(seen: Thinning, force_error_percent: float) -> float:
+    """How much its residuals count beside those of a force, 1 at most.
+
+    A force counts as one whose error is ``force_error_percent`` of its largest. Where ultrasound is off by
+    more than that share of the compression, it counts by as much less.
+    """
+    error = float(np.sqrt(np.diag(seen.covariance).mean())) / float(seen.compression_mm.max())
+    return min(1.0, (force_error_percent / 100.0 / error) ** 2)

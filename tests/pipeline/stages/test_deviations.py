@@ -13,7 +13,7 @@ from layered import block_context, block_study
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.stages.site_scatter import (
+from limbfit.pipeline.stages.deviations import (
     GIVEN_MM,
     LEAST_SHARE,
     OF_A_VOXEL,
@@ -22,7 +22,7 @@ from limbfit.pipeline.stages.site_scatter import (
     site_deviation,
     surface_error_mm,
 )
-from limbfit.pipeline.stages.traces import SiteRecord, site_record
+from limbfit.pipeline.stages.records import SiteRecord, site_record
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
 TRUTH["muscle"] = TRUTH["skin"] | {"c_kPa": 4.0}
@@ -80,5 +80,5 @@ def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None
     jacobian = np.zeros((5, len(parameters)))
     jacobian[:, moduli] = np.linspace(0, 1, 5)[:, None]
     jacobian[:, moduli[0] + 1] = 7.0
-    (off,) = site_deviation(found, [record], [SiteResponse(np.ones(5), jacobian)], parameters)
+    off = site_deviation(found, record, SiteResponse(np.ones(5), jacobian), parameters)
     assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * expected_share(found.study, record, GIVEN_MM))

@@ -1,4 +1,4 @@
-"""How far the force of a site as a whole may be off, before its residuals are seen.
+"""How far a record may be off: by its noise, and by its site as a whole, before residuals are seen.
 
 The image places skin and bone to a share of its voxels, and tissue that is thinner by so much is stiffer: by
 what a flat punch on a bonded incompressible layer says (Hayes et al. 1972).  How much more tissue differs
@@ -7,7 +7,7 @@ from site to site the residuals themselves must tell (`limbfit.identify.uncertai
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from ...identify.checks.plausibility import layer_factor
 from ...identify.fit.objective import SiteResponse
-from ...indentation import SiteModel
+from ...identify.uncertainty.noise import SiteNoise, depth_slope, record_noise
+from ...indentation import SiteModel, contact_radius
 from ...mesh import read_vtu
 from ...study import Study
 from ..shared.context import Context
-from .plausible import contact_radius
-from .traces import SiteRecord
+from .curves import read_record
+from .records import SiteRecord
 
 Array = NDArray[np.float64]
 
@@ -34,19 +35,58 @@ LEAST_SHARE = 0.01  # of the force: what is left on the true surfaces of those p
 _STEP = 1.1
 
 
-def site_deviation(
-    context: Context, records: Sequence[SiteRecord], responses: Sequence[SiteResponse], parameters: Array
-) -> tuple[Array, ...]:
-    """One standard deviation (n,) of what each record would be off by, as its site's tissue were stiffer.
+def site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
+    """Noise of a record at the times of comparison, its touch-down included.
+
+    ``force_N`` (n,) is the simulated one: what a wrong touch-down does is told by its slope, which is smooth.
+    Under a stated force it is the depth, mm, and so is the noise; and so it is with what ultrasound saw.
+    """
+    found = _curve_noise(study, record, force_N) if record.seen is None else _layer_noise(record, force_N)
+    return replace(found, site=record.site.name)
+
+
+def _curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
+    """Of a record, by what regularising took away from it."""
+    trace, smooth, facts = read_record(study, record.record)
+    since = trace.time_s - facts["touch_down_s"]
+    inside = (since >= 0) & (since <= smooth.time_s[-1])
+    residual = trace.force_N[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+    if record.record.forced:
+        moved = trace.displacement_mm[inside] - facts["touch_down_mm"]
+        residual = moved - np.interp(since[inside], smooth.time_s, smooth.displacement_mm)
+    return record_noise(
+        record.name,
+        record.times_s,
+        residual,
+        force_N,
+        None if record.record.forced else record.displacement_mm,
+        record.touch_down_sd_mm,
+        record.smoothing,
+    )
+
+
+def _layer_noise(record: SiteRecord, compression_mm: Array) -> SiteNoise:
+    """Of a tissue's compression: by the readings, the thickness at rest, the touch-down.
+
+    ``compression_mm`` (n,) is the simulated one, along whose slope a wrong touch-down moves it, but under a
+    stated force.
+    """
+    assert record.seen is not None
+    seen, covariance, doubt = record.seen, record.seen.covariance, record.touch_down_sd_mm
+    if not record.record.forced:
+        moved = np.interp(seen.time_s, record.times_s, record.displacement_mm)
+        slope = doubt * depth_slope(seen.time_s, moved, compression_mm)
+        covariance = covariance + np.outer(slope, slope)
+    return SiteNoise(record.name, seen.time_s, covariance, seen.sd_mm, 0.0, doubt, "mm")
+
+
+def site_deviation(context: Context, record: SiteRecord, response: SiteResponse, parameters: Array) -> Array:
+    """One standard deviation (n,) of what a record would be off by, as its site's tissue were stiffer.
 
     In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,).
     """
-    surface_mm = surface_error_mm(context)
-    moduli = parameters * _is_modulus(context.study)
-    return tuple(
-        response.jacobian @ moduli * expected_share(context.study, record, surface_mm)
-        for record, response in zip(records, responses, strict=True)
-    )
+    share = expected_share(context.study, record, surface_error_mm(context))
+    return np.asarray(response.jacobian @ (parameters * _is_modulus(context.study)) * share)
 
 
 def expected_share(study: Study, record: SiteRecord, surface_mm: float) -> float:

@@ -1,0 +1,96 @@
+"""How results are written: JSON, tables and curves as CSV, never half done; and digests of inputs."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+DRAFT = ".part"
+
+
+def digest(*parts: Any) -> str:
+    """A short stable digest of JSON-like values."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of all files below a folder."""
+    sha = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            sha.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                sha.update(block)
+    return sha.hexdigest()
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, never half of it."""
+    text = json.dumps(content, indent=1, allow_nan=False, default=plain)
+    with atomic(path) as stream:
+        stream.write(text.encode())
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def plain(value: Any) -> Any:
+    """NumPy scalars and arrays as what JSON knows."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[BinaryIO]:
+    """A binary stream whose content appears at ``path`` only when the block ends well."""
+    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{DRAFT}")
+    try:
+        with draft.open("xb") as stream:
+            yield stream
+        os.replace(draft, path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+
+
+def write_table(file: Path, heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A CSV file with a line of heads; numbers to nine digits, nothing where a value is None."""
+    with file.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(heads)
+        writer.writerows([_cell(value) for value in row] for row in rows)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def write_curves(file: Path, **columns: NDArray[np.float64]) -> None:
+    """A CSV with named columns of numbers."""
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
+
+
+def read_curves(file: Path) -> dict[str, NDArray[np.float64]]:
+    """The columns of a CSV that ``write_curves`` made."""
+    names = file.read_text(encoding="utf-8").split("\n", 1)[0].split(",")
+    return dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1, unpack=True), strict=True))

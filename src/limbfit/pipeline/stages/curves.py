@@ -1,0 +1,158 @@
+"""Records to regularised curves, and what ultrasound saw beside them: the stage ``traces``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import TraceError
+from ...phases import MotionPhase, in_words
+from ...study import Record, Study
+from ...traces import (
+    Creep,
+    Regularised,
+    Thinning,
+    TouchDown,
+    Trace,
+    read_layers,
+    read_trace,
+    regularise,
+    regularise_creep,
+    thinnings,
+    understand,
+)
+from ..shared.artefacts import write_curves, write_json
+from ..shared.context import Context
+from ..shared.simulations import CURVE_POINTS
+from .files import LAYERS, SMOOTHING
+
+END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does not hold the layers
+
+
+def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
+    """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
+    table = study.traces
+    file = study.path(record.trace)
+    trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
+    try:
+        known = understand(trace, record.touch_down_s, forced=record.forced)
+        trace, touch = known.trace, known.touch_down
+        made = regularise_creep if record.forced else regularise
+        smooth = made(trace, touch, table.smoothing, record.peak_s)
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+    facts = {
+        "site": record.site.name,
+        "control": record.control,
+        "touch_down_s": touch.time_s,
+        "touch_down_mm": touch.displacement_mm,
+        "touch_down_uncertainty_mm": touch.uncertainty_mm,
+        "peak_s": touch.time_s + smooth.peak_s,
+        "peak_force_N": smooth.peak_force_N,
+        "depth_mm": smooth.depth_mm,
+        "noise_N": smooth.noise_N,
+        "speed_load_mm_s": smooth.speed_load_mm_s,
+        "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
+        "phases": _phase_rows(trace, smooth, touch),
+        "phases_in_words": in_words(smooth.phases),
+        "knots_s": smooth.knots_s.tolist(),
+        "knots_mm": smooth.knots_mm.tolist(),
+        "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
+        "remarks": [asdict(remark) for remark in known.remarks],
+    }
+    return trace, smooth, facts
+
+
+def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
+    """What the indenter does, in times of the record and in mm from touch-down."""
+    first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
+    phases = [phase.later(touch.time_s) for phase in smooth.phases]
+    if touch.time_s > first_s:
+        phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
+    return [{**asdict(phase), "rate_mm_s": phase.rate_mm_s} for phase in phases]
+
+
+def run_traces(context: Context, folder: Path) -> dict[str, Any]:
+    """Records to regularised curves, counted from touch-down."""
+    recorded = context.study.recorded
+    facts = {}
+    for i, record in enumerate(recorded):
+        context.tell("traces", i, len(recorded), f"site {record.name}")
+        trace, smooth, told = read_record(context.study, record)
+        facts[record.name] = told
+        write_curves(
+            folder / f"{record.name}-raw.csv",
+            time_s=trace.time_s,
+            displacement_mm=trace.displacement_mm,
+            force_N=trace.force_N,
+        )
+        even = smooth.resample(CURVE_POINTS)
+        write_curves(
+            folder / f"{record.name}.csv",
+            time_s=even.time_s,
+            displacement_mm=even.displacement_mm,
+            force_N=even.force_N,
+        )
+        np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
+        if record.ultrasound is not None:
+            seen = read_thinnings(context.study, record, told["touch_down_s"], smooth)
+            told["layers"] = store_thinnings(folder, record, seen)
+            for one in seen:
+                if not one.is_seen:
+                    words = f"ultrasound of {record.name}: {one.tissue} hardly gives way, and is not compared"
+                    context.tell("traces", i, len(recorded), words)
+    write_json(folder / "traces.json", {"sites": facts})
+    return {}
+
+
+def read_thinnings(
+    study: Study, record: Record, touch_down_s: float, smooth: Regularised
+) -> tuple[Thinning, ...]:
+    """How each tissue gives way while the record's force is 5 % of its largest or more.
+
+    Raises
+    ------
+    TraceError
+        For a file that cannot be that, with the file, the place and the remedy.
+    """
+    assert record.ultrasound is not None
+    file = study.path(record.ultrasound)
+    pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
+    end_s = touch_down_s + float(pressed[-1])
+    try:
+        found = thinnings(
+            read_layers(file, study.traces.time_s), touch_down_s, end_s, record.ultrasound_sd_mm
+        )
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+    for one in found:
+        if one.tissue not in study.tissues:
+            known = ", ".join(f"{tissue}_mm" for tissue in study.tissues)
+            raise TraceError(
+                f"the model has no tissue {one.tissue!r}",
+                file=file,
+                place="header",
+                remedy=f"name columns among {known}",
+            )
+    return found
+
+
+def store_thinnings(folder: Path, record: Record, found: Sequence[Thinning]) -> dict[str, Any]:
+    """Write the curves of a record's tissues; what ``traces.json`` says of them."""
+    columns = {f"{one.tissue}_mm": one.compression_mm for one in found}
+    file = folder / LAYERS.format(record.name)
+    write_curves(file, time_s=found[0].time_s, samples=found[0].samples, **columns)
+    return {
+        one.tissue: {
+            "thickness_mm": one.thickness_mm,
+            "compression_mm": float(one.compression_mm.max()),
+            "before": one.before,
+            "sd_mm": one.sd_mm,
+            "compared": one.is_seen,
+        }
+        for one in found
+    }
