@@ -136,7 +136,7 @@ def told_of(
 
 def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> Wanted:
     """All eight parameters, given the study's bounds."""
-    return Wanted(prior_information(unknowns(plan_study(folder, limb, edge_mm))), tuple(range(8)))
+    return Wanted(prior_information(unknowns(plan_study(folder, limb, edge_mm))), np.eye(8))
 
 
 def best_at_truth(

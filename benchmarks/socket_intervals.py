@@ -2,14 +2,16 @@
 
     python benchmarks/socket_intervals.py STUDY --draws 12 --json intervals.json
     python benchmarks/socket_intervals.py STUDY --identified OTHER --json intervals.json
+    python benchmarks/socket_intervals.py STUDY --identified OTHER --draws 0 --truth 0 --json paper.json
 
 STUDY has identified parameters, or takes those of OTHER with their covariance.  Its socket is put on and
 loaded once with derivatives, and then with parameters drawn from the lognormal distribution of that
 covariance (by the seed and the number of the draw alone).  Told for the mean pressure of every region and
 the settling: the standard deviation by derivatives and of the draws, how far the draws are from what the
 derivatives foresee (rms), and how many lie within the 95 % interval, simulated and foreseen.  Also the change
-for a coefficient of friction 10 % larger, which counts as known.  Draws in the file of ``--json`` are not run
-again.
+for a coefficient of friction 10 % larger, which counts as known; left out without draws.  ``--truth``: also
+what the tissues of the synthetic patient of that seed do, and whether it lies within the intervals.  Draws
+in the file of ``--json`` are not run again.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
+from limbfit.phantom.build import true_parameters
 from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, quiet
@@ -97,6 +100,7 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
         sample, sd = np.array([draw["values"][name] for draw in draws.values()]), centre["sd"][name]
         linear = np.array([bench.foreseen(centre, name, step) for step in steps])
         first, percent = next(iter(centre["from"][name].items()))
+        true = rows["truth"]["values"][name] if "truth" in rows else None
         found.append(
             {
                 "of": name,
@@ -110,6 +114,7 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
                 "mostly_from": f"{first} {percent:.0f} %",
                 "liner_c": centre["change"][name].get("liner.c_kPa"),
                 "friction": rows["friction"]["values"][name] - value if "friction" in rows else None,
+                **({"truth": true, "inside": abs(true - value) <= NORMAL_95 * sd} if true else {}),
             }
         )
     return found
@@ -121,6 +126,7 @@ def main() -> None:
     parser.add_argument("--identified", type=Path, help="the study whose parameters and covariance are taken")
     parser.add_argument("--draws", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--truth", type=int, help="seed of the synthetic patient whose tissues are true")
     parser.add_argument("--folder", type=Path, default=Path("runs/socket-intervals"), help="of the mesh")
     parser.add_argument("--json", type=Path, required=True)
     asked = parser.parse_args()
@@ -129,11 +135,14 @@ def main() -> None:
     identified = study if asked.identified is None else limbfit.load_study(asked.identified)
     bench = Bench(study, identified, asked.folder)
     rows: dict[str, Any] = json.loads(asked.json.read_text())["rows"] if asked.json.exists() else {}
-    wanted = ["centre", *(["friction"] if isinstance(study.socket.friction, float) else [])]
+    wanted = ["centre"] if asked.truth is None else ["centre", "truth"]
+    wanted += ["friction"] if asked.draws and isinstance(study.socket.friction, float) else []
     for name in (*wanted, *map(str, range(asked.draws))):
         if name not in rows:
             if name.isdigit():
                 rows[name] = bench.run(bench.centre * np.exp(bench.drawn(asked.seed, int(name))))
+            elif name == "truth":
+                rows[name] = bench.run(to_vector(true_parameters(asked.truth), study.tissues))
             else:
                 rows[name] = bench.run(
                     bench.centre, known=name == "centre", friction=FRICTION if name == "friction" else 1.0

@@ -29,7 +29,7 @@ def options(number: int, draws: int = 2, seed: int = 0) -> list[Option]:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plan_is_nearly_that_of_brute_force_and_keeps_its_time(criterion, seed):
     some, budget = options(9, seed=seed), Budget(260.0, 40.0)
-    wanted = Wanted(PRIOR, (0, 1, 2), criterion)
+    wanted = Wanted(PRIOR, np.eye(P), criterion)
 
     def cost(chosen):
         return wanted.cost(wanted.covariances(some, chosen, 2))
@@ -53,8 +53,20 @@ def test_what_is_wanted_decides():
     """One record tells of the first parameter, one of the second; time is for one."""
     tells = [Option(("a", "tip"), 50.0, 100.0 * np.diag(np.eye(P)[k])[None]) for k in (0, 1)]
     budget = Budget(60.0, 0.0)
-    assert plan(tells, budget, Wanted(PRIOR, (0,))) == (0,)
-    assert plan(tells, budget, Wanted(PRIOR, (1,))) == (1,)
+    assert plan(tells, budget, Wanted(PRIOR, np.eye(P)[[0]])) == (0,)
+    assert plan(tells, budget, Wanted(PRIOR, np.eye(P)[[1]])) == (1,)
+
+
+def test_what_follows_from_parameters_decides():
+    """A pressure that only the second parameter moves, and one that the two move against each other."""
+    tells = [Option(("a", "tip"), 50.0, 100.0 * np.outer(row, row)[None]) for row in (*np.eye(P), [1, -1, 0])]
+    budget = Budget(60.0, 0.0)
+    assert plan(tells, budget, Wanted(PRIOR, np.array([[0.0, 0.2, 0.0]]), "A")) == (1,)
+    assert plan(tells, budget, Wanted(PRIOR, np.array([[0.3, -0.3, 0.0]]), "A")) == (3,)
+    both = Wanted(PRIOR, np.array([[0.3, -0.3, 0.0], [0.0, 0.0, 0.1]]), "A")
+    (covariance,) = both.of_wanted(both.covariances(tells, [3], 1))
+    exact = np.linalg.inv(PRIOR + 100.0 * np.outer([1, -1, 0], [1, -1, 0]))
+    assert covariance == pytest.approx(both.rows @ exact @ both.rows.T)
 
 
 def test_a_record_must_tell_at_every_tissue():
@@ -62,8 +74,8 @@ def test_a_record_must_tell_at_every_tissue():
     uneven = np.stack([1e4 * np.eye(P), np.zeros((P, P))])
     even = np.stack([1e3 * np.eye(P)] * 2)
     both = [Option(("a", "tip"), 50.0, uneven), Option(("a", "tip"), 50.0, even)]
-    assert plan(both, Budget(60.0, 0.0), Wanted(PRIOR, (0, 1, 2))) == (1,)
-    assert plan(both, Budget(60.0, 0.0), Wanted(PRIOR, (0, 1, 2), "A")) == (1,)
+    assert plan(both, Budget(60.0, 0.0), Wanted(PRIOR, np.eye(P))) == (1,)
+    assert plan(both, Budget(60.0, 0.0), Wanted(PRIOR, np.eye(P), "A")) == (1,)
 
 
 def test_the_expected_factor_is_of_the_covariance():
@@ -74,4 +86,4 @@ def test_the_expected_factor_is_of_the_covariance():
 
 def test_too_little_time_is_told():
     with pytest.raises(CalibrationError, match="no record fits"):
-        plan(options(4), Budget(10.0, 40.0), Wanted(PRIOR, (0,)))
+        plan(options(4), Budget(10.0, 40.0), Wanted(PRIOR, np.eye(P)[[0]]))

@@ -72,9 +72,14 @@ def design(
     ] = None,
     holds: Annotated[str, typer.Option(help="with --protocol: holds in s, 0 for none")] = "0,30",
     determine: Annotated[
-        str | None, typer.Option(help="with --protocol: parameters such as muscle.c_kPa; default: all")
+        str | None,
+        typer.Option(
+            help="with --protocol: parameters such as muscle.c_kPa, or socket (pressures); default: all"
+        ),
     ] = None,
-    criterion: Annotated[Literal["D", "A"], typer.Option(help="with --protocol: D or A")] = "D",
+    criterion: Annotated[
+        Literal["D", "A"] | None, typer.Option(help="with --protocol: D or A; default: D, for a socket A")
+    ] = None,
     draws: Annotated[int, typer.Option(help="with --protocol: how many tissues", min=1, max=64)] = 3,
     ultrasound: Annotated[
         float | None,
@@ -154,8 +159,9 @@ def show_protocol(found: dict[str, Any]) -> None:
 def _show_expected(found: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     """The factors of the 95 % intervals that each choice promises, and the verdict."""
     widths = Table("parameter", *(row["design"] for row in rows), box=None)
-    for name in rows[0]["factor_95"]:
-        widths.add_row(name, *(f"x/ {min(row['factor_95'][name], 999):.3g}" for row in rows))
+    for kind in ("factor_95", "pressures_95"):
+        for name in rows[0].get(kind, {}):
+            widths.add_row(name, *(f"x/ {min(row[kind][name], 999):.3g}" for row in rows))
     STDOUT.print(widths)
     STDOUT.print(found["verdict"], soft_wrap=True)
     for text in found["left_out"]:

@@ -11,7 +11,8 @@ import pytest
 import limbfit
 from conftest import COARSE
 from limbfit.errors import InputError
-from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, UNSEEN, drawn
+from limbfit.identify.checks.protocol import drawn
+from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, UNSEEN
 from limbfit.pipeline.stages.laboratory import unknowns
 
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
@@ -99,6 +100,8 @@ def test_what_cannot_be_planned_is_one_line(found) -> None:
         limbfit.plan_protocol(study, minutes=1, **same)
     with pytest.raises(InputError, match=r"no parameter is named 'bone\.c_kPa'"):
         limbfit.plan_protocol(study, determine=("bone.c_kPa",), **same)
+    with pytest.raises(InputError, match=r"no current socket.*run limbfit socket"):
+        limbfit.plan_protocol(study, determine=("socket",), **same)
 
 
 def test_it_is_in_the_report(found) -> None:

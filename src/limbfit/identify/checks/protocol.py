@@ -2,8 +2,9 @@
 
 Each record that could be made has a Fisher information on the logarithms of the parameters, at several draws
 of them, since what a record tells depends on the tissue. A protocol is judged by the covariance of the
-parameters that are wanted, the others being unknown too: by the mean over the draws of the logarithm of its
-determinant (D) or of its trace (A) (Chaloner and Verdinelli, Statistical Science 1995, 10:273).
+parameters that are wanted, or of what follows from them, the others being unknown too: by the mean over the
+draws of the logarithm of its determinant (D) or of its trace (A) (Chaloner and Verdinelli, Statistical
+Science 1995, 10:273).
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm, qmc
 
 from ...errors import CalibrationError
+from ..fit.parameters import Unknowns
 from ..uncertainty.uncertainty import NORMAL_95
 from .design import Criterion
 
@@ -45,10 +48,13 @@ class Budget:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is to be determined: ``which`` (k,) of the parameters, given the ``prior`` (p, p) information."""
+    """What is to be determined: ``rows`` (k, p) times log(parameters); ``prior`` (p, p) information is given.
+
+    Rows of the unit matrix are parameters; others are what follows from them, such as a pressure's logarithm.
+    """
 
     prior: Array
-    which: tuple[int, ...]
+    rows: Array
     criterion: Criterion = "D"
 
     def covariances(self, options: Sequence[Option], chosen: Sequence[int], draws: int) -> Array:
@@ -58,12 +64,30 @@ class Wanted:
             total = total + options[i].information
         return np.asarray(np.linalg.inv(total))
 
+    def of_wanted(self, covariances: Array) -> Array:
+        """The covariance (d, k, k) of what is wanted, from that of log(parameters) (d, p, p)."""
+        return np.asarray(self.rows @ covariances @ self.rows.T)
+
     def cost(self, covariances: Array) -> float:
         """What the best protocol has least of."""
-        part = covariances[:, self.which][:, :, self.which]
+        part = self.of_wanted(covariances)
         if self.criterion == "A":
             return float(np.trace(part, axis1=1, axis2=2).mean())
         return float(np.linalg.slogdet(part)[1].mean())
+
+
+def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
+    """Tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
+
+    A parameter with a prior scatters by its factor, another by half of what its bounds leave. A Latin
+    hypercube spreads few draws well.
+    """
+    spread = 0.5 * np.log(known.upper / known.lower) / np.sqrt(12.0)
+    for prior in known.priors:
+        spread[known.names.index(prior.name)] = np.log(prior.factor)
+    others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
+    scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
+    return np.vstack([centre, np.exp(np.clip(scattered, np.log(known.lower), np.log(known.upper)))])
 
 
 def factors_95(covariances: Array) -> Array:

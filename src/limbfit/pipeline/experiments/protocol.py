@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import tomlkit
 from numpy.typing import NDArray
-from scipy.stats import norm, qmc
 
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError
 from ...identify.checks.design import NoiseModel, information_of
 from ...identify.checks.design import prior_information as bounds_information
-from ...identify.checks.protocol import Budget, Option, Wanted, factors_95, plan, seconds_of
+from ...identify.checks.protocol import Budget, Option, Wanted, drawn, factors_95, plan, seconds_of
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...indentation import Parameters, Simulation, SiteModel, layers_under
@@ -78,14 +77,17 @@ def run_protocol(
     parameters_from: str,
     noise: dict[str, float],
     ultrasound_sd_mm: float | None,
+    pressures: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
     """Simulate every possible record at every draw, with derivatives, and choose within the time.
 
     ``ultrasound_sd_mm``: how well ultrasound through the indenter reads a thickness; None: there is none.
+    ``pressures``: derivatives (p,) of their logarithms by those of the parameters; none: parameters count.
     """
     study = context.study
     known = unknowns(study)
-    which = _wanted(known, determine)
+    which = _named(known, determine)
+    rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
     tissues = drawn(known, study.vector(parameters), draws, seed)
     planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, ultrasound_sd_mm is not None)
     noises = Noises(NoiseModel(**noise), _of_ultrasound(noise, ultrasound_sd_mm))
@@ -93,10 +95,10 @@ def run_protocol(
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     budget = Budget(60.0 * minutes, setup_s)
-    wanted = Wanted(bounds_information(known), which, "A" if criterion == "A" else "D")
+    wanted = Wanted(bounds_information(known), rows, "A" if criterion == "A" else "D")
     plans, told_by = _plans_told(found, options, None if ultrasound_sd_mm is None else blind, budget, wanted)
-    rows = [
-        _row(name, chosen, told_by[name], budget, wanted, known.names, len(tissues))
+    told = [
+        _row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
         for name, chosen in plans.items()
     ]
     content = {
@@ -107,8 +109,9 @@ def run_protocol(
         "determine": [known.names[i] for i in which],
         "draws": tissues.tolist(),
         "records": [_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
-        "protocols": rows,
-        "verdict": _verdict(rows[0], [known.names[i] for i in which]),
+        "pressures": list(pressures),
+        "protocols": told,
+        "verdict": _verdict(told[0], [known.names[i] for i in which]),
         "candidates": [_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
         "left_out": left_out,
         "parameters": parameters,
@@ -122,7 +125,7 @@ def run_protocol(
     return {}
 
 
-def _wanted(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
+def _named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
     """Numbers of the parameters to be determined: all where none is named."""
     strange = [name for name in determine if name not in known.names]
     if strange:
@@ -156,20 +159,6 @@ def _plans_told(
         plans[UNSEEN] = _plans(found, blind, budget, wanted)[DESIGNED]
         told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
     return plans, told_by
-
-
-def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
-    """Tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
-
-    A parameter with a prior scatters by its factor, another by half of what its bounds leave. A Latin
-    hypercube spreads few draws well.
-    """
-    spread = 0.5 * np.log(known.upper / known.lower) / np.sqrt(12.0)
-    for prior in known.priors:
-        spread[known.names.index(prior.name)] = np.log(prior.factor)
-    others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
-    scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
-    return np.vstack([centre, np.exp(np.clip(scattered, np.log(known.lower), np.log(known.upper)))])
 
 
 @dataclass(frozen=True)
@@ -318,20 +307,27 @@ def _row(
     options: Sequence[Option],
     budget: Budget,
     wanted: Wanted,
-    names: Sequence[str],
+    parameters: tuple[Sequence[str], Sequence[int]],
+    pressures: Iterable[str],
     draws: int,
 ) -> dict[str, Any]:
-    """A protocol, and what to expect of it: the middle of the draws and the worst."""
+    """A protocol, and what to expect of it: the middle of the draws and the worst.
+
+    ``parameters``: all of their names, and which are to be determined.
+    """
+    names, which = parameters
     covariances = wanted.covariances(options, chosen, draws)
     factors = factors_95(covariances)
     middle, worst = np.median(factors, axis=0), factors.max(axis=0)
+    of_pressures = np.median(factors_95(wanted.of_wanted(covariances)), axis=0)
     return {
         "design": name,
         "records": len(chosen),
         "minutes": seconds_of(options, chosen, budget) / 60.0,
         "factor_95": dict(zip(names, middle.tolist(), strict=True)),
         "worst_95": dict(zip(names, worst.tolist(), strict=True)),
-        "determined": int(np.sum(middle[list(wanted.which)] <= DETERMINED)),
+        "pressures_95": dict(zip(pressures, of_pressures.tolist())),
+        "determined": int(np.sum(middle[list(which)] <= DETERMINED)),
         "cost": wanted.cost(covariances),
     }
 
@@ -350,6 +346,13 @@ def _record(one: Planned, option: Option, peak: float) -> dict[str, Any]:
 
 def _verdict(best: Mapping[str, Any], wanted: Sequence[str]) -> str:
     """In words: how much of what is wanted the protocol determines."""
+    if best["pressures_95"]:
+        worst = max(best["pressures_95"], key=best["pressures_95"].__getitem__)
+        return (
+            f"{best['records']} records in {best['minutes']:.0f} min tell the mean pressures of the socket's "
+            f"regions within {100 * (best['pressures_95'][worst] - 1):.1f} % (95 %) as far as tissue decides "
+            f"them, the worst at {worst}; {best['determined']} of {len(wanted)} parameters within 25 %"
+        )
     open_ones = [name for name in wanted if best["factor_95"][name] > DETERMINED]
     head = (
         f"{best['records']} records in {best['minutes']:.0f} min determine {best['determined']} of "

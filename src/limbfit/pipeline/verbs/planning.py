@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import InputError
 from ...identify.checks.design import Criterion
 from ...indentation import Parameters
 from ...study import Study
+from ..experiments.socket import NAME as SOCKET
+from ..experiments.socket_intervals import CHANGE_PERCENT
 from ..shared.context import Listener, quiet
 from ..shared.store import Store
-from .run import run_experiment
+from .run import run_experiment, study_status
 from .simulate import IDENTIFIED, known_parameters
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
@@ -69,7 +72,7 @@ def plan_protocol(
     holds_s: Sequence[float] = (0.0, 30.0),
     depth_mm: float | None = None,
     determine: Sequence[str] = (),
-    criterion: Criterion = "D",
+    criterion: Criterion | None = None,
     draws: int = 3,
     seed: int = 0,
     ultrasound_sd_mm: float | None = None,
@@ -85,8 +88,10 @@ def plan_protocol(
     speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, within its limit.
     holds_s : at the deepest point, to choose from; 0: none.
     depth_mm : of all records; by default as deep as each site was recorded or is planned.
-    determine : parameters such as ``muscle.c_kPa``; by default all.
-    criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances.
+    determine : parameters such as ``muscle.c_kPa``; by default all. ``socket``: the mean pressures of the
+        regions under every load of ``results/socket``, which needs identified parameters.
+    criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances; by
+        default D, and A for pressures.
     draws : tissues that the protocol is judged at, the first those of ``parameters``.
     ultrasound_sd_mm : how well ultrasound through the indenter reads the thickness of a tissue; None: there
         is none.
@@ -100,8 +105,17 @@ def plan_protocol(
     Raises
     ------
     InputError
-        For unknown parameters, a time too short for any record, or identified parameters that are stale.
+        For unknown parameters, a time too short for any record, identified parameters that are stale, or
+        pressures that are not stored with their derivatives.
     """
+    pressures = _socket_pressures(study) if SOCKET in determine else {}
+    if pressures and (len(determine) > 1 or criterion == "D"):
+        what = "with other parameters" if len(determine) > 1 else 'by the criterion "D"'
+        raise InputError(
+            f"pressures of a socket are not determined {what}: they are more than the parameters",
+            place="--determine",
+            remedy="state socket alone, and A or no criterion",
+        )
     used, origin = (parameters, "given") if parameters else known_parameters(study, Store(study.results))
     slow = study.acquire.ramp_speed_mm_s
     return run_experiment(
@@ -115,8 +129,9 @@ def plan_protocol(
         or [slow, min(_FASTER * slow, study.acquire.speed_limit_mm_s)],
         holds_s=[float(hold) for hold in holds_s],
         depth_mm=depth_mm,
-        determine=list(determine),
-        criterion=criterion,
+        determine=[] if pressures else list(determine),
+        criterion=criterion or ("A" if pressures else "D"),
+        pressures=pressures,
         draws=draws,
         seed=seed,
         parameters=used,
@@ -124,6 +139,31 @@ def plan_protocol(
         noise=_noise_of(study, origin),
         ultrasound_sd_mm=ultrasound_sd_mm,
     )
+
+
+def _socket_pressures(study: Study) -> dict[str, list[float]]:
+    """Derivatives (p,) of the logarithm of every mean pressure by those of the parameters.
+
+    Raises
+    ------
+    InputError
+        Where the study has no current socket, or one without derivatives.
+    """
+    store, remedy = Store(study.results), "run limbfit socket on it, with identified parameters, first"
+    place = "--determine socket"
+    if "done" not in [row["state"] for row in study_status(study) if row["stage"] == SOCKET]:
+        raise InputError("the study has no current socket", file=study.file, place=place, remedy=remedy)
+    found = {}
+    for load in store.read(SOCKET, "socket.json")["loads"]:
+        for region in load["regions"]:
+            if region["change_kPa"] is None:
+                what = "its socket's pressures have no derivatives"
+                raise InputError(what, file=study.file, place=place, remedy=remedy)
+            by = [region["change_kPa"].get(f"{tissue}.{name}", 0.0) for tissue, name in study.parameters]
+            slopes = np.array(by) / np.log1p(CHANGE_PERCENT / 100.0)
+            if region["mean_kPa"] > 0:
+                found[f"{load['name']}, {region['region']}"] = (slopes / region["mean_kPa"]).tolist()
+    return found
 
 
 def _noise_of(study: Study, origin: str) -> dict[str, float]:

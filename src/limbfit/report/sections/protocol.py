@@ -12,10 +12,13 @@ def protocol_section(store: Results, content: Json) -> Section:
     """What the experiment ``protocol`` found."""
     draws = len(content["draws"])
     meaning = {"D": "the smallest joint region of confidence", "A": "the smallest sum of variances"}
+    wanted = ", ".join(map(label, content["determine"]))
+    if content.get("pressures"):
+        wanted = "the logarithms of the mean pressures of the socket's regions"
     words = Prose(
         f"The records that fit into {fixed(content['minutes'], 0)} min and have, on average over {draws} "
         f"tissues that the limb may have, {meaning[content['criterion']]} for "
-        f"{', '.join(map(label, content['determine']))}. The first of the tissues is the "
+        f"{wanted}. The first of the tissues is the "
         f"{content['parameters_from']}. Every site with another indenter takes {content['setup_s']:g} s to "
         f"prepare, every record {content['rest_s']:g} s of rest. In short: {content['verdict']}."
     )
@@ -25,6 +28,8 @@ def protocol_section(store: Results, content: Json) -> Section:
         words = Prose(f"{words.text} {seen}, but for the plain ramps and the protocol without it.")
     figure = expected_figure("protocols", content["protocols"], "the records of a protocol")
     blocks: list[Block] = [words, _records(content), _protocols(content), figure]
+    if content.get("pressures"):
+        blocks.append(_pressures(content))
     if content["left_out"]:
         blocks.append(Bullets(tuple(f"{text}." for text in content["left_out"])))
     return Section("protocol", "Which records to make", tuple(blocks))
@@ -62,3 +67,21 @@ def _protocols(content: Json) -> Table:
         "do without one ingredient, in the same time."
     )
     return Table("protocols", caption, head, rows)
+
+
+def _pressures(content: Json) -> Table:
+    rows = tuple(
+        Row(
+            (
+                heading(name),
+                *(numeric(fixed(100.0 * (row["pressures_95"][name] - 1.0))) for row in content["protocols"]),
+            )
+        )
+        for name in content["pressures"]
+    )
+    head = ("Load, region", *(f"{row['design']} (± %)" for row in content["protocols"]))
+    caption = (
+        "The 95 % interval to be expected of each mean pressure, by the tissue alone: to first order, with "
+        "the derivatives that the socket's simulation stored."
+    )
+    return Table("protocol-pressures", caption, head, rows)
