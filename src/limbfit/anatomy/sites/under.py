@@ -30,7 +30,8 @@ def tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike, width: 
     least = DEEPEST_MM
     for bone in anatomy.bones.values():
         hits = _first_hits(starts, direction, bone.points[bone.faces])
-        depth = (hits - skin)[np.isfinite(hits) & np.isfinite(skin) & (hits > skin)]
+        through = np.isfinite(hits) & np.isfinite(skin) & (hits > skin)
+        depth = hits[through] - skin[through]
         least = min(least, float(depth.min(initial=least)))
     return least
 
