@@ -12,7 +12,8 @@ of the posterior on the whole emulator, as ``limbfit uncertainty`` samples it (`
 touch-down is found in a noisy record with an approach: what it is off by moves the curve, and what is stated
 of it is what the uncertainty knows. The noise that is left after regularising is correlated from point to
 point. With ``--misfit`` the model is wrong as well: a smooth error of so many percent of the largest force,
-of another shape than the one that the method assumes.
+of another shape than the one that the method assumes.  The tissue of each site is stiffer or softer than
+the truth by as much as is expected of it (``--differ 1``; 0: alike).
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from scipy.linalg import block_diag
 from limbfit import load_study
 from limbfit.execution import SerialExecutor
 from limbfit.identify import Emulator, Measured, SiteNoise, SiteResponse, Unknowns, record_noise
-from limbfit.identify.uncertainty.coverage import Coverage, coverage_study
+from limbfit.identify.uncertainty.coverage import Coverage, Deviation, coverage_study
 from limbfit.identify.uncertainty.noise import depth_slope
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.deviations import site_deviation
 from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.pipeline.stages.records import SiteRecord, site_record
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
@@ -55,7 +57,8 @@ class Robot:
 
     ``noise_N`` at 500 Hz with ``autocorrelation`` of neighbours; ``smoothing`` (sites,) is the penalty on
     roughness and ``responses``, (n, n) per site, what such smoothing makes of a force; ``misfit`` is the
-    error of the model over the largest force.
+    error of the model over the largest force, ``stiffer`` (n,) per site the standard deviation of its force
+    as the site's tissue differs.
     """
 
     records: tuple[SiteRecord, ...]
@@ -65,15 +68,17 @@ class Robot:
     noise_N: float
     autocorrelation: float
     misfit: float
+    stiffer: tuple[Array, ...]
     seed: int
 
     def __call__(self, repeat: int, smoothed: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
         random = np.random.default_rng([self.seed, repeat])
         measured, noise = [], []
         how = zip(self.smoothing, self.responses, strict=True)
-        sites = zip(self.records, self.forces, smoothed, how, strict=True)
-        for record, force, answer, (smoothing, response) in sites:
-            true = force + self._wrong(random, record.times_s, force)
+        sites = zip(self.records, self.forces, self.stiffer, smoothed, how, strict=True)
+        for record, force, stiffer, answer, (smoothing, response) in sites:
+            true = force + random.standard_normal() * stiffer
+            true = true + self._wrong(random, record.times_s, force)
             off, sd = self._touch_down(random, record, true)
             true = true + off * depth_slope(record.times_s, record.displacement_mm, force)
             smooth, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
@@ -153,9 +158,10 @@ class Smoothed:
 
 
 def study_robot(
-    study_file: Path, noise_N: float, autocorrelation: float, misfit: float, seed: int
-) -> tuple[Robot, Array, Smoothed, Unknowns]:
-    """The robot of a study, the truth (p,), what is fitted to its records, and the unknowns."""
+    study_file: Path, noise_N: float, autocorrelation: float, misfit: float, differ: float, seed: int
+) -> tuple[Robot, Array, Smoothed, Unknowns, Deviation]:
+    """The robot of a study, the truth (p,), what is fitted to its records, the unknowns, and what is expected
+    of each site as a whole."""
     study = load_study(study_file)
     store = Store(study.results)
     context = Context(study, store, SerialExecutor(), lambda progress: None)
@@ -163,12 +169,19 @@ def study_robot(
     truth = np.array([row["calibrated"] for row in found["parameters"]])
     records = tuple(site_record(context, record) for record in study.records_at(*study.fitted))
     emulator = read_emulator(store["uncertainty"] / EMULATOR)
-    forces = tuple(response.force_N for response in emulator(truth))
-    robot = Robot(records, forces, (), (), noise_N, autocorrelation, misfit, seed)
+
+    def deviation(responses: Sequence[SiteResponse], parameters: Array) -> tuple[Array, ...]:
+        pairs = zip(records, responses, strict=True)
+        return tuple(site_deviation(context, record, response, parameters) for record, response in pairs)
+
+    true = list(emulator(truth))
+    forces = tuple(response.force_N for response in true)
+    stiffer = tuple(differ * one for one in deviation(true, truth))
+    robot = Robot(records, forces, (), (), noise_N, autocorrelation, misfit, stiffer, seed)
     smoothing = tuple(best_smoothing(robot, *pair) for pair in zip(records, forces))
     responses = tuple(robot.response(*site) for site in zip(records, forces, smoothing))
     robot = replace(robot, smoothing=smoothing, responses=responses)
-    return robot, truth, Smoothed(emulator, responses), unknowns(study)
+    return robot, truth, Smoothed(emulator, responses), unknowns(study), deviation
 
 
 def best_smoothing(robot: Robot, record: SiteRecord, force: Array) -> float:
@@ -204,18 +217,20 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.05, help="N, standard deviation at 500 Hz")
     parser.add_argument("--autocorrelation", type=float, default=0.0, help="of neighbouring samples")
     parser.add_argument("--misfit", type=float, default=0.0, help="percent of the largest force")
+    parser.add_argument("--differ", type=float, default=1.0, help="of sites, over what is expected")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    robot, truth, emulator, free = study_robot(
-        given.study, given.noise, given.autocorrelation, given.misfit / 100, given.seed
+    robot, truth, emulator, free, deviation = study_robot(
+        given.study, given.noise, given.autocorrelation, given.misfit / 100, given.differ, given.seed
     )
-    found = coverage_study(emulator, truth, free, robot, given.repeats, given.steps)
+    found = coverage_study(emulator, truth, free, robot, given.repeats, given.steps, deviation)
     told = {
         "repeats": given.repeats,
         "noise_N": robot.noise_N,
         "autocorrelation": robot.autocorrelation,
         "misfit_percent": 100 * robot.misfit,
+        "sites_differ": given.differ,
         "estimated_misfit_percent": float(np.median(found.linearised.misfit_percent)),
         "further_simulations": found.further,
         "stated": summary(found.stated),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtr
 
 from ..fit.calibration import calibrate
-from ..fit.objective import Measured
+from ..fit.objective import Measured, SiteResponse
 from ..fit.parameters import Unknowns, search_space, separate
 from ..fit.state import CalibrationSettings
 from .intervals import KeptRuns, restated, sampled_uncertainty
@@ -81,12 +81,28 @@ class CoverageStudy:
 Judged = tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]
 
 
+# From responses and parameters (p,) to what each site as a whole may be off by, (n,) N.
+Deviation = Callable[[Sequence[SiteResponse], Array], Sequence[Array]]
+
+
+def no_deviation(responses: Sequence[SiteResponse], parameters: Array) -> tuple[Array, ...]:
+    """Of sites whose tissue is alike and whose surfaces are right."""
+    return ()
+
+
 def coverage_study(
-    simulate: StandIn, truth: Array, unknowns: Unknowns, record: Recording, repeats: int, steps: int = 0
+    simulate: StandIn,
+    truth: Array,
+    unknowns: Unknowns,
+    record: Recording,
+    repeats: int,
+    steps: int = 0,
+    deviation: Deviation = no_deviation,
 ) -> CoverageStudy:
     """Calibrate and judge ``repeats`` records of the forces at ``truth`` (p,), each with noise of its own.
 
-    Each calibration starts about a tenth off the truth.
+    Each calibration starts about a tenth off the truth; ``deviation`` says what each site as a whole is
+    expected to be off by, (n,) N per site.
     Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty`` and
     ``sampled_uncertainty`` with what was simulated, and with ``steps`` of the sampler the posterior on the
     model itself.
@@ -103,8 +119,9 @@ def coverage_study(
         kept = KeptRuns()
         found = calibrate(kept.of(simulate), measured, start, settings, stages=stages)
         u = estimate_uncertainty(
-            found.parameters, found.responses, measured, unknowns, noise, settings=settings
-        )
+            found.parameters, found.responses, measured, unknowns, noise, settings=settings,
+            site_N=deviation(found.responses, found.parameters),
+        )  # fmt: skip
         linear.append(_judged(u, truth))
         asked = KeptRuns()
         ours = sampled_uncertainty(u, measured, unknowns, space, kept, asked.of(simulate))
