@@ -114,7 +114,7 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
                 "mostly_from": f"{first} {percent:.0f} %",
                 "liner_c": centre["change"][name].get("liner.c_kPa"),
                 "friction": rows["friction"]["values"][name] - value if "friction" in rows else None,
-                **({"truth": true, "inside": abs(true - value) <= NORMAL_95 * sd} if true else {}),
+                **({"truth": true, "inside": bool(abs(true - value) <= NORMAL_95 * sd)} if true else {}),
             }
         )
     return found
