@@ -1,8 +1,9 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
-from .gauges import Gauge, gauges_along
+from .gauges import Gauge, LayerGauge, gauges_along
 from .measures import MeshQuality, dihedral_angles, quality
+from .skin_points import SkinPoints, skin_points
 from .volume import (
     Mesh,
     boundary_faces,
@@ -20,8 +21,10 @@ __all__ = [
     "TRI6_EDGES",
     "CellType",
     "Gauge",
+    "LayerGauge",
     "Mesh",
     "MeshQuality",
+    "SkinPoints",
     "boundary_faces",
     "cell_volumes",
     "check",
@@ -32,6 +35,7 @@ __all__ = [
     "read_grid",
     "read_vtu",
     "silent_vtk",
+    "skin_points",
     "to_tet10",
     "write_pvd",
     "write_vtu",

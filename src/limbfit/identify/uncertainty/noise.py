@@ -29,7 +29,8 @@ class SiteNoise:
     ``covariance`` (n, n) N^2; ``sd_N`` and ``autocorrelation`` of neighbours are those of the samples as
     recorded; ``touch_down_mm`` is the standard deviation of the touch-down that is part of the covariance.
     ``unit`` is mm, and all of it, where depths are compared. ``site``: where the record is from, by default
-    its own.
+    its own. ``alike`` (n, n) is how far a misfit of the model is the same for values of one time, as of
+    points that are near each other; none: all the same.
     """
 
     name: str
@@ -40,6 +41,7 @@ class SiteNoise:
     touch_down_mm: float = 0.0
     unit: str = "N"
     site: str = ""
+    alike: Array | None = None
 
     @property
     def where(self) -> str:

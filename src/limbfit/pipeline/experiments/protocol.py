@@ -271,8 +271,8 @@ def _told_by(simulation: Simulation, parameters: Array, noise: Noises) -> tuple[
     force = information_of(SiteResponse(simulation.force_N, simulation.jacobian), parameters, noise.force)
     every = force
     if noise.layers is not None:
-        assert simulation.compression_jacobian is not None
-        for lost, slopes in zip(simulation.compression_mm, simulation.compression_jacobian, strict=True):
+        assert simulation.observed_jacobian is not None
+        for lost, slopes in zip(simulation.observed_mm, simulation.observed_jacobian, strict=True):
             every = every + information_of(SiteResponse(lost, slopes), parameters, noise.layers)
     return every, force
 

@@ -99,10 +99,10 @@ class SimulationCache:
             arrays = {"force_N": simulation.force_N}
             if simulation.jacobian is not None:
                 arrays["jacobian"] = simulation.jacobian
-            if simulation.compression_mm.size:
-                arrays["compression_mm"] = simulation.compression_mm
-            if simulation.compression_jacobian is not None:
-                arrays["compression_jacobian"] = simulation.compression_jacobian
+            if simulation.observed_mm.size:
+                arrays["observed_mm"] = simulation.observed_mm
+            if simulation.observed_jacobian is not None:
+                arrays["observed_jacobian"] = simulation.observed_jacobian
             facts = {
                 "site": simulation.site,
                 "completed": simulation.completed,
@@ -119,8 +119,8 @@ def _lost(job: SimulationJob, reason: str) -> Simulation:
     n, site = len(job.times_s), job.model.name
     slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
     facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
-    nothing = np.zeros((len(job.model.layers), n))
-    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, compression_mm=nothing)
+    nothing = np.zeros((job.model.gauges, n))
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, observed_mm=nothing)
 
 
 def _load(file: Path) -> Simulation:
@@ -132,8 +132,8 @@ def _load(file: Path) -> Simulation:
             force_N=stored["force_N"],
             jacobian=jacobian,
             doubts=doubts,
-            compression_mm=stored.get("compression_mm", np.zeros((0, 0))),
-            compression_jacobian=stored.get("compression_jacobian"),
+            observed_mm=stored.get("observed_mm", np.zeros((0, 0))),
+            observed_jacobian=stored.get("observed_jacobian"),
             **facts,
         )
 

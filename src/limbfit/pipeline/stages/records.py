@@ -100,9 +100,9 @@ class SiteRecord:
     def _compression(self, plain: SiteResponse, simulation: Simulation) -> SiteResponse:
         """The response with the compression of its tissue in place of the force."""
         assert self.seen is not None
-        row, slopes = self.model.layers.index(self.seen.tissue), simulation.compression_jacobian
+        row, slopes = self.model.layers.index(self.seen.tissue), simulation.observed_jacobian
         jacobian = np.zeros_like(plain.jacobian) if slopes is None else slopes[row]
-        return replace(plain, force_N=simulation.compression_mm[row], jacobian=jacobian)
+        return replace(plain, force_N=simulation.observed_mm[row], jacobian=jacobian)
 
     def job(
         self, parameters: Array, sensitivities: bool = True, starts: Sequence[Array] = ()
