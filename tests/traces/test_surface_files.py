@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit.errors import TraceError
-from limbfit.traces import SurfaceMotion, in_contact, read_surface
+from limbfit.traces import SurfaceMotion, in_contact, read_surface_motion
 
 HEAD = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
 AT = ((10.0, 0.0, 0.0), (0.0, 12.0, 0.0))
@@ -25,7 +25,7 @@ def test_rows_become_frames_of_points(tmp_path: Path) -> None:
     file = table(
         tmp_path, HEAD, "2,0,12,0,0.1,,-0.5", "1,10,0,0,0.2,0.0,-0.1", "2,10,0,0,0.4,0.0,-0.2", "3,10,0,0,,,"
     )
-    found = read_surface(file, "time_s")
+    found = read_surface_motion(file, "time_s")
     assert found.time_s.tolist() == [1.0, 2.0, 3.0]
     assert found.points.tolist() == [[0.0, 12.0, 0.0], [10.0, 0.0, 0.0]]
     assert np.isnan(found.moved_mm[0, 0]).all()
@@ -37,7 +37,7 @@ def test_rows_become_frames_of_points(tmp_path: Path) -> None:
 
 def test_one_component_will_do(tmp_path: Path) -> None:
     file = table(tmp_path, "time_s;x_mm;y_mm;z_mm;uz_mm", "1;10;0;0;-0,5", "1;0;12;0;-0,2")
-    found = read_surface(file, "time_s")
+    found = read_surface_motion(file, "time_s")
     assert np.isnan(found.moved_mm[..., :2]).all()
     assert found.moved_mm[0, :, 2].tolist() == [-0.2, -0.5]
     means = found.means(np.array([0, 1]))
@@ -75,7 +75,7 @@ def test_what_is_wrong_with_a_file_is_told_in_one_line(
     tmp_path: Path, head: str, rows: list[str], told: str
 ) -> None:
     with pytest.raises(TraceError, match=told) as caught:
-        read_surface(table(tmp_path, head, *rows), "time_s")
+        read_surface_motion(table(tmp_path, head, *rows), "time_s")
     assert caught.value.file == tmp_path / "s.csv"
     assert caught.value.place
     assert "\n" not in str(caught.value)

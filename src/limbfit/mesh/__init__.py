@@ -3,7 +3,7 @@
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
 from .gauges import Gauge, LayerGauge, gauges_along
 from .measures import MeshQuality, dihedral_angles, quality
-from .skin_points import SkinPoints, skin_points
+from .skin_points import SkinPoints, nearest_points, skin_points
 from .volume import (
     Mesh,
     boundary_faces,
@@ -30,6 +30,7 @@ __all__ = [
     "check",
     "dihedral_angles",
     "gauges_along",
+    "nearest_points",
     "node_jacobians",
     "quality",
     "read_grid",

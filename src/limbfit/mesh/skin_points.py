@@ -37,10 +37,7 @@ class SkinPoints:
 
 
 def skin_points(mesh: Mesh, points: Array) -> SkinPoints:
-    """The points of the face set ``skin`` nearest to ``points`` (k, 3), mm.
-
-    Faces count as the flat triangles of their corners, quadrilaterals as two; nodal values are interpolated
-    by the face's own functions.
+    """The points of a mesh's face set ``skin`` nearest to ``points`` (k, 3), mm; see `nearest_points`.
 
     Raises
     ------
@@ -50,9 +47,18 @@ def skin_points(mesh: Mesh, points: Array) -> SkinPoints:
     faces = mesh.face_sets.get("skin", np.empty((0, 3), dtype=np.int64))
     if not len(faces):
         raise ProblemError("the mesh has no face set 'skin'", remedy="mesh the site anew")
+    return nearest_points(mesh.points, faces, points)
+
+
+def nearest_points(nodes: Array, faces: Ints, points: Array) -> SkinPoints:
+    """The points of a skin with ``nodes`` (n, 3) mm and ``faces`` (f, j) nearest to ``points`` (k, 3), mm.
+
+    Faces count as the flat triangles of their corners, quadrilaterals as two; nodal values are interpolated
+    by the face's own functions.
+    """
     if faces.shape[1] == 4:
         faces = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-    corners = np.ascontiguousarray(mesh.points[faces[:, :3]])
+    corners = np.ascontiguousarray(nodes[faces[:, :3]])
     tree = build_tree(corners, np.arange(len(faces)))
     feet, near = np.empty((len(points), 3)), np.empty(len(points), dtype=np.int64)
     for k, point in enumerate(np.asarray(points, dtype=float)):

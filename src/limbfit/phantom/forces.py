@@ -19,7 +19,15 @@ from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_si
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
-from ..indentation import Parameters, SiteModel, build_problem, neighbourhood, observed, points_around
+from ..indentation import (
+    Parameters,
+    SiteModel,
+    build_problem,
+    neighbourhood,
+    observed,
+    points_around,
+    read_indenter,
+)
 from ..mesh import Mesh, gauges_along
 from ..study import IndenterTable
 from .record import Ramp
@@ -162,7 +170,8 @@ def site_force(job: ForceJob) -> TrueForce:
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
     gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.ultrasound else ()
-    around = points_around(job.mesh, problem.indenter) if job.surface else np.zeros((0, 3))
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
+    around = points_around(job.mesh, indenter) if job.surface else np.zeros((0, 3))
     layers = tuple(gauge.region for gauge in gauges)
     seen, _ = observed(result, replace(model, layers=layers, skin_points=tuple(map(tuple, around))), times)
     return TrueForce(

@@ -235,7 +235,10 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
     ),
     VainOfSite(
         "edge",
-        lambda s, site: all(SHAPES[one.shape].is_round for one in s.indenters_at(site)),
+        lambda s, site: (
+            all(SHAPES[one.shape].is_round for one in s.indenters_at(site))
+            and not any(one.surface and one.surface_frame == "site" for one in s.records_at(site))
+        ),
         "the indenter is round",
     ),
 )

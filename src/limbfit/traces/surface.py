@@ -30,6 +30,26 @@ class SurfaceMotion:
     time_s: Array
     moved_mm: Array
 
+    @classmethod
+    def of_rows(cls, time_s: Array, place_mm: Array, moved_mm: Array) -> SurfaceMotion:
+        """From rows (r, ...), one for each point at each time; rows of one place are of one point."""
+        frames, frame = np.unique(time_s, return_inverse=True)
+        points, point = _points_of(place_mm)
+        whole = np.full((len(frames), len(points), 3), np.nan)
+        whole[frame, point] = moved_mm
+        return cls(points, frames, whole)
+
+    @property
+    def rows(self) -> tuple[Array, Array, Array]:
+        """What `of_rows` takes: of every point at every time, seen or not."""
+        f, k, _ = self.moved_mm.shape
+        return np.repeat(self.time_s, k), np.tile(self.points, (f, 1)), self.moved_mm.reshape(-1, 3)
+
+    @property
+    def largest_mm(self) -> float:
+        """The largest component of all."""
+        return float(np.nanmax(np.abs(self.moved_mm)))
+
     def frames(self, which: NDArray[np.bool_]) -> SurfaceMotion:
         """Some of the frames (f,)."""
         return SurfaceMotion(self.points, self.time_s[which], self.moved_mm[which])
@@ -70,7 +90,7 @@ class SurfaceMeans:
         return np.asarray((self.frames > 0.0).sum(axis=1), dtype=np.float64)
 
 
-def read_surface(path: str | Path, time_name: str) -> SurfaceMotion:
+def read_surface_motion(path: str | Path, time_name: str) -> SurfaceMotion:
     """Read a table with a row for each point at each time: where it is at rest, and its displacement.
 
     Columns are the time, ``x_mm``, ``y_mm``, ``z_mm`` and one or more of ``ux_mm``, ``uy_mm``, ``uz_mm``,
@@ -101,7 +121,8 @@ def read_surface(path: str | Path, time_name: str) -> SurfaceMotion:
     nothing = np.full(len(place), np.nan)
     moved = np.column_stack([columns.get(name, nothing) for name in MOVES])
     _check_sizes(file, place, moved, ", ".join(given))
-    return _by_frame(file, time_name, columns[time_name], place, moved)
+    _check_once(file, time_name, columns[time_name], place)
+    return SurfaceMotion.of_rows(columns[time_name], place, moved)
 
 
 def _check_sizes(file: Path, place: Array, moved: Array, given: str) -> None:
@@ -123,16 +144,19 @@ def _check_sizes(file: Path, place: Array, moved: Array, given: str) -> None:
         )
 
 
-def _by_frame(file: Path, time_name: str, time: Array, place: Array, moved: Array) -> SurfaceMotion:
-    """Rows (r, ...) as frames of points."""
-    frames, frame = np.unique(time, return_inverse=True)
-    _, first, point = np.unique(
-        np.round(place / _SAME_MM).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    cell = frame.ravel() * len(first) + point.ravel()
-    _, once = np.unique(cell, return_index=True)
-    if len(once) < len(cell):
-        again = int(np.setdiff1d(np.arange(len(cell)), once)[0])
+def _points_of(place: Array) -> tuple[Array, NDArray[np.int64]]:
+    """The places (k, 3) of rows (r, 3), each once, and which (r,) each row has."""
+    whole = np.round(place / _SAME_MM).astype(np.int64)
+    _, first, point = np.unique(whole, axis=0, return_index=True, return_inverse=True)
+    return place[first], point.ravel()
+
+
+def _check_once(file: Path, time_name: str, time: Array, place: Array) -> None:
+    """Whether no point has two rows at one time."""
+    rows = np.column_stack([time, _points_of(place)[1]])
+    _, once = np.unique(rows, axis=0, return_index=True)
+    if len(once) < len(rows):
+        again = int(np.setdiff1d(np.arange(len(rows)), once)[0])
         where = ", ".join(f"{value:g}" for value in place[again])
         raise TraceError(
             f"the point ({where}) has two rows at {time[again]:g} s",
@@ -140,9 +164,6 @@ def _by_frame(file: Path, time_name: str, time: Array, place: Array, moved: Arra
             place=time_name,
             remedy="give each point one row for each time",
         )
-    whole = np.full((len(frames) * len(first), 3), np.nan)
-    whole[cell] = moved
-    return SurfaceMotion(place[first], frames, whole.reshape(len(frames), len(first), 3))
 
 
 def in_contact(

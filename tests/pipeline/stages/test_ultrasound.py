@@ -22,7 +22,7 @@ from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.layer_figures import layer_figure
+from limbfit.report.drawing.observed_figures import layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study, load_study
 from limbfit.traces import Layers, read_layers, thinnings
@@ -225,7 +225,7 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
     last = found["stages"][-1]["iterations"][-1]
     assert list(last["error_percent_by_site"]) == ["a", "a+skin", "a+muscle"]
     (row,) = context.store.read("predict", "predict.json")["sites"]
-    assert {one["tissue"]: one["thickness_mm"] for one in row["layers"]} == pytest.approx(
+    assert {one["what"]: one["thickness_mm"] for one in row["observed"]} == pytest.approx(
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )
     assert (context.store["predict"] / "a+muscle.csv").is_file()

@@ -139,7 +139,8 @@ class ResidualModel:
         """Covariance (n, n) of the misfit of record i."""
         noise = self.noise[i]
         shape = matern(noise.times_s, self.correlation)
-        return (self.misfit[i] * self.peaks_N[i]) ** 2 * (shape if noise.alike is None else shape * noise.alike)
+        shape = shape if noise.alike is None else shape * noise.alike
+        return (self.misfit[i] * self.peaks_N[i]) ** 2 * shape
 
     def covariance(self, i: int) -> Array:
         """Covariance (n, n) of the residuals of record i."""

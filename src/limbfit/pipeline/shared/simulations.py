@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from .artefacts import atomic, digest, file_digest
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS
+from .surface_points import ChosenPoints, chosen_points, read_motion
 
 Array = NDArray[np.float64]
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
@@ -271,7 +272,29 @@ def recorded_model(context: Context, record: Record, searched: bool = False) -> 
     facts = context.stored("traces", "traces.json")["sites"][record.name]
     force = facts["knots_N"] if record.forced else ()
     layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
-    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
+    model = site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
+    points = surface_points(context, record)
+    return model if points is None else replace(model, skin_points=points.points, skin_axes=points.axes)
+
+
+def surface_points(context: Context, record: Record) -> ChosenPoints | None:
+    """The points of a record's surface that are compared, on the skin of the site's own mesh; None: nothing.
+
+    Raises
+    ------
+    TraceError
+        Where no point can be compared.
+    """
+    facts = context.stored("traces", "traces.json")["sites"][record.name].get("surface")
+    if facts is None or not facts["compared"]:
+        return None
+    (placed,) = (
+        row for row in context.stored("sites", "sites.json")["sites"] if row["site"] == record.site.name
+    )
+    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
+    place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    motion = read_motion(context.store["traces"], record)
+    return chosen_points(context.study, record, place, (mesh.points, mesh.face_sets["skin"]), motion)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:
