@@ -17,9 +17,9 @@ from limbfit.indentation import (
     is_under,
     points_around,
     simulate,
+    skin_points,
     to_vector,
 )
-from limbfit.mesh import skin_points
 from limbfit.study import IndenterTable, SolverTable
 
 TISSUES = ("skin", "muscle")

@@ -15,6 +15,7 @@ from .sites import (
     read_indenter,
     steps_of,
 )
+from .skin_points import nearest_points, skin_points
 
 __all__ = [
     "OFF_SKIN_MM",
@@ -36,12 +37,14 @@ __all__ = [
     "job_fields",
     "layers_under",
     "materials",
+    "nearest_points",
     "neighbourhood",
     "observed",
     "points_around",
     "read_indenter",
     "simulate",
     "simulate_fields",
+    "skin_points",
     "steps_of",
     "to_parameters",
     "to_vector",

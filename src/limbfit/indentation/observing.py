@@ -1,7 +1,7 @@
 """What is seen of a limb beside the force: layers that become thinner, points of the skin that move.
 
 Ultrasound through the indenter sees the interfaces between tissues on its axis, cameras see the skin around
-it. Both are followed as material points (`mesh.gauges`, `mesh.skin_points`). Their displacement is that of
+it. Both are followed as material points (`mesh.gauges`, `skin_points`). Their displacement is that of
 the steps, and so are its derivatives, exact as those of the force are.
 """
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ..errors import ProblemError
 from ..fe import Indenter, Result
 from ..fe.interpolation import interpolate
-from ..mesh import Gauge, Mesh, gauges_along, read_vtu, skin_points
+from ..mesh import Gauge, Mesh, gauges_along, read_vtu
 from .sites import SiteModel
+from .skin_points import skin_points
 
 Array = NDArray[np.float64]
 OFF_SKIN_MM = 5.0  # farther from the skin than that is no point of it

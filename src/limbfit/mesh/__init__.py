@@ -3,7 +3,6 @@
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
 from .gauges import Gauge, LayerGauge, gauges_along
 from .measures import MeshQuality, dihedral_angles, quality
-from .skin_points import SkinPoints, nearest_points, skin_points
 from .volume import (
     Mesh,
     boundary_faces,
@@ -24,19 +23,16 @@ __all__ = [
     "LayerGauge",
     "Mesh",
     "MeshQuality",
-    "SkinPoints",
     "boundary_faces",
     "cell_volumes",
     "check",
     "dihedral_angles",
     "gauges_along",
-    "nearest_points",
     "node_jacobians",
     "quality",
     "read_grid",
     "read_vtu",
     "silent_vtk",
-    "skin_points",
     "to_tet10",
     "write_pvd",
     "write_vtu",

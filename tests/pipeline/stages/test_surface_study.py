@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from limbfit.pipeline.stages.traces import run_traces
 from scipy.interpolate import interp1d
 
 import layered
@@ -28,6 +27,7 @@ from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.shared.surface_points import MAX_POINTS, ChosenPoints, chosen_points
 from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.stages.curves import run_traces
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.observed_figures import surface_figure

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TraceError
-from ...indentation import OFF_SKIN_MM, is_under, read_indenter
-from ...mesh import nearest_points
+from ...indentation import OFF_SKIN_MM, is_under, nearest_points, read_indenter
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion
 from .artefacts import read_curves, write_curves

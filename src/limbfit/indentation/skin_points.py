@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
+from ..mesh import Gauge, Mesh
+from ..mesh.cells import linear_simplex, quadratic_simplex
 from ..shapes.closest_point import build_tree, closest_point
-from .cells import linear_simplex, quadratic_simplex
-from .gauges import Gauge
-from .volume import Mesh
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
