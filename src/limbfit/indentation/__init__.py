@@ -4,7 +4,7 @@ from ..laws import Parameters, flat_names, to_parameters, to_vector
 from .clamps import clamped, clamping_pins
 from .fibres import Direction, fibre_field
 from .neighbourhood import Extension, neighbourhood
-from .observing import OFF_SKIN_MM, is_under, layers_under, observed, points_around
+from .observing import OFF_SKIN_MM, is_under, layers_under, observed, points_around, skin_beside
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
 from .sites import (
     Array,
@@ -44,6 +44,7 @@ __all__ = [
     "read_indenter",
     "simulate",
     "simulate_fields",
+    "skin_beside",
     "skin_points",
     "steps_of",
     "to_parameters",

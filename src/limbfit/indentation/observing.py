@@ -14,7 +14,8 @@ from ..errors import ProblemError
 from ..fe import Indenter, Result
 from ..fe.interpolation import interpolate
 from ..mesh import Gauge, Mesh, gauges_along, read_vtu
-from .sites import SiteModel
+from ..study import Vector
+from .sites import SiteModel, read_indenter
 from .skin_points import skin_points
 
 Array = NDArray[np.float64]
@@ -91,6 +92,12 @@ def layers_under(model: SiteModel) -> tuple[str, ...]:
     """The tissues on the axis of a site's indenter, outermost first, as its stored mesh has them."""
     found = gauges_along(read_vtu(model.mesh), np.array(model.position), np.array(model.axis))
     return tuple(one.region for one in found)
+
+
+def skin_beside(model: SiteModel) -> tuple[Vector, ...]:
+    """`points_around` a site's indenter on its stored mesh."""
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
+    return tuple((float(x), float(y), float(z)) for x, y, z in points_around(read_vtu(model.mesh), indenter))
 
 
 def observed(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:

@@ -164,3 +164,17 @@ def _exchanged(start: Sequence[int], options: Sequence[Option], budget: Budget, 
 def _nothing(option: Option) -> Option:
     """A record that takes longer than any session: it is not chosen again."""
     return Option(option.place, float("inf"), option.information)
+
+
+def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
+    """Tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
+
+    A parameter with a prior scatters by its factor, another by half of what its bounds leave. A Latin
+    hypercube spreads few draws well.
+    """
+    spread = 0.5 * np.log(known.upper / known.lower) / np.sqrt(12.0)
+    for prior in known.priors:
+        spread[known.names.index(prior.name)] = np.log(prior.factor)
+    others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
+    scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
+    return np.vstack([centre, np.exp(np.clip(scattered, np.log(known.lower), np.log(known.upper)))])

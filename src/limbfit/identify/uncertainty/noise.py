@@ -19,6 +19,7 @@ from ..fit.objective import Measured, SiteResponse
 
 Array = NDArray[np.float64]
 
+ALIKE_MM = 10.0  # over which a misfit of the skin's moves goes from one point to the next
 _LEAST_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
 
 
@@ -47,6 +48,15 @@ class SiteNoise:
     def where(self) -> str:
         """What records of one site have in common."""
         return self.site or self.name
+
+
+def alike_on_skin(points_mm: Array, components: NDArray[np.int64]) -> Array:
+    """`SiteNoise.alike` of moves of ``points_mm`` (n, 3) along ``components`` (n,): within `ALIKE_MM`.
+
+    Each component has a misfit of its own.
+    """
+    apart = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
+    return np.asarray(np.exp(-apart / ALIKE_MM) * (components[:, None] == components[None]))
 
 
 def record_noise(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...identify.fit.objective import largest
-from ...identify.uncertainty.noise import SiteNoise, depth_slope
+from ...identify.uncertainty.noise import SiteNoise, alike_on_skin, depth_slope
 from ...indentation import Simulation
 from ...study import Record
 from ...traces import SurfaceMotion, Thinning
@@ -25,7 +25,6 @@ from .files import LAYERS
 
 Array = NDArray[np.float64]
 
-ALIKE_MM = 10.0  # over which a misfit of the skin's moves goes from one point to the next
 _LEAST_DEPTH = 0.1  # of the largest: nearer to touch-down moves are not in proportion to the depth
 
 
@@ -114,10 +113,7 @@ class SeenLayer(Observed):
 
 @dataclass(frozen=True)
 class SeenSurface(Observed):
-    """The displacement of the skin around the indenter: ``points`` (n, 3) mm along ``components`` (n,).
-
-    The model's misfit is alike at points within about `ALIKE_MM`, and of each component its own.
-    """
+    """The displacement of the skin around the indenter: ``points`` (n, 3) mm along ``components`` (n,)."""
 
     points: Array
     components: NDArray[np.int64]
@@ -127,8 +123,7 @@ class SeenSurface(Observed):
 
     @property
     def alike(self) -> Array:
-        apart = np.linalg.norm(self.points[:, None] - self.points[None], axis=2)
-        return np.exp(-apart / ALIKE_MM) * (self.components[:, None] == self.components[None])
+        return alike_on_skin(self.points, self.components)
 
     def by_depth(self, depth_mm: Array, simulated_mm: Array) -> Array:
         """Moves of the skin are nearly in proportion to the depth."""
