@@ -87,9 +87,7 @@ def design(
     ] = None,
     surface: Annotated[
         float | None,
-        typer.Option(
-            help="with --protocol: cameras read the skin with this deviation, mm", min=1e-3
-        ),
+        typer.Option(help="with --protocol: cameras read the skin with this deviation, mm", min=1e-3),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

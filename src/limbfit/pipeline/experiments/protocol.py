@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError
-from ...identify.checks.design import NoiseModel, information_of, information_of_field
+from ...identify.checks.design import NoiseModel
 from ...identify.checks.design import prior_information as bounds_information
-from ...identify.checks.protocol import Budget, Option, Wanted, drawn, factors_95, plan, seconds_of
+from ...identify.checks.protocol import Budget, Noises, Option, Wanted, drawn, factors_95, plan, seconds_of
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...identify.uncertainty.noise import alike_on_skin
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, layers_under, skin_beside
 from ...study import Site
 from ..shared.artefacts import write_json, write_table
@@ -93,7 +92,7 @@ def run_protocol(
     rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
     tissues = drawn(known, study.vector(parameters), draws, seed)
     seen = {"ultrasound_sd_mm": ultrasound_sd_mm, "surface_sd_mm": surface_sd_mm}
-    noises = Noises(NoiseModel(**noise), *(_of_lengths(noise, sd_mm) for sd_mm in seen.values()))
+    noises = Noises.of(NoiseModel(**noise), **seen)
     planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, noises)
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
@@ -163,28 +162,6 @@ def _plans_told(
         plans[UNSEEN] = _plans(found, blind, budget, wanted)[DESIGNED]
         told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
     return plans, told_by
-
-
-@dataclass(frozen=True)
-class Noises:
-    """Of a record's force, of the compressions that ultrasound sees and of the moves that cameras see.
-
-    None where there is none.
-    """
-
-    force: NoiseModel
-    layers: NoiseModel | None
-    skin: NoiseModel | None
-
-    @property
-    def sees_more(self) -> bool:
-        """Whether there is anything beside the force."""
-        return self.layers is not None or self.skin is not None
-
-
-def _of_lengths(noise: Mapping[str, float], sd_mm: float | None) -> NoiseModel | None:
-    """One reading at each point of comparison; the model errs by the same share as of the force."""
-    return None if sd_mm is None else NoiseModel(**{**noise, "sensor_N": sd_mm})
 
 
 def _planned(
@@ -280,24 +257,16 @@ def _options(
     return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
 
 
-def _told_by(job: SimulationJob, simulation: Simulation, noise: Noises) -> tuple[Array, Array]:
+def _told_by(job: SimulationJob, simulation: Simulation, noises: Noises) -> tuple[Array, Array]:
     """The information (p, p) of a record with what is seen beside its force, and of its force alone."""
     assert simulation.jacobian is not None
-    parameters, model = np.array(job.parameters), job.model
-    force = information_of(SiteResponse(simulation.force_N, simulation.jacobian), parameters, noise.force)
-    every, values, slopes = force, simulation.observed_mm, simulation.observed_jacobian
-    if not noise.sees_more:
-        return every, force
-    assert slopes is not None
-    first = len(model.layers)
-    if noise.layers is not None:
-        for lost, of_layer in zip(values[:first], slopes[:first], strict=True):
-            every = every + information_of(SiteResponse(lost, of_layer), parameters, noise.layers)
-    if noise.skin is not None and model.skin_points:
-        points, axes = np.repeat(model.skin_points, 3, axis=0), np.tile(range(3), len(model.skin_points))
-        alike = alike_on_skin(points, axes)
-        every = every + information_of_field(values[first:], slopes[first:], alike, parameters, noise.skin)
-    return every, force
+    parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
+    force = SiteResponse(simulation.force_N, simulation.jacobian)
+    if not noises.sees_more:
+        return (alone := noises.of_force(force, parameters)), alone
+    assert simulation.observed_jacobian is not None
+    beside = simulation.observed_mm, simulation.observed_jacobian
+    return noises.of_all(force, *beside, points, parameters), noises.of_force(force, parameters)
 
 
 def _plans(
