@@ -135,6 +135,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
         widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in laboratory.records] == ["a", "a+surface"]
     assert [one.unit for one in laboratory.measured] == ["N", "mm"]
+    assert {one.where for one in laboratory.measured} == {"a"}  # left out together
     seen, noise = laboratory.records[1], known.residual_model.noise[1]
     off = at.responses[1].force_N - seen.compared
     assert len(off) > 300
