@@ -27,7 +27,7 @@ from limbfit.anatomy.meshing.meshing import base_mesh, mesh_site
 from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.fe import solve
-from limbfit.indentation import SiteModel, build_problem, compressions
+from limbfit.indentation import SiteModel, build_problem, observed
 from limbfit.mesh import Mesh, gauges_along, read_vtu, write_vtu
 from limbfit.phantom.record import (
     CLEARANCE_MM,
@@ -114,7 +114,7 @@ class Limb:
             if not result.completed:
                 raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
             times = model.curve_times(2001)
-            lost, _ = compressions(result, model, times)
+            lost, _ = observed(result, model, times)
             told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
             told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}
             np.savez(file, times=times, force=result.force_at(times), **told)

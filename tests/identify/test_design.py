@@ -17,6 +17,7 @@ from limbfit.identify.checks.design import (
     choose,
     efficiency,
     evaluate,
+    information_of_field,
     prior_information,
 )
 from limbfit.identify.fit.objective import Measured
@@ -136,3 +137,20 @@ def test_what_cannot_be_chosen_is_refused():
     partial = SiteResponse(np.ones(3), np.ones((3, 2)), False, "did not converge")
     with pytest.raises(CalibrationError, match="did not converge"):
         candidate("s0", 1.0, partial, np.ones(2), NoiseModel(0.1))
+
+
+def test_the_information_of_a_field_is_that_of_its_whole_covariance() -> None:
+    """The misfit is alike between curves and along them; curves that share nothing add up."""
+    rng = np.random.default_rng(4)
+    values, slopes = rng.normal(size=(3, 7)), rng.normal(size=(3, 7, 2))
+    noise, parameters = NoiseModel(0.1, 0.05, 0.8), np.array([2.0, 0.5])
+    along = 0.8 ** np.abs(np.subtract.outer(np.arange(7), np.arange(7)))
+    alike = np.exp(-np.abs(np.subtract.outer(np.arange(3), np.arange(3))) / 2.0)
+    size = (0.05 * np.abs(values).max()) ** 2
+    scaled = (slopes * parameters).reshape(21, 2)
+    whole = scaled.T @ np.linalg.solve(0.01 * np.eye(21) + size * np.kron(alike, along), scaled)
+    assert information_of_field(values, slopes, alike, parameters, noise) == pytest.approx(whole)
+    apart = sum(
+        row.T @ np.linalg.solve(0.01 * np.eye(7) + size * along, row) for row in scaled.reshape(3, 7, 2)
+    )
+    assert information_of_field(values, slopes, np.eye(3), parameters, noise) == pytest.approx(apart)

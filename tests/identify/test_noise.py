@@ -7,7 +7,15 @@ import pytest
 
 from limbfit.autoregressive import block_covariance
 from limbfit.identify import Measured, SiteResponse
-from limbfit.identify.uncertainty.noise import curve_noise, depth_slope, record_noise
+from limbfit.identify.uncertainty.discrepancy import ResidualModel, matern
+from limbfit.identify.uncertainty.noise import (
+    ALIKE_MM,
+    SiteNoise,
+    alike_on_skin,
+    curve_noise,
+    depth_slope,
+    record_noise,
+)
 
 
 def drift(rng, n, lag):
@@ -104,3 +112,15 @@ def test_scatter_of_a_curve_is_told_from_its_bend():
     response = SiteResponse(10 + 2 * bend + 0.01 * rng.standard_normal(400), np.zeros((400, 0)))
     (found,) = curve_noise([response], [measured])
     assert found.sd_N == pytest.approx(0.01, rel=0.15)
+
+
+def test_a_misfit_is_alike_at_points_that_are_near_and_of_its_own_along_each_component() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [ALIKE_MM, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    alike = alike_on_skin(points, np.array([0, 0, 2]))
+    near = np.exp(-1.0)
+    assert alike == pytest.approx(np.array([[1.0, near, 0.0], [near, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    for times in (np.full(3, 2.0), np.array([0.0, 1.0, 4.0])):  # one scan, and several times
+        noise = SiteNoise("a+surface", times, np.eye(3), 1.0, 0.0, unit="mm", alike=alike)
+        model = ResidualModel((noise,), np.array([2.0]), np.array([0.1]), 0.35, 1.0)
+        shape = np.ones((3, 3)) if np.ptp(times) == 0.0 else matern(times, 0.35)
+        assert model.discrepancy(0) == pytest.approx(0.04 * shape * alike)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from bars import PAPER, TRUTH, records, simulate
 
-from limbfit.identify import Measured, calibrate
+from limbfit.errors import TraceError
+from limbfit.identify import Measured, SiteResponse, calibrate
 from limbfit.identify.fit.objective import residuals
+from limbfit.identify.fit.prediction import error_percent
 
 N, SHARE = 50, 0.01
 DOUBTFUL = Measured("a", np.linspace(0.0, 2.0, N), doubt_N=np.linspace(0.0, 0.1, N) ** 2, error_share=SHARE)
@@ -51,3 +53,15 @@ def test_parameters_suffer_less_from_a_wrong_touch_down(wrong: int) -> None:
     doubted = [replace(r, doubt_N=d) for r, d in zip(data, doubts, strict=True)]
     off = [np.log(calibrate(simulate, given, PAPER).parameters / TRUTH) for given in (data, doubted)]
     assert np.linalg.norm(off[1]) < 0.55 * np.linalg.norm(off[0])
+
+
+def test_lengths_may_be_negative_and_forces_may_not() -> None:
+    """Displacements count over the largest one, whatever its sign."""
+    down = np.array([-0.5, -2.0, 0.1])
+    with pytest.raises(TraceError, match="no measured force"):
+        Measured("a", -np.abs(down))
+    seen = Measured("a+surface", down, unit="mm")
+    assert seen.peak_N == 2.0
+    off, _ = residuals("pointwise", [SiteResponse(down + 0.2, np.zeros((3, 1)))], [seen])
+    assert off @ off == pytest.approx(0.1**2)
+    assert error_percent(down + 0.2, down) == pytest.approx(10.0)

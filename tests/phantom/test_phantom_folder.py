@@ -19,10 +19,14 @@ from limbfit.phantom import make_limb, make_phantom, true_parameters
 from limbfit.phantom.forces import TrueForce, site_force, site_mesh
 from limbfit.phantom.sites import DETAIL_SITES, FITTED
 from limbfit.study import load_study
+from limbfit.traces import read_surface_motion
 
 
 def cubic_law(function, jobs):
-    """Force 0.02 d^3 newton on the way in, a little less on the way out; no mesh is needed for it."""
+    """Force 0.02 d^3 newton on the way in, a little less on the way out; no mesh is needed for it.
+
+    Where cameras are wanted two points follow the indenter by a half and a tenth.
+    """
     for job in jobs:
         if function is site_mesh:
             yield None
@@ -30,7 +34,10 @@ def cubic_law(function, jobs):
         times = np.linspace(0, 2 * job.ramp.peak_s, 101)
         depth = np.interp(times, *job.ramp.knots)
         lag = np.where(times > job.ramp.peak_s, 0.8, 1.0)
-        yield TrueForce(job.site, times, lag * 0.02 * depth**3, {"element": "none"})
+        points = np.array(job.position) + np.array([[14.0, 0.0, 0.0], [0.0, 22.0, 0.0]]) * job.surface
+        moves = np.multiply.outer(np.outer([0.5, 0.1], job.axis), depth)[: 2 * job.surface]
+        force = lag * 0.02 * depth**3
+        yield TrueForce(job.site, times, force, {"element": "none"}, {}, points[: len(moves)], moves)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +169,7 @@ def test_simulated_forces_are_those_of_soft_tissue(tmp_path) -> None:
 @pytest.fixture(scope="module")
 def with_tendon(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("phantom") / "tendon"
-    make_phantom(folder, sites=["01"], tendon=True, mapping=cubic_law)
+    make_phantom(folder, sites=["01"], tendon=True, surface=True, mapping=cubic_law)
     return folder
 
 
@@ -189,3 +196,20 @@ def test_its_mesh_has_the_tendon(with_tendon: Path) -> None:
     assert facts["region_volumes_mm3"]["tendon"] == pytest.approx(true, rel=0.05)
     assert facts["regions"]["tendon"]["mean_mm"] < 0.5
     assert facts["min_dihedral_deg"] > 5.0
+
+
+def test_a_surface_is_named_by_the_study_and_holds_the_true_moves(with_tendon: Path) -> None:
+    study = load_study(with_tendon)
+    (site,) = json.loads((with_tendon / "truth.json").read_text())["sites"]
+    (record,) = study.recorded
+    assert record.ultrasound is None
+    seen = read_surface_motion(study.path(record.surface), "time_s")
+    assert len(seen.points) == 2
+    assert np.diff(seen.time_s) == pytest.approx(0.2, abs=1e-3)
+    peak = site["depth_mm"] / site["speed_mm_s"]
+    depth = np.interp(seen.time_s - site["touch_down_s"], [0.0, peak, 2 * peak], [0.0, site["depth_mm"], 0.0])
+    far = np.linalg.norm(seen.points - site["position_mm"], axis=1) > 18.0
+    share = np.where(far, 0.1, 0.5)
+    off = seen.moved_mm - np.einsum("f,k,i->fki", depth, share, site["axis"])
+    assert off.std() == pytest.approx(0.05, rel=0.15)
+    assert abs(off.mean()) < 0.02

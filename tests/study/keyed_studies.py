@@ -17,6 +17,7 @@ from limbfit.pipeline.shared.keys import Keys
 from limbfit.pipeline.verbs.run import keys
 from limbfit.study import Study, load_study
 
+SEEN = {"ultrasound": "3.csv", "surface": "3.csv"}
 # Studies in which each key acts: the second is for those that an image, layers or markers rule out.
 IMAGED: dict[str, Any] = {
     "study": {"name": "one"},
@@ -29,12 +30,12 @@ IMAGED: dict[str, Any] = {
     "mesh": {"coarse": {}},
     "calibration": {"prior": {"skin.c_kPa": {"median": 5.0, "factor": 2.0}}, "starts": 2},
     "sites": [
-        {"name": "1", "fitted": True, "trace": "1.csv", "near": [0.0, -50.0, 10.0], "ultrasound": "3.csv"},
+        {"name": "1", "fitted": True, "trace": "1.csv", "near": [0.0, -50.0, 10.0], **SEEN},
         {"name": "2", "trace": "2.csv", "near": [0.0, 50.0, 10.0], "indenter": "ball"},
     ],
     "indenters": {"ball": {}},
     "records": [
-        {"site": "2", "name": "fast", "trace": "2.csv", "ultrasound": "3.csv"},
+        {"site": "2", "name": "fast", "trace": "2.csv", **SEEN},
         {"site": "2", "name": "slow", "trace": "2.csv"},
     ],
 }
@@ -111,8 +112,14 @@ ACTS: dict[str, tuple[str, Any]] = {
     "sites.0.control": ("traces", "force"),
     "sites.0.ultrasound": ("traces", "2.csv"),
     "sites.0.ultrasound_sd_mm": ("traces", 0.2),
+    "sites.0.surface": ("traces", "2.csv"),
+    "sites.0.surface_sd_mm": ("traces", 0.2),
+    "sites.0.surface_frame": ("traces", "site"),
     "records.0.ultrasound": ("traces", "1.csv"),
     "records.0.ultrasound_sd_mm": ("traces", 0.2),
+    "records.0.surface": ("traces", "1.csv"),
+    "records.0.surface_sd_mm": ("traces", 0.2),
+    "records.0.surface_frame": ("traces", "site"),
     "traces.time_s": ("traces", "t"),
     "traces.displacement_mm": ("traces", "d"),
     "traces.force_N": ("traces", "F"),

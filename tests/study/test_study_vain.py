@@ -161,6 +161,8 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (GIVEN, {"material.activation": {"time_s": [0.0, 1.0], "share": [1.0, 0.5]}}, "material.activation"),
     (GIVEN, {"sites.1.control": "force"}, "sites.control"),
     (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),
+    (GIVEN, {"sites.0.surface_sd_mm": 0.2}, "sites.surface_sd_mm"),
+    (GIVEN, {"sites.0.surface_frame": "site"}, "sites.surface_frame"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
     (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),

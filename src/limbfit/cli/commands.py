@@ -69,6 +69,9 @@ def phantom(
     ultrasound: Annotated[
         bool, typer.Option("--ultrasound", help="also what ultrasound sees under the indenter")
     ] = False,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="also how the skin around the indenter moves")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
@@ -80,6 +83,7 @@ def phantom(
             fat=fat,
             socket=socket,
             ultrasound=ultrasound,
+            surface=surface,
             tendon=tendon,
             listener=listener,
         )

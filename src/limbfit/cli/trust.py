@@ -85,6 +85,10 @@ def design(
         float | None,
         typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
     ] = None,
+    surface: Annotated[
+        float | None,
+        typer.Option(help="with --protocol: cameras read the skin with this deviation, mm", min=1e-3),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.
@@ -109,6 +113,7 @@ def design(
                 criterion=criterion,
                 draws=draws,
                 ultrasound_sd_mm=ultrasound,
+                surface_sd_mm=surface,
                 parameters=used,
                 listener=listener,
             )

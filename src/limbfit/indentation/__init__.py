@@ -3,8 +3,8 @@
 from ..laws import Parameters, flat_names, to_parameters, to_vector
 from .clamps import clamped, clamping_pins
 from .fibres import Direction, fibre_field
-from .layers import compressions, layers_under
 from .neighbourhood import Extension, neighbourhood
+from .observing import OFF_SKIN_MM, is_under, layers_under, observed, points_around, skin_beside
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
 from .sites import (
     Array,
@@ -15,8 +15,10 @@ from .sites import (
     read_indenter,
     steps_of,
 )
+from .skin_points import nearest_points, skin_points
 
 __all__ = [
+    "OFF_SKIN_MM",
     "Array",
     "Direction",
     "Extension",
@@ -27,18 +29,23 @@ __all__ = [
     "build_problem",
     "clamped",
     "clamping_pins",
-    "compressions",
     "contact_radius",
     "fibre_field",
     "first_steps",
     "flat_names",
+    "is_under",
     "job_fields",
     "layers_under",
     "materials",
+    "nearest_points",
     "neighbourhood",
+    "observed",
+    "points_around",
     "read_indenter",
     "simulate",
     "simulate_fields",
+    "skin_beside",
+    "skin_points",
     "steps_of",
     "to_parameters",
     "to_vector",

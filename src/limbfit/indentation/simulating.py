@@ -19,8 +19,8 @@ from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
 from ..mesh import read_vtu
-from .layers import compressions
 from .neighbourhood import Extension, neighbourhood
+from .observing import observed
 from .sites import (
     Parameters,
     SiteModel,
@@ -71,8 +71,9 @@ class Simulation:
     Where a force drives the indenter, ``force_N`` is what answers to it: the displacement, mm.
 
     Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
-    ``compression_mm`` (t, n) is what each of the model's layers has lost of its thickness,
-    ``compression_jacobian`` (t, n, p) its derivatives.
+    ``observed_mm`` (g, n) is what else is seen, in rows: the thickness that each of the model's layers has
+    lost, then the moves of each of its points of the skin along the model's axes. ``observed_jacobian``
+    (g, n, p) are its derivatives.
     """
 
     site: str
@@ -83,8 +84,8 @@ class Simulation:
     penetration_mm: float
     facts: dict[str, Any]
     doubts: tuple[Doubt, ...] = ()
-    compression_mm: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    compression_jacobian: Array | None = None
+    observed_mm: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    observed_jacobian: Array | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -196,8 +197,8 @@ def _solve_from_rest(
 
 
 def _kept_of(model: SiteModel, sensitivities: bool) -> str:
-    """Which states are kept: all, where they give first guesses or layers are read from them."""
-    return "all" if sensitivities or model.layers else "peak"
+    """Which states are kept: all, where they give first guesses or more than the force is read from them."""
+    return "all" if sensitivities or model.gauges else "peak"
 
 
 def _lightened(state: State) -> State:
@@ -251,7 +252,7 @@ def simulate(job: SimulationJob) -> Simulation:
     """
     model, result = job.model, _result(job)
     times = np.array(job.times_s) + model.waits_s
-    thinner, slopes = compressions(result, model, times) if model.layers else (np.zeros((0, 0)), None)
+    seen, slopes = observed(result, model, times) if model.gauges else (np.zeros((0, 0)), None)
     return Simulation(
         site=model.name,
         force_N=result.response_at(times),
@@ -263,8 +264,8 @@ def simulate(job: SimulationJob) -> Simulation:
         penetration_mm=float(result.penetration.max(initial=0.0)),
         facts=dict(result.statistics),
         doubts=result.doubts,
-        compression_mm=thinner,
-        compression_jacobian=None if slopes is None else _in_user_units(result, job, slopes),
+        observed_mm=seen,
+        observed_jacobian=None if slopes is None else _in_user_units(result, job, slopes),
     )
 
 

@@ -74,6 +74,8 @@ class SiteModel:
     site: str = ""
     knots_N: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
+    skin_points: tuple[Vector, ...] = ()  # points of the skin at rest, LPS mm, whose moves are, too
+    skin_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # of moves
     clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
     along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally, across which the clamps are
     course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
@@ -83,6 +85,11 @@ class SiteModel:
     def forced(self) -> bool:
         """Whether a force drives the indenter."""
         return bool(self.knots_N)
+
+    @property
+    def gauges(self) -> int:
+        """How many numbers are wanted of every moment beside the force."""
+        return len(self.layers) + len(self.skin_axes) * len(self.skin_points)
 
     @property
     def waits_s(self) -> float:

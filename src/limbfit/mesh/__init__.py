@@ -1,7 +1,7 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
-from .gauges import Gauge, gauges_along
+from .gauges import Gauge, LayerGauge, gauges_along
 from .measures import MeshQuality, dihedral_angles, quality
 from .volume import (
     Mesh,
@@ -20,6 +20,7 @@ __all__ = [
     "TRI6_EDGES",
     "CellType",
     "Gauge",
+    "LayerGauge",
     "Mesh",
     "MeshQuality",
     "boundary_faces",

@@ -1,7 +1,7 @@
-"""How thick the regions of a mesh are along a line, and how that changes as the mesh deforms.
+"""Lengths that change as a mesh deforms: how thick its regions are along a line.
 
 The line meets faces between regions; the points of these faces are followed as material points. What the
-thickness of a region loses is then a fixed linear function of the nodal displacements.
+thickness of a region loses is then a fixed linear function of the nodal displacements: a gauge.
 """
 
 from __future__ import annotations
@@ -25,16 +25,26 @@ _SAME_MM = 1e-6
 
 @dataclass(frozen=True)
 class Gauge:
-    """The thickness of one region along a line.
+    """A length that displacements u (n, 3) of all nodes change by ``weights @ (u[nodes] @ along)``.
 
-    With displacements ``u`` along the line the region is ``weights @ u[nodes]`` mm thinner than its
-    ``thickness_mm`` at rest; ``nodes`` and ``weights`` are (k,).
+    ``nodes`` and ``weights`` are (k,), ``along`` (3,) is a unit vector.
     """
+
+    nodes: Ints
+    weights: Array
+    along: Array
+
+    def read(self, field: Array) -> Array:
+        """Of a nodal field (n, 3, ...), such as displacements, mm, or their derivatives: (...)."""
+        return np.asarray(self.weights @ np.tensordot(self.along, field[self.nodes], (0, 1)))
+
+
+@dataclass(frozen=True)
+class LayerGauge(Gauge):
+    """How much thinner one region becomes along a line than its ``thickness_mm`` at rest."""
 
     region: str
     thickness_mm: float
-    nodes: Ints
-    weights: Array
 
 
 @dataclass(frozen=True)
@@ -51,7 +61,7 @@ class _Crossing:
     weights: Array
 
 
-def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
+def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGauge, ...]:
     """A gauge of each region that a line meets, from where it enters the mesh nearest to ``origin``.
 
     It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
@@ -79,14 +89,14 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[Gauge, ...]:
     spans: dict[int, tuple[_Crossing, _Crossing]] = {}
     for top, bottom in pairwise(crossings[first : end + 1]):
         spans.setdefault(top.below, (top, bottom))
-    return tuple(_gauge(mesh.region_names[region], *span) for region, span in spans.items())
+    return tuple(_gauge(mesh.region_names[region], axis, *span) for region, span in spans.items())
 
 
-def _gauge(region: str, top: _Crossing, bottom: _Crossing) -> Gauge:
+def _gauge(region: str, axis: Array, top: _Crossing, bottom: _Crossing) -> LayerGauge:
     weights: Array = np.concatenate([top.weights, -bottom.weights])
     kept, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
     thickness = bottom.along_mm - top.along_mm
-    return Gauge(region, thickness, kept, np.bincount(place, weights).astype(np.float64))
+    return LayerGauge(kept, np.bincount(place, weights).astype(np.float64), axis, region, thickness)
 
 
 def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import interp1d
 
 from ..anatomy.surfaces.surfaces import save_anatomy
 from ..errors import InputError
@@ -30,7 +31,7 @@ from .forces import DISCRETISATIONS, ForceJob, TrueForce, TruthMeshJob, site_for
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
-from .record import Ramp, record, write_ultrasound
+from .record import Ramp, record, write_surface, write_ultrasound
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
 from .socket import STUDY as SOCKET_STUDY
 from .socket import write_socket
@@ -81,6 +82,7 @@ def make_phantom(
     fat: bool = False,
     socket: bool = False,
     ultrasound: bool = False,
+    surface: bool = False,
     tendon: bool = False,
     mapping: Mapping = map,
     progress: Listener | None = None,
@@ -96,6 +98,7 @@ def make_phantom(
     fat : three tissues, skin of 2 mm over fat of 4 mm over muscle, instead of two.
     socket : also a rectified socket for the limb with a liner, as a file that the study names.
     ultrasound : beside each record what ultrasound through the indenter saw, to 0.1 mm at 20 Hz.
+    surface : beside each record how the skin around the indenter moved, to 0.05 mm at 5 Hz.
     tendon : also a patellar tendon, a stiffer region of the muscle, in a label map that the study names.
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
@@ -123,9 +126,9 @@ def make_phantom(
         _write_images(work, limb, everywhere, detail, seed, tell)
         truth = _truth(limb, everywhere, detail, seed, parameters)
         truth["sites"] = _write_traces(
-            work, limb, indented, detail, seed, parameters, mapping, tell, ultrasound
+            work, limb, indented, detail, seed, parameters, mapping, tell, ultrasound, surface
         )
-        text = study_text(indented, detail, seed, limb, ultrasound)
+        text = study_text(indented, detail, seed, limb, ultrasound, surface)
         if socket:
             truth["socket"] = write_socket(work, limb)
             text += SOCKET_STUDY
@@ -182,6 +185,7 @@ def _write_traces(
     mapping: Mapping,
     tell: Listener,
     ultrasound: bool,
+    surface: bool,
 ) -> list[dict[str, Any]]:
     """Simulate and record every site; what is true of each, for ``truth.json``."""
     truth, traces = work / "truth", work / "traces"
@@ -196,7 +200,7 @@ def _write_traces(
     tell("meshes", 0, len(wanted))
     for (name, at, axis), site, mesh in zip(places, indented, mapping(site_mesh, wanted), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters, ultrasound))
+        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters, ultrasound, surface))
         tell("meshes", len(jobs), len(wanted))
     tell("forces", 0, len(jobs))
     told = []
@@ -219,6 +223,14 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
                 for tissue, (thickness, lost) in found.layers.items()
             },
             np.random.default_rng([seed, 11, int(site.name)]),
+        )
+    if len(found.skin_points):
+        write_surface(
+            traces / f"site-{site.name}-surface.csv",
+            made,
+            found.skin_points,
+            lambda t: interp1d(found.times, found.skin_moves)(np.minimum(t, found.times[-1])),
+            np.random.default_rng([seed, 12, int(site.name)]),
         )
     return {
         **_site_facts(site),

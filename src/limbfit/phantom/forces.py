@@ -19,7 +19,15 @@ from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_si
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
-from ..indentation import Parameters, SiteModel, build_problem, compressions, neighbourhood
+from ..indentation import (
+    Parameters,
+    SiteModel,
+    build_problem,
+    neighbourhood,
+    observed,
+    points_around,
+    read_indenter,
+)
 from ..mesh import Mesh, gauges_along
 from ..study import IndenterTable
 from .record import Ramp
@@ -94,6 +102,7 @@ class ForceJob:
     steps: StepControl
     parameters: Parameters
     ultrasound: bool = False
+    surface: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,7 +110,8 @@ class TrueForce:
     """What came back: force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``.
 
     ``layers``: of each tissue on the axis its thickness at rest, mm, and its compression (n,) mm, where
-    ultrasound was wanted.
+    ultrasound was wanted. ``skin_points`` (k, 3) mm around the indenter and their ``skin_moves`` (k, 3, n),
+    mm, where cameras were.
     """
 
     site: str
@@ -109,6 +119,8 @@ class TrueForce:
     force: NDArray[np.float64]
     facts: dict[str, float | int | str]
     layers: dict[str, tuple[float, NDArray[np.float64]]] = field(default_factory=dict)
+    skin_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    skin_moves: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 0)))
 
 
 @lru_cache(maxsize=1)
@@ -146,7 +158,7 @@ def site_force(job: ForceJob) -> TrueForce:
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
     problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
-    result = solve(problem, steps=job.steps, store="all" if job.ultrasound else "peak")
+    result = solve(problem, steps=job.steps, store="all" if job.ultrasound or job.surface else "peak")
     if not result.completed:
         raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
     times = np.linspace(0.0, knots_s[-1], 401)
@@ -157,9 +169,17 @@ def site_force(job: ForceJob) -> TrueForce:
         "steps": int(result.statistics["steps"]),
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
-    layers = {}
-    if job.ultrasound:
-        gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis))
-        lost, _ = compressions(result, replace(model, layers=tuple(g.region for g in gauges)), times)
-        layers = {one.region: (one.thickness_mm, row) for one, row in zip(gauges, lost, strict=True)}
-    return TrueForce(job.site, times, result.force_at(times), facts, layers)
+    gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.ultrasound else ()
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
+    around = points_around(job.mesh, indenter) if job.surface else np.zeros((0, 3))
+    layers = tuple(gauge.region for gauge in gauges)
+    seen, _ = observed(result, replace(model, layers=layers, skin_points=tuple(map(tuple, around))), times)
+    return TrueForce(
+        job.site,
+        times,
+        result.force_at(times),
+        facts,
+        {one.region: (one.thickness_mm, row) for one, row in zip(gauges, seen)},
+        around,
+        seen[len(layers) :].reshape(len(around), 3, -1),
+    )

@@ -22,6 +22,7 @@ AFTER_S = 0.4
 CLEARANCE_MM = (0.3, 0.6)
 FORCE_NOISE_N = (0.03, 0.05)
 ULTRASOUND_HZ, ULTRASOUND_NOISE_MM = 20.0, 0.1
+SURFACE_HZ, SURFACE_NOISE_MM = 5.0, 0.05
 DISPLACEMENT_NOISE_MM = 0.005
 HEADER = "time_s,displacement_mm,force_N"
 
@@ -116,3 +117,26 @@ def write_ultrasound(
         columns.append(clean + ULTRASOUND_NOISE_MM * random.standard_normal(time.size))
     header = ",".join(["time_s", *(f"{tissue}_mm" for tissue in layers)])
     np.savetxt(path, np.column_stack(columns), fmt="%.3f", delimiter=",", header=header, comments="")
+
+
+def write_surface(
+    path: Path,
+    made: RobotRecord,
+    points: Array,
+    moves: Callable[[Array], Array],
+    random: np.random.Generator,
+) -> None:
+    """Write what cameras saw of the skin around the indenter: positions at rest and displacements, at 5 Hz.
+
+    Parameters
+    ----------
+    points : (k, 3) mm at rest.
+    moves : of all points (k, 3, n), mm, at times (n,) from touch-down.
+    """
+    time = np.arange(0.0, made.time[-1], 1 / SURFACE_HZ)
+    since = time - made.touch_s
+    moved = np.where(since > 0.0, moves(np.maximum(since, 0.0)), 0.0)
+    moved = moved + SURFACE_NOISE_MM * random.standard_normal(moved.shape)
+    frames = [np.column_stack([np.full(len(points), t), points, moved[..., i]]) for i, t in enumerate(time)]
+    header = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
+    np.savetxt(path, np.concatenate(frames), fmt="%.3f", delimiter=",", header=header, comments="")

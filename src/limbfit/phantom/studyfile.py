@@ -76,10 +76,18 @@ near = [{x:.1f}, {y:.1f}, {z:.1f}]
 _ULTRASOUND = """\
 ultrasound = "traces/site-{name}-layers.csv"   # thickness of the tissues under the indenter meanwhile
 """
+_SURFACE = """\
+surface = "traces/site-{name}-surface.csv"     # how the skin around the indenter moved meanwhile
+"""
 
 
 def study_text(
-    sites: Sequence[TrueSite], detail: str, seed: int, limb: Limb, ultrasound: bool = False
+    sites: Sequence[TrueSite],
+    detail: str,
+    seed: int,
+    limb: Limb,
+    ultrasound: bool = False,
+    surface: bool = False,
 ) -> str:
     """The content of ``study.toml`` for some sites of a limb."""
     head = _HEAD.format(
@@ -101,6 +109,8 @@ def study_text(
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
         if ultrasound:
             parts.append(_ULTRASOUND.format(name=site.name))
+        if surface:
+            parts.append(_SURFACE.format(name=site.name))
     return "".join(parts)
 
 

@@ -103,6 +103,36 @@ def _number_of_sites(rows: list[Json]) -> str:
     return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
 
 
+def observed_table(store: Results) -> Table | None:
+    """What was seen beside the force of each record, and how far its prediction is off; None: nothing."""
+    rows = tuple(_observed_row(row, one) for row in store.predicted for one in row.get("observed") or ())
+    if not rows:
+        return None
+    caption = (
+        "What was seen beside the force: compression of tissues by ultrasound through the indenter, "
+        "displacement of the skin around it. Errors are mean absolute ones in percent of the largest value."
+    )
+    head = ("Record", "Seen", "Use", "Compared", "Left out", "Largest (mm)", "Noise (mm)", "Error (%)")
+    return Table("observed", caption, head, rows)
+
+
+def _observed_row(row: Json, one: Json) -> Row:
+    left_out = ", ".join(f"{number} {why}" for why, number in (one.get("left_out") or {}).items())
+    return Row(
+        (
+            heading(str(row["record"])),
+            Cell(str(one["what"])),
+            Cell("fitted" if row.get("fitted") else "held out"),
+            Cell(str(one["compared"])),
+            Cell(left_out or NOTHING),
+            numeric(fixed(one["largest_mm"], 2)),
+            numeric(fixed(one["noise_mm"], 3)),
+            numeric(fixed(one["error_percent"])),
+        ),
+        marked=bool(row.get("fitted")),
+    )
+
+
 def noise_and_misfit(sites: Json) -> str:
     """Standard deviations of each fitted record's noise and of the model's misfit, in words."""
     rows = [(name, one.get("noise_sd_N"), one.get("misfit_sd_N"), one) for name, one in sites.items()]

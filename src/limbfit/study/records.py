@@ -11,6 +11,8 @@ from pydantic import Field, field_validator, model_validator
 from .tables import Positive, TomlTable, Vector
 
 Control = Literal["displacement", "force"]
+Frame = Literal["limb", "site"]
+RECORDED = ("trace", "ultrasound", "surface")  # files of a record
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
@@ -21,6 +23,8 @@ class _Stated(TomlTable):
     them. ``indenter`` is a name in ``[indenters]``; None: the one of ``[indenter]``. ``control`` is what was
     stated to the machine, and drives the model; the other is compared. ``ultrasound`` is a file of what
     ultrasound through the indenter saw meanwhile: the thickness of tissues, read to ``ultrasound_sd_mm``.
+    ``surface`` is one of how the skin around the indenter moved, to ``surface_sd_mm``; positions and
+    displacements in ``surface_frame``: that of the limb, or of the site's indenter.
     """
 
     name: str = Field(pattern=_NAME)
@@ -31,6 +35,9 @@ class _Stated(TomlTable):
     control: Control = "displacement"
     ultrasound: Path | None = None
     ultrasound_sd_mm: Positive = 0.1
+    surface: Path | None = None
+    surface_sd_mm: Positive = 0.05
+    surface_frame: Frame = "limb"
 
     @model_validator(mode="after")
     def _in_order(self) -> _Stated:
@@ -62,7 +69,7 @@ class Site(_Stated):
     def _one_place(self) -> Site:
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
-        for key in ("touch_down_s", "peak_s", "ultrasound"):
+        for key in ("touch_down_s", "peak_s", "ultrasound", "surface"):
             if self.trace is None and getattr(self, key) is not None:
                 raise ValueError(f"{key} belongs to a record, and the site has no trace")
         return self
@@ -110,11 +117,19 @@ class Record:
     hold_s: float | None = None
     ultrasound: Path | None = None
     ultrasound_sd_mm: float = 0.1
+    surface: Path | None = None
+    surface_sd_mm: float = 0.05
+    surface_frame: Frame = "limb"
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What was recorded: the trace, and what ultrasound saw meanwhile."""
-        return (self.trace,) if self.ultrasound is None else (self.trace, self.ultrasound)
+        """What was recorded: the trace, and what ultrasound and cameras saw meanwhile."""
+        return tuple(file for key in RECORDED if (file := getattr(self, key)) is not None)
+
+    @property
+    def observed(self) -> str:
+        """What there is beside the force, in a word; empty where there is nothing."""
+        return "ultrasound" if self.ultrasound else "surface displacement" if self.surface else ""
 
     @property
     def forced(self) -> bool:
@@ -167,6 +182,9 @@ def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...
                 len(stated),
                 ultrasound=one.ultrasound,
                 ultrasound_sd_mm=one.ultrasound_sd_mm,
+                surface=one.surface,
+                surface_sd_mm=one.surface_sd_mm,
+                surface_frame=one.surface_frame,
             )
             if isinstance(one, RecordTable):
                 depth, speed, hold = one.depth_mm, one.speed_mm_s, one.hold_s

@@ -128,8 +128,8 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("calibration.force_error_percent",),
-        lambda s: not s.priors and not any(record.ultrasound for record in s.recorded),
-        "it sets forces against priors and ultrasound, and there is neither",
+        lambda s: not s.priors and not any(record.observed for record in s.recorded),
+        "it sets forces against priors and what is seen beside them, and there is neither",
     ),
     Vain(
         ("calibration.prior_tissues",),
@@ -225,6 +225,8 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
     ),
     VainOfSite("control", lambda s, site: site.trace is None, "it is of the site's trace, and there is none"),
     VainOfSite("ultrasound_sd_mm", lambda s, site: site.ultrasound is None, "the site has no ultrasound"),
+    VainOfSite("surface_sd_mm", lambda s, site: site.surface is None, "the site has no surface"),
+    VainOfSite("surface_frame", lambda s, site: site.surface is None, "the site has no surface"),
     VainOfSite(
         "indenter",
         lambda s, site: site.trace is None and bool(s.records_at(site)),
@@ -233,7 +235,10 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
     ),
     VainOfSite(
         "edge",
-        lambda s, site: all(SHAPES[one.shape].is_round for one in s.indenters_at(site)),
+        lambda s, site: (
+            all(SHAPES[one.shape].is_round for one in s.indenters_at(site))
+            and not any(one.surface and one.surface_frame == "site" for one in s.records_at(site))
+        ),
         "the indenter is round",
     ),
 )

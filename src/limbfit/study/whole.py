@@ -28,7 +28,7 @@ from .acquisition import AcquireTable
 from .clamps import ClampsTable
 from .material import MaterialTable
 from .meshing import MeshTable, stated_widths, with_edges
-from .records import Indentation, Record, RecordTable, Site, records_of
+from .records import RECORDED, Indentation, Record, RecordTable, Site, records_of
 from .socket import SocketTable
 from .tables import (
     CalibrationTable,
@@ -216,8 +216,7 @@ class Study(TomlTable):
             **{f"geometry.regions.{one.name}.surface": one.surface for one in self.geometry.regions},
             **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},
-            **{f"{record.key}.trace": record.trace for record in self.recorded},
-            **{f"{record.key}.ultrasound": record.ultrasound for record in self.recorded},
+            **{f"{one.key}.{key}": getattr(one, key) for one in self.recorded for key in RECORDED},
         }
         if self.image is not None:
             named |= {"image.path": self.image.path, "image.markers": self.image.marked}
@@ -305,7 +304,7 @@ class Study(TomlTable):
         if self.calibration.objective != "paper":
             return self
         for record in self.recorded:
-            why = 'control = "force"' if record.forced else "ultrasound" if record.ultrasound else ""
+            why = 'control = "force"' if record.forced else record.observed
             if why:
                 raise ValueError(
                     f'{record.name}: {why} compares depths, and objective = "paper" adds squares of '
@@ -325,9 +324,9 @@ class Study(TomlTable):
 
     @model_validator(mode="after")
     def _stretched_unseen(self) -> Study:
-        seen = [record.name for record in self.recorded if record.ultrasound is not None]
+        seen = [record for record in self.recorded if record.observed]
         if self.material.prestretch and seen:
-            why = f"{seen[0]} has ultrasound, which sees no pre-stretch"
+            why = f"{seen[0].name} has {seen[0].observed}, which sees no pre-stretch"
             raise ValueError(f"material.prestretch: {why}; leave it out")
         return self
 

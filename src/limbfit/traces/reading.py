@@ -36,9 +36,14 @@ def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Tra
 
 
 def read_columns(
-    file: Path, columns: Sequence[str], wanted: Callable[[str], bool] = lambda name: False
+    file: Path,
+    columns: Sequence[str],
+    wanted: Callable[[str], bool] = lambda name: False,
+    gaps: bool = False,
 ) -> dict[str, Array]:
     """The named columns of a file that `read_trace` could read, and all others that are ``wanted``.
+
+    With ``gaps`` an empty cell of a table is nan.
 
     Raises
     ------
@@ -47,8 +52,11 @@ def read_columns(
     """
     if not file.is_file():
         raise TraceError("no such file", file=file)
-    read = _read_mat if file.suffix.lower() == ".mat" else _read_table
-    return {name: np.asarray(c, dtype=np.float64) for name, c in read(file, columns, wanted).items()}
+    if file.suffix.lower() == ".mat":
+        found = _read_mat(file, columns, wanted)
+    else:
+        found = _read_table(file, columns, wanted, "nan" if gaps else "")
+    return {name: np.asarray(c, dtype=np.float64) for name, c in found.items()}
 
 
 def _chosen(
@@ -60,7 +68,9 @@ def _chosen(
     return [*columns, *(name for name in known if wanted(name) and name not in columns)]
 
 
-def _read_table(file: Path, columns: Sequence[str], wanted: Callable[[str], bool]) -> dict[str, Array]:
+def _read_table(
+    file: Path, columns: Sequence[str], wanted: Callable[[str], bool], empty: str
+) -> dict[str, Array]:
     with file.open("rb") as stream:
         if b"\0" in stream.read(4096):
             raise TraceError("not a text table", file=file, remedy="give CSV with one header line, or MAT")
@@ -74,7 +84,7 @@ def _read_table(file: Path, columns: Sequence[str], wanted: Callable[[str], bool
     header = numbered[0][1]
     delimiter = max("\t;,", key=header.count)
     names = [name.strip().strip('"') for name in header.split(delimiter)]
-    cells = [(i, line.split(delimiter)) for i, line in numbered[1:]]
+    cells = [(i, [cell.strip() or empty for cell in line.split(delimiter)]) for i, line in numbered[1:]]
     if delimiter != ",":
         cells = [(i, [cell.replace(",", ".") for cell in row]) for i, row in cells]
     chosen = _chosen(names, columns, wanted, file)

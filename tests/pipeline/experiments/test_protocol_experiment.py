@@ -105,7 +105,21 @@ def test_what_cannot_be_planned_is_one_line(found) -> None:
 
 
 def test_it_is_in_the_report(found) -> None:
-    study, content = found
+    study, _ = found
+    content = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0, 10), draws=1)
     text = Path(limbfit.report_study(study)["report"]).read_text()
     assert "Which records to make" in text
     assert content["verdict"].split(";")[0] in text
+
+
+@pytest.mark.slow
+def test_cameras_tell_more_in_the_same_time(found) -> None:
+    study, content = found
+    seen = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0,), draws=1, surface_sd_mm=0.05)
+    rows = {row["design"]: row for row in seen["protocols"]}
+    assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
+    plain = {row["design"]: row for row in content["protocols"]}[PLAIN]
+    assert rows[PLAIN]["factor_95"] == pytest.approx(plain["factor_95"], rel=1e-6)
+    (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
+    assert (record["surface"], record["surface_sd_mm"]) == ("records/1-1-surface.csv", 0.05)
+    assert "ultrasound" not in record

@@ -22,7 +22,7 @@ from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.layer_figures import layer_figure
+from limbfit.report.drawing.observed_figures import layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study, load_study
 from limbfit.traces import Layers, read_layers, thinnings
@@ -75,19 +75,19 @@ def test_compressions_follow_the_parameters(tmp_path: Path) -> None:
     tissues, vector = layered.TISSUES, to_vector(layered.TRUTH, layered.TISSUES)
     times = tuple(np.linspace(0.2, 3.5, 12))
     found = simulate(SimulationJob(model, tissues, tuple(vector), times))
-    assert found.compression_mm.shape == (3, 12)
-    assert found.compression_jacobian is not None
+    assert found.observed_mm.shape == (3, 12)
+    assert found.observed_jacobian is not None
     depth = np.interp(times, model.knots_s, model.knots_mm)
     loading = np.array(times) < 2.0
-    assert found.compression_mm.sum(axis=0)[loading] == pytest.approx(depth[loading], rel=0.08)
-    assert (found.compression_mm[0] > 0.0).any()
+    assert found.observed_mm.sum(axis=0)[loading] == pytest.approx(depth[loading], rel=0.08)
+    assert (found.observed_mm[0] > 0.0).any()
     for i in (0, 4, 9):  # the skin's and the fat's modulus, the muscle's exponent
         step = 1e-3 * vector[i] * np.eye(len(vector))[i]
         ends = [
             simulate(SimulationJob(model, tissues, tuple(vector + s), times, False)) for s in (step, -step)
         ]
-        slope = (ends[0].compression_mm - ends[1].compression_mm) / (2e-3 * vector[i])
-        assert found.compression_jacobian[:, :, i] == pytest.approx(slope, abs=5e-3 * np.abs(slope).max())
+        slope = (ends[0].observed_mm - ends[1].observed_mm) / (2e-3 * vector[i])
+        assert found.observed_jacobian[:, :, i] == pytest.approx(slope, abs=5e-3 * np.abs(slope).max())
 
 
 def table(folder: Path, head: str, rows: np.ndarray) -> Path:
@@ -180,7 +180,7 @@ def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
         made.write(study.path(Path("a.csv")))
         layers = {
             tissue: (thick, lambda t, lost=lost: np.interp(t, times, lost))
-            for tissue, thick, lost in zip(study.tissues, BLOCK, found.compression_mm, strict=True)
+            for tissue, thick, lost in zip(study.tissues, BLOCK, found.observed_mm, strict=True)
         }
         write_ultrasound(folder / "a-layers.csv", made, layers, random)
 
@@ -225,7 +225,7 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
     last = found["stages"][-1]["iterations"][-1]
     assert list(last["error_percent_by_site"]) == ["a", "a+skin", "a+muscle"]
     (row,) = context.store.read("predict", "predict.json")["sites"]
-    assert {one["tissue"]: one["thickness_mm"] for one in row["layers"]} == pytest.approx(
+    assert {one["what"]: one["thickness_mm"] for one in row["observed"]} == pytest.approx(
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )
     assert (context.store["predict"] / "a+muscle.csv").is_file()

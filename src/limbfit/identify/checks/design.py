@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz
+from scipy.linalg import solve_toeplitz, toeplitz
 
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
@@ -86,6 +86,23 @@ def information_of(response: SiteResponse, parameters: Array, noise: NoiseModel)
     scaled = response.jacobian * parameters
     information = scaled.T @ solve_toeplitz(noise.row(response.force_N), scaled)
     return np.asarray((information + information.T) / 2)
+
+
+def information_of_field(
+    values: Array, slopes: Array, alike: Array, parameters: Array, noise: NoiseModel
+) -> Array:
+    """Fisher information (p, p) on log(parameters) of a field: curves ``values`` (g, n) of one record.
+
+    Its misfit is a share of the largest value of all, and between curves ``alike`` (g, g); ``slopes``
+    (g, n, p) are derivatives.
+    """
+    n = values.shape[1]
+    across, U = np.linalg.eigh(alike)
+    along, V = np.linalg.eigh(toeplitz(noise.correlation ** np.arange(n)))
+    rotated = np.einsum("ga,gnp,nb->abp", U, slopes * parameters, V, optimize=True)
+    misfit = noise.misfit * float(np.abs(values).max())
+    variances = noise.sensor_N**2 + misfit**2 * np.outer(across, along).clip(0.0)
+    return np.einsum("abp,abq->pq", rotated / variances[..., None], rotated)
 
 
 def prior_information(unknowns: Unknowns) -> Array:

@@ -102,7 +102,7 @@ class Sites:
 
     def __init__(self, simulate: Simulate, measured: Sequence[Measured], start: Array) -> None:
         self.simulate, self.measured, self.start = simulate, tuple(measured), start
-        self.peaks = [float(site.force_N.max()) for site in measured]
+        self.peaks = [site.peak_N for site in measured]
         self._fits: dict[tuple[int, ...], Array] = {}
 
     def without(self, *left: int) -> Array:

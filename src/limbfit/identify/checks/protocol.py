@@ -10,20 +10,69 @@ Science 1995, 10:273).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 
 from ...errors import CalibrationError
+from ..fit.objective import SiteResponse
 from ..fit.parameters import Unknowns
+from ..uncertainty.noise import alike_on_skin
 from ..uncertainty.uncertainty import NORMAL_95
-from .design import Criterion
+from .design import Criterion, NoiseModel, information_of, information_of_field
 
 Array = NDArray[np.float64]
 
 _LARGEST_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), however little is known
+
+
+@dataclass(frozen=True)
+class Noises:
+    """Of a record's force, of the compressions that ultrasound sees and of the moves that cameras see.
+
+    None where there is none.
+    """
+
+    force: NoiseModel
+    layers: NoiseModel | None
+    skin: NoiseModel | None
+
+    @classmethod
+    def of(cls, force: NoiseModel, ultrasound_sd_mm: float | None, surface_sd_mm: float | None) -> Noises:
+        """One reading at each point of comparison; the model errs by the same share as of the force."""
+        found = [
+            None if sd is None else replace(force, sensor_N=sd) for sd in (ultrasound_sd_mm, surface_sd_mm)
+        ]
+        return cls(force, *found)
+
+    @property
+    def sees_more(self) -> bool:
+        """Whether there is anything beside the force."""
+        return self.layers is not None or self.skin is not None
+
+    def of_force(self, force: SiteResponse, parameters: Array) -> Array:
+        """Information (p, p) of a record's force."""
+        return information_of(force, parameters, self.force)
+
+    def of_all(
+        self, force: SiteResponse, values: Array, slopes: Array, points_mm: Array, parameters: Array
+    ) -> Array:
+        """Information (p, p) of a record with ``values`` (g, n) mm beside its force, ``slopes`` (g, n, p).
+
+        Values are those of layers, then of three components of each of ``points_mm`` (k, 3) on the skin.
+        """
+        found, layers = self.of_force(force, parameters), len(values) - 3 * len(points_mm)
+        if self.layers is not None:
+            for lost, of_layer in zip(values[:layers], slopes[:layers], strict=True):
+                found = found + information_of(SiteResponse(lost, of_layer), parameters, self.layers)
+        if self.skin is not None and len(points_mm):
+            components = np.tile(range(3), len(points_mm))
+            alike = alike_on_skin(np.repeat(points_mm, 3, axis=0), components)
+            skin = values[layers:], slopes[layers:]
+            found = found + information_of_field(*skin, alike, parameters, self.skin)
+        return found
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,18 @@ Objective = Literal["pointwise", "paper"]
 _EXACT = 1e-4  # of the largest force: where all residuals vanish, equation 8 squared has no curvature
 
 
+def largest(values: Array) -> float:
+    """The largest of values (n,) without its sign."""
+    return float(np.abs(values).max())
+
+
 @dataclass(frozen=True)
 class Measured:
     """A record at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost.
 
     ``site`` is where it is from, the same for all records of a site; by default its own. Under a stated
-    force the depth is compared: ``force_N`` is that, and ``unit`` mm. ``doubt_N`` (n,) is one standard
+    force the depth is compared: ``force_N`` is that, and ``unit`` mm; so are lengths that are seen beside the
+    force, of either sign. ``doubt_N`` (n,) is one standard
     deviation of what its touch-down may have done to it, beside which it may be off by ``error_share`` of its
     largest force throughout.
     """
@@ -42,8 +48,13 @@ class Measured:
     error_share: float = 0.01
 
     def __post_init__(self) -> None:
-        if self.force_N.size < 2 or not np.all(np.isfinite(self.force_N)) or self.force_N.max() <= 0:
+        if self.force_N.size < 2 or not np.all(np.isfinite(self.force_N)) or not self.peak_N > 0.0:
             raise TraceError("no measured force to compare with", place=self.name)
+
+    @property
+    def peak_N(self) -> float:
+        """The largest force, or whatever is compared, without its sign."""
+        return largest(self.force_N) if self.unit == "mm" else float(self.force_N.max())
 
     @property
     def where(self) -> str:
@@ -53,14 +64,14 @@ class Measured:
     @property
     def scale(self) -> float:
         """1 / (largest force x sqrt(n)), times the root of the weight."""
-        return float(np.sqrt(self.weight / self.force_N.size) / self.force_N.max())
+        return float(np.sqrt(self.weight / self.force_N.size) / self.peak_N)
 
     def discounted(self, rows: Array, power: float = 0.5) -> Array:
         """Rows (n, ...) times a power of the inverse covariance that the touch-down's doubt alone gives."""
         if self.doubt_N is None or not (size := float(np.linalg.norm(self.doubt_N))):
             return rows
         shape = self.doubt_N / size
-        variance = 1.0 + (size / self.force_N.max() / self.error_share) ** 2 / self.force_N.size
+        variance = 1.0 + (size / self.peak_N / self.error_share) ** 2 / self.force_N.size
         return np.asarray(rows - np.multiply.outer(shape, (1.0 - variance**-power) * (shape @ rows)))
 
     def curvature(self, objective: Objective, difference_N: Array) -> Array:
@@ -73,7 +84,7 @@ class Measured:
         n = difference_N.size
         if objective == "pointwise":
             return self.scale**2 * self.discounted(np.eye(n), power=1.0)
-        square = max(float(difference_N @ difference_N), n * (_EXACT * float(self.force_N.max())) ** 2)
+        square = max(float(difference_N @ difference_N), n * (_EXACT * self.peak_N) ** 2)
         both = square * np.eye(n) + 2 * np.outer(difference_N, difference_N)
         return np.asarray(2 * (self.weight / n) ** 2 * both)
 

@@ -10,12 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from .objective import largest
+
 Array = NDArray[np.float64]
 
 
 def error_percent(simulated_N: Array, measured_N: Array) -> float:
-    """Mean absolute error over the trace over the largest measured force, in percent (paper, table 2)."""
-    return float(100 * np.mean(np.abs(simulated_N - measured_N)) / np.max(measured_N))
+    """Mean absolute error over the trace over the largest measured force, in percent (paper, table 2).
+
+    Of lengths, which may be negative, over the largest without its sign.
+    """
+    return float(100 * np.mean(np.abs(simulated_N - measured_N)) / largest(measured_N))
 
 
 @dataclass(frozen=True)

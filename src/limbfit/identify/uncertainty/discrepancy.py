@@ -32,8 +32,11 @@ _ALIKE = 0.5  # sd of log(sd) between sites: a site with a lucky fit is not trus
 
 
 def matern(times_s: Array, correlation: float) -> Array:
-    """Matern 3/2 correlation (n, n); ``correlation`` is its length over the length of the record."""
-    share = times_s / (correlation * np.ptp(times_s))
+    """Matern 3/2 correlation (n, n); ``correlation`` is its length over the length of the record.
+
+    Times that are all the same are fully correlated.
+    """
+    share = times_s / (correlation * (np.ptp(times_s) or 1.0))
     distance = np.sqrt(3.0) * np.abs(share[:, None] - share[None, :])
     return (1 + distance) * np.exp(-distance)
 
@@ -134,7 +137,10 @@ class ResidualModel:
 
     def discrepancy(self, i: int) -> Array:
         """Covariance (n, n) of the misfit of record i."""
-        return (self.misfit[i] * self.peaks_N[i]) ** 2 * matern(self.noise[i].times_s, self.correlation)
+        noise = self.noise[i]
+        shape = matern(noise.times_s, self.correlation)
+        shape = shape if noise.alike is None else shape * noise.alike
+        return (self.misfit[i] * self.peaks_N[i]) ** 2 * shape
 
     def covariance(self, i: int) -> Array:
         """Covariance (n, n) of the residuals of record i."""

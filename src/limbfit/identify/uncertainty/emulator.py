@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError
-from ..fit.objective import SiteResponse
+from ..fit.objective import SiteResponse, largest
 from ..fit.prediction import error_percent
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ class Emulator:
         forces = np.array([np.concatenate([r.force_N for r in run]) for run in runs])
         slopes = np.array([np.concatenate([r.jacobian for r in run]) for run in runs])
         sites = _slices([r.force_N.size for r in runs[0]])
-        peaks = np.array([[f[s].max() for s in sites] for f in forces])
+        peaks = np.array([[largest(f[s]) for s in sites] for f in forces])
         middle = softening * np.maximum(np.median(peaks, axis=0), 1e-9)
         soft = np.concatenate([np.full(s.stop - s.start, v) for s, v in zip(sites, middle)])
         centre, width = _box(np.log(points))
@@ -144,7 +144,7 @@ class Emulator:
     def error_percent(self, parameters: Array) -> Array:
         """Expected error of the emulator itself (sites,), in percent of the largest force: one sd."""
         force, doubt = (found[0] for found in self.forces_and_doubt(np.asarray(parameters)))
-        return np.array([100 * sd / max(force[s].max(), 1e-12) for sd, s in zip(doubt, self._sites)])
+        return np.array([100 * sd / max(largest(force[s]), 1e-12) for sd, s in zip(doubt, self._sites)])
 
     def inside(self, parameters: Array, margin: float = 0.1) -> bool:
         """Whether the parameters (p,) lie in the box of the points, widened by a share of its width."""

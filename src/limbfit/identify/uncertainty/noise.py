@@ -19,6 +19,7 @@ from ..fit.objective import Measured, SiteResponse
 
 Array = NDArray[np.float64]
 
+ALIKE_MM = 10.0  # over which a misfit of the skin's moves goes from one point to the next
 _LEAST_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
 
 
@@ -29,7 +30,8 @@ class SiteNoise:
     ``covariance`` (n, n) N^2; ``sd_N`` and ``autocorrelation`` of neighbours are those of the samples as
     recorded; ``touch_down_mm`` is the standard deviation of the touch-down that is part of the covariance.
     ``unit`` is mm, and all of it, where depths are compared. ``site``: where the record is from, by default
-    its own.
+    its own. ``alike`` (n, n) is how far a misfit of the model is the same for values of one time, as of
+    points that are near each other; none: all the same.
     """
 
     name: str
@@ -40,11 +42,21 @@ class SiteNoise:
     touch_down_mm: float = 0.0
     unit: str = "N"
     site: str = ""
+    alike: Array | None = None
 
     @property
     def where(self) -> str:
         """What records of one site have in common."""
         return self.site or self.name
+
+
+def alike_on_skin(points_mm: Array, components: NDArray[np.int64]) -> Array:
+    """`SiteNoise.alike` of moves of ``points_mm`` (n, 3) along ``components`` (n,): within `ALIKE_MM`.
+
+    Each component has a misfit of its own.
+    """
+    apart = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
+    return np.asarray(np.exp(-apart / ALIKE_MM) * (components[:, None] == components[None]))
 
 
 def record_noise(

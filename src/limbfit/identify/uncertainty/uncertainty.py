@@ -117,7 +117,7 @@ def estimate_uncertainty(
     scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
     z = space.reduce(np.log(parameters))
     prior = Beliefs.of(unknowns, space)
-    peaks = np.array([site.force_N.max() for site in measured])
+    peaks = np.array([site.peak_N for site in measured])
     model = estimate_discrepancy(left, scaled, noise, peaks, prior.precision, mesh_N, site_N)
     chosen = settings or CalibrationSettings()
     weights = [one.curvature(chosen.objective, r) for r, one in zip(left, measured, strict=True)]

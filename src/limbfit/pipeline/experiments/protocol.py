@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError
-from ...identify.checks.design import NoiseModel, information_of
+from ...identify.checks.design import NoiseModel
 from ...identify.checks.design import prior_information as bounds_information
-from ...identify.checks.protocol import Budget, Option, Wanted, drawn, factors_95, plan, seconds_of
+from ...identify.checks.protocol import Budget, Noises, Option, Wanted, drawn, factors_95, plan, seconds_of
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...indentation import Parameters, Simulation, SiteModel, layers_under
+from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, layers_under, skin_beside
 from ...study import Site
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
@@ -30,7 +30,7 @@ from .design import DEEPEST_SHARE
 Array = NDArray[np.float64]
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
-DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "without ultrasound"
+DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
 
 
 @dataclass(frozen=True)
@@ -77,26 +77,29 @@ def run_protocol(
     parameters_from: str,
     noise: dict[str, float],
     ultrasound_sd_mm: float | None,
+    surface_sd_mm: float | None,
     pressures: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
     """Simulate every possible record at every draw, with derivatives, and choose within the time.
 
-    ``ultrasound_sd_mm``: how well ultrasound through the indenter reads a thickness; None: there is none.
-    ``pressures``: derivatives (p,) of their logarithms by those of the parameters; none: parameters count.
+    ``ultrasound_sd_mm``: how well ultrasound through the indenter reads a thickness, ``surface_sd_mm``: how
+    well cameras read the moves of the skin around it; None: there is none. ``pressures``: derivatives (p,) of
+    their logarithms by those of the parameters; none: parameters count.
     """
     study = context.study
     known = unknowns(study)
     which = _named(known, determine)
     rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
     tissues = drawn(known, study.vector(parameters), draws, seed)
-    planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, ultrasound_sd_mm is not None)
-    noises = Noises(NoiseModel(**noise), _of_ultrasound(noise, ultrasound_sd_mm))
+    seen = {"ultrasound_sd_mm": ultrasound_sd_mm, "surface_sd_mm": surface_sd_mm}
+    noises = Noises.of(NoiseModel(**noise), **seen)
+    planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, noises)
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     budget = Budget(60.0 * minutes, setup_s)
     wanted = Wanted(bounds_information(known), rows, "A" if criterion == "A" else "D")
-    plans, told_by = _plans_told(found, options, None if ultrasound_sd_mm is None else blind, budget, wanted)
+    plans, told_by = _plans_told(found, options, blind if noises.sees_more else None, budget, wanted)
     told = [
         _row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
         for name, chosen in plans.items()
@@ -117,11 +120,11 @@ def run_protocol(
         "parameters": parameters,
         "parameters_from": parameters_from,
         "noise": noise,
-        "ultrasound_sd_mm": ultrasound_sd_mm,
+        **seen,
     }
     write_json(folder / "protocol.json", content)
     _write_tables(folder, content)
-    _write_records(folder / "records.toml", content["records"], ultrasound_sd_mm)
+    _write_records(folder / "records.toml", content["records"], seen)
     return {}
 
 
@@ -144,7 +147,7 @@ def _plans_told(
     budget: Budget,
     wanted: Wanted,
 ) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[Option]]]:
-    """The plans by name, and what their records tell; ``blind``: without ultrasound, where there is any."""
+    """The plans by name, and what their records tell; ``blind``: by force alone, if more is seen."""
     plans = _plans(found, options, budget, wanted)
     if DESIGNED not in plans:
         least = min(seconds_of(options, [i], budget) for i in range(len(options)))
@@ -161,25 +164,12 @@ def _plans_told(
     return plans, told_by
 
 
-@dataclass(frozen=True)
-class Noises:
-    """Of a record's force, and of the compressions that ultrasound sees; None where there is none."""
-
-    force: NoiseModel
-    layers: NoiseModel | None
-
-
-def _of_ultrasound(noise: Mapping[str, float], sd_mm: float | None) -> NoiseModel | None:
-    """One reading at each point of comparison; the model errs by the same share as of the force."""
-    return None if sd_mm is None else NoiseModel(**{**noise, "sensor_N": sd_mm})
-
-
 def _planned(
     context: Context,
     speeds_mm_s: Sequence[float],
     holds_s: Sequence[float],
     depth_mm: float | None,
-    ultrasound: bool,
+    noises: Noises,
 ) -> tuple[list[Planned], list[str]]:
     """Every site with every indenter, speed and hold, as deep as it was recorded, planned or asked for."""
     study, found, left_out = context.study, [], []
@@ -192,8 +182,10 @@ def _planned(
         wanted = depth_mm or deepest[site.name]
         for name in study.all_indenters:
             model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, wanted), searched=True)
-            if ultrasound:
+            if noises.layers is not None:
                 model = replace(model, layers=layers_under(model))
+            if noises.skin is not None:
+                model = replace(model, skin_points=skin_beside(model))
             thickness = tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
             depth = min(wanted, DEEPEST_SHARE * thickness)
             if depth < wanted:
@@ -228,8 +220,8 @@ def _options(
     rest_s: float,
     left_out: list[str],
 ) -> tuple[list[Planned], list[Option], list[Option], list[float]]:
-    """What each record would tell at each draw, and without ultrasound: nothing where its simulation does
-    not come to its end.
+    """What each record would tell at each draw, and its force alone: nothing where its simulation does not
+    come to its end.
 
     Records that press harder than the device may at the first draw are left out.
     """
@@ -245,7 +237,7 @@ def _options(
         if draw == 0:
             peaks[k] = simulation.force_N.max()
         if simulation.completed:
-            infos[:, k, draw] = _told_by(simulation, np.array(job.parameters), noise)
+            infos[:, k, draw] = _told_by(job, simulation, noise)
         else:
             failed[k] += 1
     kept = []
@@ -265,16 +257,16 @@ def _options(
     return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
 
 
-def _told_by(simulation: Simulation, parameters: Array, noise: Noises) -> tuple[Array, Array]:
-    """The information (p, p) of a record with what ultrasound sees, and of its force alone."""
+def _told_by(job: SimulationJob, simulation: Simulation, noises: Noises) -> tuple[Array, Array]:
+    """The information (p, p) of a record with what is seen beside its force, and of its force alone."""
     assert simulation.jacobian is not None
-    force = information_of(SiteResponse(simulation.force_N, simulation.jacobian), parameters, noise.force)
-    every = force
-    if noise.layers is not None:
-        assert simulation.compression_jacobian is not None
-        for lost, slopes in zip(simulation.compression_mm, simulation.compression_jacobian, strict=True):
-            every = every + information_of(SiteResponse(lost, slopes), parameters, noise.layers)
-    return every, force
+    parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
+    force = SiteResponse(simulation.force_N, simulation.jacobian)
+    if not noises.sees_more:
+        return (alone := noises.of_force(force, parameters)), alone
+    assert simulation.observed_jacobian is not None
+    beside = simulation.observed_mm, simulation.observed_jacobian
+    return noises.of_all(force, *beside, points, parameters), noises.of_force(force, parameters)
 
 
 def _plans(
@@ -374,7 +366,7 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     write_table(folder / "protocols.csv", heads, rows)
 
 
-def _write_records(file: Path, records: Sequence[Mapping[str, Any]], ultrasound_sd_mm: float | None) -> None:
+def _write_records(file: Path, records: Sequence[Mapping[str, Any]], seen: Mapping[str, Any]) -> None:
     """The tables ``[[records]]`` of a study that makes them."""
     tables, number = tomlkit.aot(), dict.fromkeys((row["site"] for row in records), 0)
     for row in records:
@@ -384,9 +376,10 @@ def _write_records(file: Path, records: Sequence[Mapping[str, Any]], ultrasound_
         table.update({"site": row["site"], "name": name, "trace": f"records/{row['site']}-{name}.csv"})
         if row["indenter"] != "indenter":
             table["indenter"] = row["indenter"]
-        if ultrasound_sd_mm is not None:
-            table["ultrasound"] = f"records/{row['site']}-{name}-layers.csv"
-            table["ultrasound_sd_mm"] = ultrasound_sd_mm
+        for key, end in (("ultrasound", "layers"), ("surface", "surface")):
+            if seen[f"{key}_sd_mm"] is not None:
+                table[key] = f"records/{row['site']}-{name}-{end}.csv"
+                table[f"{key}_sd_mm"] = seen[f"{key}_sd_mm"]
         table.update({key: round(row[key], 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
         tables.append(table)
     document = tomlkit.document()

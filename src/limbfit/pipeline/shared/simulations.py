@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from .artefacts import atomic, digest, file_digest
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS
+from .surface_points import ChosenPoints, chosen_points, read_motion
 
 Array = NDArray[np.float64]
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
@@ -99,10 +100,10 @@ class SimulationCache:
             arrays = {"force_N": simulation.force_N}
             if simulation.jacobian is not None:
                 arrays["jacobian"] = simulation.jacobian
-            if simulation.compression_mm.size:
-                arrays["compression_mm"] = simulation.compression_mm
-            if simulation.compression_jacobian is not None:
-                arrays["compression_jacobian"] = simulation.compression_jacobian
+            if simulation.observed_mm.size:
+                arrays["observed_mm"] = simulation.observed_mm
+            if simulation.observed_jacobian is not None:
+                arrays["observed_jacobian"] = simulation.observed_jacobian
             facts = {
                 "site": simulation.site,
                 "completed": simulation.completed,
@@ -119,8 +120,8 @@ def _lost(job: SimulationJob, reason: str) -> Simulation:
     n, site = len(job.times_s), job.model.name
     slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
     facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
-    nothing = np.zeros((len(job.model.layers), n))
-    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, compression_mm=nothing)
+    nothing = np.zeros((job.model.gauges, n))
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, observed_mm=nothing)
 
 
 def _load(file: Path) -> Simulation:
@@ -132,8 +133,8 @@ def _load(file: Path) -> Simulation:
             force_N=stored["force_N"],
             jacobian=jacobian,
             doubts=doubts,
-            compression_mm=stored.get("compression_mm", np.zeros((0, 0))),
-            compression_jacobian=stored.get("compression_jacobian"),
+            observed_mm=stored.get("observed_mm", np.zeros((0, 0))),
+            observed_jacobian=stored.get("observed_jacobian"),
             **facts,
         )
 
@@ -271,7 +272,29 @@ def recorded_model(context: Context, record: Record, searched: bool = False) -> 
     facts = context.stored("traces", "traces.json")["sites"][record.name]
     force = facts["knots_N"] if record.forced else ()
     layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
-    return site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
+    model = site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
+    points = surface_points(context, record)
+    return model if points is None else replace(model, skin_points=points.points, skin_axes=points.axes)
+
+
+def surface_points(context: Context, record: Record) -> ChosenPoints | None:
+    """The points of a record's surface that are compared, on the skin of the site's own mesh; None: nothing.
+
+    Raises
+    ------
+    TraceError
+        Where no point can be compared.
+    """
+    facts = context.stored("traces", "traces.json")["sites"][record.name].get("surface")
+    if facts is None or not facts["compared"]:
+        return None
+    (placed,) = (
+        row for row in context.stored("sites", "sites.json")["sites"] if row["site"] == record.site.name
+    )
+    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
+    place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    motion = read_motion(context.store["traces"], record)
+    return chosen_points(context.study, record, place, (mesh.points, mesh.face_sets["skin"]), motion)
 
 
 def planned_model(context: Context, site: Site) -> SiteModel:

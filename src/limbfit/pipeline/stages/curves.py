@@ -1,4 +1,4 @@
-"""Records to regularised curves, and what ultrasound saw beside them: the stage ``traces``."""
+"""Records to regularised curves, and what was seen beside them: the stage ``traces``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from ...study import Record, Study
 from ...traces import (
     Creep,
     Regularised,
+    SurfaceMotion,
     Thinning,
     TouchDown,
     Trace,
+    in_contact,
     read_layers,
+    read_surface_motion,
     read_trace,
     regularise,
     regularise_creep,
@@ -28,9 +31,11 @@ from ...traces import (
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS
+from ..shared.surface_points import write_motion
 from .files import LAYERS, SMOOTHING
 
-END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does not hold the layers
+END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does not hold the tissue
+SEEN = 3.0  # standard deviations that the skin must move by to be compared
 
 
 def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
@@ -98,35 +103,49 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
             force_N=even.force_N,
         )
         np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
-        if record.ultrasound is not None:
-            seen = read_thinnings(context.study, record, told["touch_down_s"], smooth)
-            told["layers"] = store_thinnings(folder, record, seen)
-            for one in seen:
-                if not one.is_seen:
-                    words = f"ultrasound of {record.name}: {one.tissue} hardly gives way, and is not compared"
-                    context.tell("traces", i, len(recorded), words)
+        seen = read_observed(context.study, record, trace, told["touch_down_s"], smooth)
+        told |= observed_facts(record, *seen)
+        store_observed(folder, record, *seen)
+        for what in not_compared(told):
+            words = f"site {record.name}, {what} hardly gives way, and is not compared"
+            context.tell("traces", i, len(recorded), words)
     write_json(folder / "traces.json", {"sites": facts})
     return {}
 
 
-def read_thinnings(
-    study: Study, record: Record, touch_down_s: float, smooth: Regularised
-) -> tuple[Thinning, ...]:
-    """How each tissue gives way while the record's force is 5 % of its largest or more.
+def read_observed(
+    study: Study, record: Record, trace: Trace, touch_down_s: float, smooth: Regularised
+) -> tuple[tuple[Thinning, ...], SurfaceMotion | None]:
+    """What was seen while the record's force is 5 % of its largest or more: layers, and the skin.
 
     Raises
     ------
     TraceError
         For a file that cannot be that, with the file, the place and the remedy.
     """
-    assert record.ultrasound is not None
-    file = study.path(record.ultrasound)
     pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
     end_s = touch_down_s + float(pressed[-1])
+    layers: tuple[Thinning, ...] = ()
+    motion = None
+    if record.ultrasound is not None:
+        layers = _read_thinnings(study, record, touch_down_s, end_s)
+    if record.surface is not None:
+        file = study.path(record.surface)
+        whole = read_surface_motion(file, study.traces.time_s)
+        times = float(trace.time_s[0]), float(trace.time_s[-1])
+        try:
+            motion = in_contact(whole, times, touch_down_s, end_s)
+        except TraceError as error:
+            raise TraceError(error.what, file=file, place=study.traces.time_s, remedy=error.remedy) from None
+    return layers, motion
+
+
+def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: float) -> tuple[Thinning, ...]:
+    assert record.ultrasound is not None
+    file = study.path(record.ultrasound)
     try:
-        found = thinnings(
-            read_layers(file, study.traces.time_s), touch_down_s, end_s, record.ultrasound_sd_mm
-        )
+        layers = read_layers(file, study.traces.time_s)
+        found = thinnings(layers, touch_down_s, end_s, record.ultrasound_sd_mm)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
     for one in found:
@@ -141,18 +160,48 @@ def read_thinnings(
     return found
 
 
-def store_thinnings(folder: Path, record: Record, found: Sequence[Thinning]) -> dict[str, Any]:
-    """Write the curves of a record's tissues; what ``traces.json`` says of them."""
-    columns = {f"{one.tissue}_mm": one.compression_mm for one in found}
-    file = folder / LAYERS.format(record.name)
-    write_curves(file, time_s=found[0].time_s, samples=found[0].samples, **columns)
-    return {
-        one.tissue: {
-            "thickness_mm": one.thickness_mm,
-            "compression_mm": float(one.compression_mm.max()),
-            "before": one.before,
-            "sd_mm": one.sd_mm,
-            "compared": one.is_seen,
+def observed_facts(
+    record: Record, layers: Sequence[Thinning], motion: SurfaceMotion | None
+) -> dict[str, Any]:
+    """What ``traces.json`` says of them."""
+    facts: dict[str, Any] = {}
+    if layers:
+        facts["layers"] = {
+            one.tissue: {
+                "thickness_mm": one.thickness_mm,
+                "compression_mm": float(one.compression_mm.max()),
+                "before": one.before,
+                "sd_mm": one.sd_mm,
+                "compared": one.is_seen,
+            }
+            for one in layers
         }
-        for one in found
-    }
+    if motion is not None:
+        frames, points, _ = motion.moved_mm.shape
+        facts["surface"] = {
+            "points": points,
+            "frames": frames,
+            "displacement_mm": motion.largest_mm,
+            "sd_mm": record.surface_sd_mm,
+            "compared": motion.largest_mm > SEEN * record.surface_sd_mm,
+        }
+    return facts
+
+
+def not_compared(facts: dict[str, Any]) -> tuple[str, ...]:
+    """What of the facts hardly moves, in words."""
+    layers = [f"ultrasound: {name}" for name, one in facts.get("layers", {}).items() if not one["compared"]]
+    still = "surface" in facts and not facts["surface"]["compared"]
+    return (*layers, *(["surface: the skin"] if still else []))
+
+
+def store_observed(
+    folder: Path, record: Record, layers: Sequence[Thinning], motion: SurfaceMotion | None
+) -> None:
+    """Write the curves of a record's tissues, and the moves of its surface."""
+    if layers:
+        columns = {f"{one.tissue}_mm": one.compression_mm for one in layers}
+        file = folder / LAYERS.format(record.name)
+        write_curves(file, time_s=layers[0].time_s, samples=layers[0].samples, **columns)
+    if motion is not None:
+        write_motion(folder, record, motion)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...identify.checks.plausibility import layer_factor
 from ...identify.fit.objective import SiteResponse
-from ...identify.uncertainty.noise import SiteNoise, depth_slope, record_noise
+from ...identify.uncertainty.noise import SiteNoise, record_noise
 from ...indentation import SiteModel, contact_radius
 from ...mesh import read_vtu
 from ...study import Study
@@ -39,9 +39,13 @@ def site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
     """Noise of a record at the times of comparison, its touch-down included.
 
     ``force_N`` (n,) is the simulated one: what a wrong touch-down does is told by its slope, which is smooth.
-    Under a stated force it is the depth, mm, and so is the noise; and so it is with what ultrasound saw.
+    Under a stated force it is the depth, mm, and so is the noise; and so it is with what is seen beside it.
     """
-    found = _curve_noise(study, record, force_N) if record.seen is None else _layer_noise(record, force_N)
+    if record.seen is None:
+        found = _curve_noise(study, record, force_N)
+    else:
+        depth = None if record.record.forced else record.displacement_mm
+        found = record.seen.noise(record.name, force_N, depth, record.touch_down_sd_mm)
     return replace(found, site=record.site.name)
 
 
@@ -63,21 +67,6 @@ def _curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
         record.touch_down_sd_mm,
         record.smoothing,
     )
-
-
-def _layer_noise(record: SiteRecord, compression_mm: Array) -> SiteNoise:
-    """Of a tissue's compression: by the readings, the thickness at rest, the touch-down.
-
-    ``compression_mm`` (n,) is the simulated one, along whose slope a wrong touch-down moves it, but under a
-    stated force.
-    """
-    assert record.seen is not None
-    seen, covariance, doubt = record.seen, record.seen.covariance, record.touch_down_sd_mm
-    if not record.record.forced:
-        moved = np.interp(seen.time_s, record.times_s, record.displacement_mm)
-        slope = doubt * depth_slope(seen.time_s, moved, compression_mm)
-        covariance = covariance + np.outer(slope, slope)
-    return SiteNoise(record.name, seen.time_s, covariance, seen.sd_mm, 0.0, doubt, "mm")
 
 
 def site_deviation(context: Context, record: SiteRecord, response: SiteResponse, parameters: Array) -> Array:

@@ -103,6 +103,7 @@ def _driven_by(site: SiteRecord, other: SiteRecord, parameters: Array) -> Simula
         indenter=driven.indenter,
         indenter_digest=driven.indenter_digest,
         layers=(),
+        skin_points=(),
     )
     return replace(site, model=model, times_s=other.times_s).job(parameters)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...identify.fit.correction import CoarseToFine
-from ...identify.fit.objective import SiteResponse
+from ...identify.fit.objective import SiteResponse, largest
 from ...identify.fit.prediction import Known, error_percent, summarise
 from ...indentation import (
     Simulation,
@@ -72,7 +72,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         _write_curves(context, folder, site, best, known)
     rows = [_row(site) for site in sites]
     for i, site in enumerate(sites):
-        rows[i]["layers"] = _layers(context, folder, site, None if near is None else near[i], best, known)
+        rows[i]["observed"] = _observed(context, folder, site, None if near is None else near[i], best, known)
     doubts = outlier_record(context, cache, records, ours, best, one, searched, correction)
     write_json(folder / "predict.json", {"sites": rows, **_means(rows), **doubts})
     return {}
@@ -195,10 +195,10 @@ def _write_curves(context: Context, folder: Path, site: SitePrediction, best: Ar
     write_curves(folder / f"{record.name}.csv", **columns)
 
 
-def _layers(
+def _observed(
     context: Context, folder: Path, site: SitePrediction, near: Simulation | None, best: Array, known: Known
 ) -> list[dict[str, Any]]:
-    """What ultrasound saw of each tissue beside its prediction, as a file and as a row.
+    """Everything that was seen beside a record's force with its prediction, as files and rows.
 
     ``near`` is the simulation with derivatives where that is another than the site's own.
     """
@@ -209,20 +209,23 @@ def _layers(
         if near is not None:
             searched = one.respond(near)
             ours = CoarseToFine([searched], [whole])([searched])[0]
-        columns = {"time_s": one.compared_at_s, "compression_measured_mm": one.compared}
+        seen, what = one.seen, one.seen.quantity
+        columns = seen.columns | {f"{what}_measured_mm": one.compared}
         if whole.completed:
-            columns["compression_simulated_mm"] = whole.force_N
+            columns[f"{what}_simulated_mm"] = whole.force_N
         if ours.completed:
-            peak = float(np.abs(ours.force_N).max())
+            peak = largest(ours.force_N)
             half = known.half_width_95(ours.jacobian, best, peak, one.name, one.unit)
-            columns |= {"compression_low_mm": ours.force_N - half, "compression_high_mm": ours.force_N + half}
+            columns |= {f"{what}_low_mm": ours.force_N - half, f"{what}_high_mm": ours.force_N + half}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
             {
-                "tissue": one.seen.tissue,
+                "kind": seen.kind,
+                "what": seen.what,
                 "name": one.name,
-                "largest_mm": float(one.compared.max()),
-                "thickness_mm": one.seen.thickness_mm,
+                "largest_mm": largest(one.compared),
+                "noise_mm": seen.noise_mm,
+                **seen.facts,
                 "error_percent": error_percent(whole.force_N, one.compared) if whole.completed else None,
             }
         )

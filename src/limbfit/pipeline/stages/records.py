@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +13,11 @@ from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.uncertainty.noise import depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Site
-from ...traces import Thinning
 from ..shared.artefacts import read_curves
 from ..shared.context import Context
-from ..shared.simulations import recorded_model
-from .files import LAYERS, SMOOTHING
+from ..shared.simulations import recorded_model, surface_points
+from .files import SMOOTHING
+from .observed import Observed, load_observed
 
 Array = NDArray[np.float64]
 
@@ -31,9 +29,9 @@ class SiteRecord:
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
     blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
-    same mesh. With ``seen`` it is what ultrasound saw of one tissue meanwhile that is compared, of the same
-    simulation; ``weight`` is how much that counts beside a force. ``touch_down_sd_mm`` is how far the
-    touch-down may be off, ``error_share`` how far forces may be beside that.
+    same mesh. With ``seen`` it is what was seen beside the force that is compared, of the same simulation;
+    ``weight`` is how much that counts beside a force. ``touch_down_sd_mm`` is how far the touch-down may be
+    off, ``error_share`` how far forces may be beside that.
     """
 
     record: Record
@@ -44,15 +42,15 @@ class SiteRecord:
     force_N: Array
     smoothing: Array
     nested_mm: float | None = None
-    seen: Thinning | None = None
+    seen: Observed | None = None
     weight: float = 1.0
     touch_down_sd_mm: float = 0.0
     error_share: float = 0.01
 
     @property
     def name(self) -> str:
-        """The record's; with the tissue that ultrasound saw."""
-        return self.record.name if self.seen is None else f"{self.record.name}+{self.seen.tissue}"
+        """The record's; with what was seen beside it."""
+        return self.record.name if self.seen is None else f"{self.record.name}+{self.seen.what}"
 
     @property
     def unit(self) -> str:
@@ -79,30 +77,19 @@ class SiteRecord:
 
     @property
     def compared(self) -> Array:
-        """What is compared: force (n,) N; displacement, mm, under a stated force; compression of a tissue."""
+        """What is compared: force (n,) N; displacement, mm, under a stated force; what is seen beside."""
         if self.seen is not None:
-            return self.seen.compression_mm
+            return self.seen.value_mm
         return self.displacement_mm if self.record.forced else self.force_N
-
-    @property
-    def compared_at_s(self) -> Array:
-        """At which times (n,) s from touch-down."""
-        return self.times_s if self.seen is None else self.seen.time_s
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
         plain = as_response(simulation)
         if self.seen is not None:
-            plain = self._compression(plain, simulation)
+            values, slopes = self.seen.of(simulation)
+            return replace(plain, force_N=values, jacobian=slopes)
         force_N, jacobian = (self.smoothing @ values for values in (plain.force_N, plain.jacobian))
         return replace(plain, force_N=force_N, jacobian=jacobian)
-
-    def _compression(self, plain: SiteResponse, simulation: Simulation) -> SiteResponse:
-        """The response with the compression of its tissue in place of the force."""
-        assert self.seen is not None
-        row, slopes = self.model.layers.index(self.seen.tissue), simulation.compression_jacobian
-        jacobian = np.zeros_like(plain.jacobian) if slopes is None else slopes[row]
-        return replace(plain, force_N=simulation.compression_mm[row], jacobian=jacobian)
 
     def job(
         self, parameters: Array, sensitivities: bool = True, starts: Sequence[Array] = ()
@@ -150,15 +137,15 @@ def site_record(context: Context, record: Record) -> SiteRecord:
 
 
 def all_compared(context: Context, records: Sequence[SiteRecord]) -> list[SiteRecord]:
-    """The records, each followed by one for every tissue that ultrasound saw beside it."""
-    facts = context.stored("traces", "traces.json")["sites"]
+    """The records, each followed by one for everything that was seen beside it."""
+    facts, folder = context.stored("traces", "traces.json")["sites"], context.store["traces"]
     found = []
     for one in records:
         found.append(one)
-        for seen in load_thinnings(context.store["traces"], one.record, facts[one.record.name]):
-            weight = weight_of(seen, context.study.calibration.force_error_percent)
-            at = np.array([np.interp(seen.time_s, one.times_s, row) for row in np.eye(len(one.times_s))]).T
-            found.append(replace(one, seen=seen, weight=weight, smoothing=at))
+        own, points = facts[one.record.name], surface_points(context, one.record)
+        for seen in load_observed(folder, one.record, own, one.times_s, points):
+            weight = seen.weight(context.study.calibration.force_error_percent)
+            found.append(replace(one, seen=seen, weight=weight))
     return found
 
 
@@ -167,34 +154,3 @@ def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[Sit
     if not context.study.is_searched_apart:
         return records
     return [replace(one, model=recorded_model(context, one.record, searched=True)) for one in records]
-
-
-def load_thinnings(folder: Path, record: Record, facts: dict[str, Any]) -> tuple[Thinning, ...]:
-    """The tissues of a record that are compared, as the stage ``traces`` left them."""
-    stated = facts.get("layers", {})
-    tissues = [tissue for tissue, one in stated.items() if one["compared"]]
-    if not tissues:
-        return ()
-    curves = read_curves(folder / LAYERS.format(record.name))
-    return tuple(
-        Thinning(
-            tissue,
-            stated[tissue]["thickness_mm"],
-            curves["time_s"],
-            curves[f"{tissue}_mm"],
-            curves["samples"],
-            stated[tissue]["before"],
-            stated[tissue]["sd_mm"],
-        )
-        for tissue in tissues
-    )
-
-
-def weight_of(seen: Thinning, force_error_percent: float) -> float:
-    """How much its residuals count beside those of a force, 1 at most.
-
-    A force counts as one whose error is ``force_error_percent`` of its largest. Where ultrasound is off by
-    more than that share of the compression, it counts by as much less.
-    """
-    error = float(np.sqrt(np.diag(seen.covariance).mean())) / float(seen.compression_mm.max())
-    return min(1.0, (force_error_percent / 100.0 / error) ** 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,14 @@ import numpy as np
 from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...indentation import read_indenter
-from ...study import ClampsTable, Study
+from ...study import ClampsTable, Record, Study
+from ...traces import Regularised, SurfaceMotion, Trace
 from ..shared.context import Listener, Progress, quiet
 from ..shared.simulations import pins_met
 from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
 from ..shared.store import Store
-from ..stages.curves import read_record
+from ..shared.surface_points import chosen_points
+from ..stages.curves import read_observed, read_record
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
@@ -48,6 +51,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     listener(Progress("check", 1, 2, "records"))
     read = {record.name: read_record(study, record) for record in study.recorded}
     records = {name: record for name, (_, _, record) in read.items()}
+    motions = {record.name: _motion(study, record, read[record.name]) for record in study.recorded}
     for name, record in records.items():
         facts.append(
             f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
@@ -65,6 +69,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
     placed, anatomy = _places(study, given)
+    facts += _surface_motion_facts(study, motions, placed, anatomy)
     if records and not placed:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
@@ -82,6 +87,36 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         "sites": records,
         "flags": [flag.to_dict() for flag in flags],
     }
+
+
+def _motion(
+    study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]
+) -> SurfaceMotion | None:
+    """What cameras saw beside a record; what ultrasound saw is read and checked, too."""
+    trace, smooth, facts = read
+    return read_observed(study, record, trace, facts["touch_down_s"], smooth)[1]
+
+
+def _surface_motion_facts(
+    study: Study,
+    motions: Mapping[str, SurfaceMotion | None],
+    placed: dict[str, dict[str, Any]],
+    anatomy: Anatomy | None,
+) -> Iterator[str]:
+    """How the skin around the indenter moves, and which of its points are compared where sites are known."""
+    for record in study.recorded:
+        motion = motions[record.name]
+        if motion is None:
+            continue
+        said = (
+            f"site {record.name}: surface of {len(motion.points)} points at {len(motion.time_s)} times in "
+            f"contact, up to {motion.largest_mm:.2f} mm"
+        )
+        if anatomy is not None and placed:
+            row, skin = placed[record.site.name], (anatomy.skin.points, anatomy.skin.faces)
+            place = tuple(row["position_mm"]), tuple(row["axis"])
+            said += f"; {chosen_points(study, record, place, skin, motion).words}"
+        yield said
 
 
 def _places(study: Study, given: Anatomy | None) -> tuple[dict[str, dict[str, Any]], Anatomy | None]:

@@ -76,6 +76,7 @@ def plan_protocol(
     draws: int = 3,
     seed: int = 0,
     ultrasound_sd_mm: float | None = None,
+    surface_sd_mm: float | None = None,
     parameters: Parameters | None = None,
     listener: Listener = quiet,
 ) -> dict[str, Any]:
@@ -95,6 +96,7 @@ def plan_protocol(
     draws : tissues that the protocol is judged at, the first those of ``parameters``.
     ultrasound_sd_mm : how well ultrasound through the indenter reads the thickness of a tissue; None: there
         is none.
+    surface_sd_mm : how well cameras read the displacement of the skin around the indenter; None: likewise.
     parameters : per tissue; by default the identified ones, or the study's start.
 
     Returns
@@ -138,6 +140,7 @@ def plan_protocol(
         parameters_from=origin,
         noise=_noise_of(study, origin),
         ultrasound_sd_mm=ultrasound_sd_mm,
+        surface_sd_mm=surface_sd_mm,
     )
 
 

@@ -35,12 +35,15 @@ from ..stages.surfaces import run_surfaces
 from .journal import journal
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
-_RECORD = ("trace", "touch_down_s", "peak_s", "control", "ultrasound", "ultrasound_sd_mm")
+_SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame")
+_RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)
 _UNSEEN: dict[str, Any] = {
-    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter", "ultrasound")),
+    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter", "ultrasound", "surface")),
     "region": "",
     "control": "displacement",
     "ultrasound_sd_mm": 0.1,
+    "surface_sd_mm": 0.05,
+    "surface_frame": "limb",
 }
 _NAMED = ("site", "name")
 # How pins press; the mesh depends on how wide they are alone.

@@ -7,6 +7,11 @@ from ..page import Block, Bullets, Cell, Prose, Row, Section, Table
 from ..store import Json, Results
 from .design import expected_figure, factor
 
+SEEN = {
+    "ultrasound_sd_mm": "Ultrasound through the indenter reads every tissue's thickness",
+    "surface_sd_mm": "Cameras read the displacement of the skin around the indenter",
+}
+
 
 def protocol_section(store: Results, content: Json) -> Section:
     """What the experiment ``protocol`` found."""
@@ -22,10 +27,10 @@ def protocol_section(store: Results, content: Json) -> Section:
         f"{content['parameters_from']}. Every site with another indenter takes {content['setup_s']:g} s to "
         f"prepare, every record {content['rest_s']:g} s of rest. In short: {content['verdict']}."
     )
-    if content.get("ultrasound_sd_mm") is not None:
-        sd = f"{content['ultrasound_sd_mm']:g} mm"
-        seen = f"Ultrasound through the indenter reads every tissue's thickness to {sd}"
-        words = Prose(f"{words.text} {seen}, but for the plain ramps and the protocol without it.")
+    seen = [f"{said} to {content[key]:g} mm" for key, said in SEEN.items() if content.get(key) is not None]
+    if seen:
+        told = ", ".join(seen)
+        words = Prose(f"{words.text} {told}, but for the plain ramps and the protocol by force alone.")
     figure = expected_figure("protocols", content["protocols"], "the records of a protocol")
     blocks: list[Block] = [words, _records(content), _protocols(content), figure]
     if content.get("pressures"):

@@ -1,0 +1,247 @@
+"""Displacement of the skin around the indenter: from the file to the prediction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import interp1d
+
+import layered
+from layered import layered_block, store_blocks
+from limbfit.errors import TraceError
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import (
+    Parameters,
+    SimulationJob,
+    SiteModel,
+    points_around,
+    read_indenter,
+    simulate,
+)
+from limbfit.mesh import write_vtu
+from limbfit.phantom.record import Ramp, record, write_surface
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import SimulationCache
+from limbfit.pipeline.shared.surface_points import MAX_POINTS, ChosenPoints, chosen_points
+from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.stages.curves import run_traces
+from limbfit.pipeline.stages.laboratory import Laboratory, linearised
+from limbfit.pipeline.stages.predict import run_predict
+from limbfit.report.drawing.observed_figures import surface_figure
+from limbfit.report.site_tables import observed_table
+from limbfit.report.store import load_store
+from limbfit.study import Study, load_study
+from limbfit.traces import SurfaceMotion
+
+BLOCK = (3.0, 12.0)
+TRUTH = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
+TEXT = """
+[study]
+name = "a block"
+[surfaces]
+skin = "skin.stl"
+[indenter]
+shape = "sphere"
+width_mm = 12.0
+[solver]
+load_steps = 6
+unload_steps = 5
+penalty_per_mm = 200.0
+[mesh.coarse]
+edge_near_mm = 6.0
+[calibration]
+max_iterations = 2
+corrections = 1
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+"""
+SEEN = 'surface = "a-surface.csv"\n'
+FRAME = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # edge, across it, axis
+
+
+def study_of(folder: Path, more: str = SEEN) -> Study:
+    for name in ("skin.stl", "a.csv", "a-surface.csv"):
+        (folder / name).touch()
+    (folder / "study.toml").write_text(TEXT + more)
+    return load_study(folder)
+
+
+def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
+    """A study of a block, whose record and surface come from the same mesh and element."""
+    mesh = layered_block(BLOCK, ("skin", "muscle"), 24.0, 6, 4.0)
+
+    def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+        write_vtu(mesh, folder / "truth.vtu")
+        model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", element=study.mesh.element)
+        points = points_around(mesh, read_indenter(model.indenter, model.position, model.axis, None))
+        times = np.linspace(0.0, model.knots_s[-1], 201)
+        job = SimulationJob(
+            replace(model, skin_points=tuple(map(tuple, points))),
+            study.tissues,
+            tuple(study.vector(truth)),
+            tuple(times),
+            False,
+        )
+        found = simulate(job)
+        made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
+        made.write(study.path(Path("a.csv")))
+        moves = interp1d(times, found.observed_mm.reshape(len(points), 3, -1))
+        if study.recorded[0].surface_frame == "site":
+            points = points @ FRAME.T
+            write_surface(
+                folder / "a-surface.csv",
+                made,
+                points,
+                lambda t: np.einsum("ij,kjn->kin", FRAME, moves(np.minimum(t, times[-1]))),
+                random,
+            )
+        else:
+            write_surface(
+                folder / "a-surface.csv", made, points, lambda t: moves(np.minimum(t, times[-1])), random
+            )
+
+    monkeypatch.setattr(layered, "_write_record", write)
+    study = study_of(folder, more)
+    store = store_blocks(study, {"a": (BLOCK, 3.0, True)}, TRUTH, 6, coarse=6)
+    for place in (store["mesh"], store["mesh"] / "coarse"):
+        write_vtu(mesh, place / "a.vtu")
+    return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+@pytest.mark.slow
+def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
+    """Beside one ramp: nothing is off at the truth, and every interval is narrower than by force alone.
+
+    The skin's modulus is determined, which it is not by force; the true values lie within the intervals of
+    the calibration.
+    """
+    widths = []
+    for name, more in (("force", ""), ("both", SEEN)):
+        (tmp_path / name).mkdir()
+        context = stored(tmp_path / name, monkeypatch, more)
+        study = context.study
+        laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
+        at = laboratory.anchored(study.vector(TRUTH))
+        known = linearised(context, laboratory.records, study.vector(TRUTH), at)
+        widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
+    assert [one.name for one in laboratory.records] == ["a", "a+surface"]
+    assert [one.unit for one in laboratory.measured] == ["N", "mm"]
+    assert {one.where for one in laboratory.measured} == {"a"}  # left out together
+    seen, noise = laboratory.records[1], known.residual_model.noise[1]
+    off = at.responses[1].force_N - seen.compared
+    assert len(off) > 300
+    assert off @ np.linalg.solve(noise.covariance, off) / len(off) == pytest.approx(1.0, abs=0.25)
+    assert laboratory.simulated == 1
+    assert (widths[1] < widths[0]).all()
+    assert widths[0][0] > 2.0  # force alone: 2.6 for the skin's modulus, 1.7 for the muscle's
+    assert widths[1][0] < 1.4  # 1.27
+    assert widths[1][4] < 1.2  # 1.09
+    for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
+        context.store[stage].mkdir()
+        run(context, context.store[stage])
+    found = context.store.read("calibrate", "calibration.json")
+    assert list(found["contact"]) == ["a"]
+    assert found["uncertainty"]["residuals"]["sites"]["a+surface"]["unit"] == "mm"
+    intervals = found["uncertainty"]["intervals_95"]
+    for tissue, values in TRUTH.items():
+        for name, value in values.items():
+            low, high = intervals[tissue][name]
+            assert low <= value <= high, (tissue, name)
+    (row,) = context.store.read("predict", "predict.json")["sites"]
+    (surface,) = row["observed"]
+    assert (surface["kind"], surface["left_out"]) == ("surface", {})
+    assert surface["compared"].startswith("24 points, ")
+    assert surface["error_percent"] < 10.0
+    results = load_store(study.results)
+    figure, shown = surface_figure(results, fitted=True), observed_table(results)
+    assert figure is not None
+    assert "a: " in figure.markup
+    assert shown is not None
+    assert shown.rows[0].cells[1].text == "surface"
+
+
+@pytest.mark.slow
+def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch) -> None:
+    """The same points and the same moves, along the axis alone."""
+    context = stored(tmp_path, monkeypatch, SEEN + 'surface_frame = "site"\nedge = [0.0, 1.0, 0.0]\n')
+    file = context.study.path(Path("a-surface.csv"))
+    rows = np.loadtxt(file, delimiter=",", skiprows=1)
+    np.savetxt(
+        file, rows[:, [0, 1, 2, 3, 6]], delimiter=",", header="time_s,x_mm,y_mm,z_mm,uz_mm", comments=""
+    )
+    run_traces(context, context.store["traces"])
+    laboratory = Laboratory(context, SimulationCache(tmp_path / "runs"), context.study.recorded)
+    at = laboratory.anchored(context.study.vector(TRUTH))
+    seen = laboratory.records[1]
+    assert set(seen.seen.components.tolist()) == {2}
+    assert seen.compared.max() > 0.2  # into the limb
+    off = at.responses[1].force_N - seen.compared
+    assert np.sqrt(np.mean(off**2)) < 1.3 * seen.seen.noise_mm
+
+
+PLACE = ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+
+
+def chosen(study: Study, points: np.ndarray | list) -> ChosenPoints:
+    """Of points that all go down, on the block's top."""
+    mesh = layered_block(BLOCK, ("skin", "muscle"), 24.0, 6, 4.0)
+    moved = np.tile([0.0, 0.0, -1.0], (1, len(points), 1))
+    motion = SurfaceMotion(np.asarray(points, dtype=float), np.array([1.0]), moved)
+    skin = mesh.points, mesh.face_sets["skin"]
+    return chosen_points(study, study.recorded[0], PLACE, skin, motion)
+
+
+def test_points_that_are_not_compared_are_counted(tmp_path: Path) -> None:
+    found = chosen(
+        study_of(tmp_path), [[8, 0, 0.4], [0, 20, 0], [3, 0, 0], [0, -9, 6], [41, 0, 0], [30.5, 0, 0]]
+    )
+    assert found.which.tolist() == [0, 1]
+    assert found.points[0] == pytest.approx((8.0, 0.0, 0.0))
+    assert found.left_out == {
+        "farther than 40 mm from the site": 1,
+        "more than 5 mm off the skin": 2,
+        "under the indenter": 1,
+    }
+    assert found.words.startswith(
+        "2 points compared, 1 farther than 40 mm from the site, 2 more than 5 mm off"
+    )
+
+
+def test_many_points_are_thinned_evenly(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(-20.0, 20.1, 2.0), np.arange(-20.0, 20.1, 2.0))
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    found = chosen(study_of(tmp_path), points)
+    assert len(found.which) == MAX_POINTS
+    assert found.left_out["thinned out, to 30"] == x.size - MAX_POINTS - found.left_out["under the indenter"]
+    kept = np.array(found.points)
+    apart = np.linalg.norm(kept[:, None] - kept, axis=2) + 99.0 * np.eye(len(kept))
+    assert apart.min() > 4.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "points", "told"),
+    [
+        (
+            "limb",
+            [[500.0, 0, 0], [510.0, 0, 0]],
+            "no point lies within 40 mm of site a: the nearest is 500 mm",
+        ),
+        ("limb", [[3.0, 0, 0], [0, 0, 1.0]], "no point can be compared: 2 under the indenter"),
+        ("limb", [[8.0, 0, 9.0]], 'off the skin; give LPS millimetres .*, or surface_frame = "site"'),
+        ("site", [[8.0, 0, 9.0]], 'off the skin; give millimetres from the site, or surface_frame = "limb"'),
+    ],
+)
+def test_a_surface_elsewhere_is_refused(tmp_path: Path, frame: str, points: list, told: str) -> None:
+    more = SEEN + f'surface_frame = "{frame}"\n' * (frame == "site")
+    with pytest.raises(TraceError, match=told) as caught:
+        chosen(study_of(tmp_path, more), np.array(points))
+    assert caught.value.file == tmp_path / "a-surface.csv"

@@ -1,0 +1,100 @@
+"""What was seen beside the force, in the report: a figure of each kind, a row of each thing seen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stored_results import write_results
+
+from limbfit.report.drawing.observed_figures import layer_figure, surface_figure
+from limbfit.report.sections.sections import fit, prediction
+from limbfit.report.site_tables import observed_table
+from limbfit.report.store import load_store
+
+SURFACE = {
+    "kind": "surface",
+    "what": "surface",
+    "name": "PT-1+surface",
+    "compared": "4 points, 96 values",
+    "left_out": {"under the indenter": 3},
+    "components": ["x", "y", "z"],
+    "largest_mm": 1.236,
+    "noise_mm": 0.021,
+    "sd_mm": 0.05,
+    "error_percent": 2.25,
+}
+LAYER = {
+    "kind": "ultrasound",
+    "what": "muscle",
+    "name": "TI-5+muscle",
+    "compared": "81 times",
+    "largest_mm": 3.5,
+    "noise_mm": 0.03,
+    "sd_mm": 0.1,
+    "thickness_mm": 20.0,
+    "error_percent": None,
+}
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """A study with a surface at a fitted site, and ultrasound at a held-out one that was not simulated."""
+    folder = write_results(tmp_path / "results")
+    file = folder / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    for row in content["sites"]:
+        row["observed"] = {"PT-1": [SURFACE], "TI-5": [LAYER]}.get(row["site"], [])
+    file.write_text(json.dumps(content))
+    moves = np.linspace(-1.2, 0.4, 96)
+    columns = {
+        "time_s": np.linspace(0.5, 9.0, 96),
+        "component": np.arange(96) % 3,
+        "displacement_measured_mm": moves,
+        "displacement_simulated_mm": moves + 0.01,
+        "displacement_low_mm": moves - 0.1,
+        "displacement_high_mm": moves + 0.1,
+    }
+    _write(folder / "predict" / "PT-1+surface.csv", columns)
+    times = np.linspace(0.0, 9.0, 81)
+    layer = {"time_s": times, "compression_measured_mm": times / 3.0}
+    _write(folder / "predict" / "TI-5+muscle.csv", layer)
+    return folder
+
+
+def _write(file: Path, columns: dict[str, np.ndarray]) -> None:
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(file, table, delimiter=",", header=",".join(columns), comments="")
+
+
+def test_each_kind_is_drawn_where_it_belongs(results: Path) -> None:
+    store = load_store(results)
+    surface, layer = surface_figure(store, fitted=True), layer_figure(store, fitted=False)
+    assert surface is not None
+    assert layer is not None
+    assert surface.name == "surface-fitted"
+    assert "PT-1: 2.2 %" in surface.markup
+    assert "TI-5, muscle" in layer.markup
+    assert surface_figure(store, fitted=False) is None
+    assert layer_figure(store, fitted=True) is None
+    assert surface in fit(store).blocks
+    assert layer in prediction(store).blocks
+
+
+def test_each_has_a_row_with_what_was_left_out(results: Path) -> None:
+    table = observed_table(load_store(results))
+    assert table is not None
+    told = [[cell.text for cell in row.cells] for row in table.rows]
+    assert told[0] == [
+        "PT-1", "surface", "fitted", "4 points, 96 values", "3 under the indenter", "1.24", "0.021", "2.2",
+    ]  # fmt: skip
+    assert told[1][1:5] == ["muscle", "held out", "81 times", "\u2013"]
+    assert [row.marked for row in table.rows] == [True, False]
+
+
+def test_a_study_of_forces_alone_shows_nothing_of_it(tmp_path: Path) -> None:
+    store = load_store(write_results(tmp_path / "results"))
+    assert observed_table(store) is None
+    assert surface_figure(store, fitted=True) is None

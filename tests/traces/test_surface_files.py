@@ -1,0 +1,127 @@
+"""Displacements of the skin around the indenter: from the file to what is compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbfit.errors import TraceError
+from limbfit.traces import SurfaceMotion, in_contact, read_surface_motion
+
+HEAD = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
+AT = ((10.0, 0.0, 0.0), (0.0, 12.0, 0.0))
+
+
+def table(folder: Path, head: str, *rows: str) -> Path:
+    file = folder / "s.csv"
+    file.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    return file
+
+
+def test_rows_become_frames_of_points(tmp_path: Path) -> None:
+    """In any order, with cells that are empty and points that are not seen at every time."""
+    file = table(
+        tmp_path, HEAD, "2,0,12,0,0.1,,-0.5", "1,10,0,0,0.2,0.0,-0.1", "2,10,0,0,0.4,0.0,-0.2", "3,10,0,0,,,"
+    )
+    found = read_surface_motion(file, "time_s")
+    assert found.time_s.tolist() == [1.0, 2.0, 3.0]
+    assert found.points.tolist() == [[0.0, 12.0, 0.0], [10.0, 0.0, 0.0]]
+    assert np.isnan(found.moved_mm[0, 0]).all()
+    assert np.isnan(found.moved_mm[2, 1]).all()
+    assert found.moved_mm[1, 1].tolist() == [0.4, 0.0, -0.2]
+    assert found.moved_mm[1, 0, [0, 2]].tolist() == [0.1, -0.5]
+    assert np.isnan(found.moved_mm[1, 0, 1])
+
+
+def test_one_component_will_do(tmp_path: Path) -> None:
+    file = table(tmp_path, "time_s;x_mm;y_mm;z_mm;uz_mm", "1;10;0;0;-0,5", "1;0;12;0;-0,2")
+    found = read_surface_motion(file, "time_s")
+    assert np.isnan(found.moved_mm[..., :2]).all()
+    assert found.moved_mm[0, :, 2].tolist() == [-0.2, -0.5]
+    means = found.means(np.array([0, 1]))
+    assert means.component.tolist() == [2, 2]
+
+
+WRONG = {
+    "no place": ("time_s,ux_mm", ["1,2"], "no column 'x_mm'"),
+    "no move": ("time_s,x_mm,y_mm,z_mm", ["1,2,3,4"], "no displacement of a point; name columns ux_mm"),
+    "metres": (HEAD, ["1,0.01,0,0,0.001,0,0", "1,0,0.012,0,0.0,0,0"], "points lie within 0.012 mm"),
+    "moves in metres": (
+        HEAD,
+        ["1,10,0,0,0.002,0,0", "1,0,12,0,0,0,0"],
+        "the largest displacement is 0.002 mm",
+    ),
+    "moves too far": (HEAD, ["1,10,0,0,2e3,0,0", "1,0,12,0,0,0,0"], "the largest displacement is 2e"),
+    "a gap in a place": (HEAD, ["1,10,,0,2,0,0"], "nan in sample 1; give a number"),
+    "an endless move": (
+        HEAD,
+        ["1,10,0,0,inf,0,0"],
+        "inf in sample 1; give a number, or leave the cell empty",
+    ),
+    "all gaps": (HEAD, ["1,10,0,0,,,", "1,0,12,0,nan,,"], "no displacement is given"),
+    "twice": (
+        HEAD,
+        ["1,10,0,0,1,0,0", "1,10,0,0,2,0,0", "1,0,1,0,0,0,0"],
+        r"\(10, 0, 0\) has two rows at 1 s",
+    ),
+    "words": (HEAD, ["1,10,0,0,down,0,0"], "'down' is not a number"),
+}
+
+
+@pytest.mark.parametrize(("head", "rows", "told"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_with_a_file_is_told_in_one_line(
+    tmp_path: Path, head: str, rows: list[str], told: str
+) -> None:
+    with pytest.raises(TraceError, match=told) as caught:
+        read_surface_motion(table(tmp_path, head, *rows), "time_s")
+    assert caught.value.file == tmp_path / "s.csv"
+    assert caught.value.place
+    assert "\n" not in str(caught.value)
+
+
+def motion(times: np.ndarray, seed: int = 0, sd: float = 0.0) -> SurfaceMotion:
+    """Two points that go down with time squared."""
+    moved = np.zeros((len(times), 2, 3))
+    moved[:, :, 2] = -0.1 * times[:, None] ** 2 * [1.0, 2.0]
+    return SurfaceMotion(
+        np.array(AT), times, moved + np.random.default_rng(seed).normal(0.0, sd, moved.shape)
+    )
+
+
+def test_times_are_of_the_records_clock() -> None:
+    seen = motion(np.arange(0.0, 10.0))
+    found = in_contact(seen, (0.0, 12.0), 2.0, 8.0)
+    assert found.time_s.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    with pytest.raises(
+        TraceError, match="times from 0 to 9 s, and the record goes from 0 to 8 s; give times"
+    ):
+        in_contact(seen, (0.0, 8.0), 2.0, 7.0)
+    with pytest.raises(TraceError, match=r"no displacement while the indenter presses \(9.20 to 11.00 s\)"):
+        in_contact(seen, (0.0, 12.0), 9.2, 11.0)
+
+
+def test_means_are_of_the_frames_that_show_a_point() -> None:
+    """Each is compared with the same mean of a simulation: on a curve that bends nothing is off."""
+    times = np.linspace(0.1, 6.0, 60)
+    seen = motion(times)
+    seen.moved_mm[::3, 1] = np.nan
+    seen.moved_mm[40:, 1, 0] = np.nan
+    found = seen.means(np.array([1, 0]))
+    of_point = np.array(AT)[[1, 0]][found.point]
+    assert len(np.unique(found.time_s.round(6))) > 8  # other frames, other times
+    assert len(found.moved_mm) < 8 * 2 * 3
+    curve = -0.1 * times**2
+    down = found.component == 2
+    scale = np.where(of_point[:, 0] == 0.0, 2.0, 1.0)
+    assert found.moved_mm[down] == pytest.approx((scale * (found.frames @ curve))[down])
+    assert found.frames.sum(axis=1) == pytest.approx(1.0)
+    assert found.samples.min() == 4
+    assert found.samples.max() == 8
+
+
+def test_one_scan_is_one_time() -> None:
+    found = motion(np.array([3.0])).means(np.array([0, 1]))
+    assert len(found.moved_mm) == 6
+    assert found.samples.tolist() == [1.0] * 6
