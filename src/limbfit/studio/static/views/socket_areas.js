@@ -170,6 +170,7 @@ export class ShapeEditor {
   marks() {
     const { viewer, frame } = this.view;
     if (!viewer || !this.shape) return;
+    this.trim.aside(Boolean(this.draft));
     const inward = (point) => {
       const up = frame[2], from = viewer.view.home.target.map((value, k) => value - point[k]);
       const along = from.reduce((sum, value, k) => sum + value * up[k], 0);

@@ -17,7 +17,7 @@ export class TrimHandles {
     this.part = el("div", {}, el("h2", {}, "Trimline"), this.words, el("div", { class: "row" }, this.away));
     const { viewer } = view;
     if (!viewer) return;
-    viewer.host.append(this.over);
+    viewer.overlay.host.before(this.over); // names stay readable
     const { changed } = viewer.view;
     viewer.view.changed = () => {
       changed();
@@ -44,6 +44,11 @@ export class TrimHandles {
       replace(this.over, this.line.parentNode, ...this.handles);
     }
     this.arrange();
+  }
+
+  /** Out of the way while an area is placed. */
+  aside(away) {
+    this.over.classList.toggle("aside", away);
   }
 
   clear() {
