@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 import pytest
-from test_execution import die, nap, refuse, solve, threads, told
+from test_execution import die, heard, nap, refuse, solve, threads, told
 
 from conftest import COARSE
 from limbfit.errors import InputError, TraceError
@@ -42,6 +42,14 @@ def test_the_same_answers_in_order_with_threads_pinned(cluster):
     assert all(np.array_equal(a, b) for a, b in zip(wanted, found, strict=True))
     assert next(cluster.map(threads, [0])) == ["1"] * len(THREAD_VARIABLES)
     assert cluster.workers == 2
+
+
+@pytest.mark.slow
+def test_what_a_job_reports_comes_back_from_the_cluster(cluster):
+    said, answers = heard(cluster, [3, 1, 2, 4])
+    assert answers == [3, 1, 2, 4]
+    assert said[3] == [(1, "1 of 3"), (2, "2 of 3"), (3, "3 of 3")]
+    assert cluster.threads_for(2) == 1
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from limbfit.execution import (
     make_executor,
     meanwhile,
     placed,
+    report_progress,
     sharing,
     usable_cores,
 )
@@ -100,6 +101,47 @@ def test_workers_persist_and_keep_their_keys(pool):
     assert first == second
     assert len(set(first.values())) == 2
     assert os.getpid() not in first.values()
+
+
+def count(to):
+    for i in range(to):
+        report_progress([i + 1, f"{i + 1} of {to}"])
+    time.sleep(0.2)  # words on their way across a cluster come in before the answer
+    return to
+
+
+def heard(executor, jobs):
+    """What jobs report, by job, in its order, and their answers."""
+    said = {job: [] for job in jobs}
+    answers = list(executor.map(count, jobs, told=lambda job, message: said[job].append(tuple(message))))
+    return said, answers
+
+
+@pytest.mark.parametrize("executor", ["pool", "serial"])
+def test_what_a_job_reports_is_told_with_the_job(executor, pool):
+    said, answers = heard(pool if executor == "pool" else SerialExecutor(), [3, 0, 2])
+    assert said == {
+        3: [(1, "1 of 3"), (2, "2 of 3"), (3, "3 of 3")],
+        0: [],
+        2: [(1, "1 of 2"), (2, "2 of 2")],
+    }
+    assert answers == [3, 0, 2]
+    assert list(pool.map(count, [2])) == [2]  # nobody listens
+
+
+def test_a_listener_that_breaks_off_leaves_no_job_behind(pool):
+    def stop(job, message):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(pool.map(count, [1, 600], told=stop))
+    assert list(pool.map(square, [3, 4])) == [9, 16]
+
+
+def test_jobs_side_by_side_share_the_workers_threads(pool):
+    assert [pool.threads_for(jobs) for jobs in (1, 2, 5)] == [2, 1, 1]
+    assert ProcessExecutor(8).threads_for(2) == 4
+    assert SerialExecutor().threads_for(2) == usable_cores()
 
 
 def test_work_goes_on_meanwhile():

@@ -124,3 +124,59 @@ def test_areas_are_placed_by_a_click_written_and_drawn_and_a_run_says_what_is_wr
     page.get_by_role("button", name="area 1").click()
     page.get_by_role("button", name="Remove").click()
     until(lambda: not load_study(study).socket.areas)
+
+
+@pytest.mark.slow
+def test_the_trimline_is_dragged_written_and_drawn(study, serve, open_page):
+    """A handle of the brim, with the mouse and with a key; a drag too far down springs back."""
+    file = study / "study.toml"
+    file.write_text(file.read_text() + "[socket]\ntrim_mm = 40.0\n")
+    page = open_page(serve(study) + "#/socket", may_say="status of 422")
+    page.get_by_role("combobox", name="view").select_option("its shape")
+    words, canvas = page.locator(".socket-shape-words"), page.locator(".view.socket .lf-canvas")
+    until(lambda: "cm³" in words.inner_text())
+    seen = page.locator(".trim-handle:visible")
+    until(lambda: 6 <= seen.count() <= 12)  # of 16: the others are behind the limb
+    plain, told = canvas.screenshot(), words.inner_text()
+
+    def front():
+        """The handle in the middle of the picture."""
+        box = canvas.bounding_box()
+        middle = box["x"] + box["width"] / 2
+        places = [seen.nth(i).bounding_box() for i in range(seen.count())]
+        return seen.nth(int(np.argmin([abs(one["x"] + one["width"] / 2 - middle) for one in places])))
+
+    def drag(handle, pixels: float) -> None:
+        box = handle.bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x, y + pixels / 2)
+        page.mouse.move(x, y + pixels)
+        page.mouse.up()
+
+    handle = front()
+    level = float(handle.get_attribute("aria-valuenow"))
+    drag(handle, 60.0)
+    until(lambda: "The trimline is in the study" in page.locator("body").inner_text())
+    line = until(lambda: load_study(study).socket.trimline)
+    assert load_study(study).socket.trim_mm is None
+    heights = np.array([point[2] for point in line])
+    assert len(line) == 16
+    assert level - heights.min() > 5.0
+    assert np.sort(np.abs(heights - level))[:15].max() < 0.5  # one handle alone
+    until(lambda: canvas.screenshot() != plain)
+    until(lambda: words.inner_text() != told)  # the volume below the brim
+    assert serious_findings(page) == []
+    until(lambda: abs(float(front().get_attribute("aria-valuenow")) - heights.min()) < 0.1)
+    front().press("Shift+ArrowUp")
+    until(lambda: min(z for *_, z in load_study(study).socket.trimline) > heights.min() + 5.0)
+    text, stored = file.read_text(), min(z for *_, z in load_study(study).socket.trimline)
+    drag(front(), 330.0)
+    until(lambda: "mm of the distal end" in page.locator("body").inner_text())
+    until(lambda: abs(float(front().get_attribute("aria-valuenow")) - stored) < 0.1)
+    assert file.read_text() == text
+    page.get_by_role("button", name="Default brim").click()
+    until(lambda: not load_study(study).socket.trimline)
+    page.get_by_role("combobox", name="view").select_option("stored runs")
+    until(lambda: page.locator(".trim-handle").count() == 0)

@@ -67,3 +67,61 @@ def test_a_list_of_areas_in_one_line_is_added_to(page, study):
     file.write_text(file.read_text() + f"areas = [{one}]\n")
     assert page.post("/api/socket/areas", json=AREA).status_code == 200
     assert [area.name for area in load_study(study).socket.areas] == ["a", "front"]
+
+
+def heights(points) -> np.ndarray:
+    return np.array(points)[:, 2]  # of the stump, which stands along z
+
+
+def test_a_dragged_brim_is_a_trimline_of_the_study_and_moves_the_face(page, study):
+    before = page.get("/api/socket/shape").json()
+    points = before["trim"]["points"]
+    assert not before["trim"]["is_line"]
+    assert len(points) == 16
+    assert np.ptp(heights(points)) < 0.5  # a plane
+    assert abs(np.hypot(*np.array(points)[:, :2].T) - 41.0).max() < 3.0  # on the skin
+    plain, _ = unpack(page.get("/api/socket/face").content)
+    front = int(np.argmin(np.array(points)[:, 1]))
+    points[front] = [*points[front][:2], points[front][2] - 15.0]
+    after = page.post("/api/socket/trimline", json={"points": points}).json()
+    assert after["problem"] is None
+    assert after["trim"]["is_line"]
+    assert after["mark"] != before["mark"]
+    socket = load_study(study).socket
+    assert (socket.trim_mm, socket.trim_planes, len(socket.trimline)) == (None, (), 16)
+    np.testing.assert_allclose(heights(socket.trimline), heights(points), atol=0.02)
+    np.testing.assert_allclose(after["trim"]["points"], socket.trimline, atol=0.5)
+    lower, _ = unpack(page.get("/api/socket/face").content)
+
+    def top(face) -> float:
+        """The highest point of the face on its front, where it is cut by the plane x = 0."""
+        own = (abs(face["points"][:, 0]) < 4.0) & (face["points"][:, 1] < 0.0)
+        return float(face["points"][own, 2].max())
+
+    assert top(plain) - top(lower) == pytest.approx(15.0, abs=1.5)
+    gone = page.post("/api/socket/trimline/remove").json()
+    assert not gone["trim"]["is_line"]
+    assert load_study(study).socket.trimline == ()
+
+
+def test_a_brim_that_leaves_no_socket_is_refused_and_changes_nothing(page, study):
+    text, points = (study / "study.toml").read_text(), page.get("/api/socket/shape").json()["trim"]["points"]
+    low = [[x, y, z - 300.0] for x, y, z in points]
+    for wrong, reason in (
+        ([points[0], *low[1:]], "mm of the distal end"),
+        ([[x, y, z + 300.0] for x, y, z in points], "beyond the limb's proximal cut"),
+        ([points[0], points[4], points[2], points[8]], "does not go once around the limb"),
+        (points[:2], ""),
+        ([["nan", 0, 0]] * 3, ""),
+    ):
+        answer = page.post("/api/socket/trimline", json={"points": wrong})
+        assert answer.status_code == 422, reason
+        assert reason in answer.text
+        assert (study / "study.toml").read_text() == text
+
+
+def test_a_socket_from_a_file_has_no_brim_to_drag(page, study):
+    (study / "own.stl").write_text("solid\nendsolid\n")
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace("trim_mm = 40.0", 'file = "own.stl"'))
+    assert page.get("/api/socket/shape").json()["trim"]["points"] == []

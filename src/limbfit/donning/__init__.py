@@ -5,7 +5,8 @@ Or the other way round: under a stated pressure, whose shape is a socket's.
 
 from .inside import RARE, SHEAR_LEVELS, Strains, TissueStrain
 from .model import Load, SocketFit, socket_problem, socket_steps
-from .outcome import SETTLING, WHOLE, Donned, Held, Patch, SocketStep, don
+from .outcome import SETTLING, WHOLE, Donned, DonnedPart, Held, Patch, SocketStep, don
+from .parts import pack, unpack
 from .pressing import outer_surface, press, pressed_problem
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "SHEAR_LEVELS",
     "WHOLE",
     "Donned",
+    "DonnedPart",
     "Held",
     "Load",
     "Patch",
@@ -23,8 +25,10 @@ __all__ = [
     "TissueStrain",
     "don",
     "outer_surface",
+    "pack",
     "press",
     "pressed_problem",
     "socket_problem",
     "socket_steps",
+    "unpack",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
+from ..execution import usable_cores
 from ..fe import History, Motion, Problem, RigidBody, SmoothSurface, StepControl
 from ..fe.materials import Material
 from ..fe.motion import COORDINATES
@@ -25,7 +25,7 @@ COMING_ON, HELD, LOADING = 8, 6, 6
 RELAXING = 2.0  # power of the step's number that the time in a hold goes with
 # The stiffness of contact, MPa/mm: where pressures are the largest, 0.2 MPa, the wall is met to 0.1 mm.
 STIFFNESS = 2.0
-MOST_THREADS = 4  # one simulation has the machine to itself; more wait for memory
+MOST_THREADS = 4  # of one simulation; more wait for memory
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,11 @@ def _loading(load: Load, before: Array | None, after: Array) -> Motion:
     return Motion.of(times[:count], force=dict(zip(COORDINATES, values.T, strict=True)))
 
 
-def socket_steps(fit: SocketFit, modulus: float) -> StepControl:
-    """When a socket's simulation steps, and its contact stiffness; ``modulus`` as `Laws.modulus`, MPa."""
+def socket_steps(fit: SocketFit, modulus: float, threads: int | None = None) -> StepControl:
+    """When a socket's simulation steps, and its contact stiffness; ``modulus`` as `Laws.modulus`, MPa.
+
+    ``threads``: those that it may have, of which it takes no more than are of use; by default the machine's.
+    """
     times: list[float] = []
     for i, (_, on, off) in enumerate(fit.ends):
         start = times[-1] if times else 0.0
@@ -152,10 +155,10 @@ def socket_steps(fit: SocketFit, modulus: float) -> StepControl:
         if off > on:
             times += [on + (off - on) * (k / HELD) ** RELAXING for k in range(1, HELD + 1)]
     return StepControl(
-        times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=most_threads()
+        times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=most_threads(threads)
     )
 
 
-def most_threads() -> int:
-    """Threads of one simulation that has the machine to itself."""
-    return min(os.cpu_count() or 1, MOST_THREADS)
+def most_threads(given: int | None = None) -> int:
+    """Threads of one simulation, of those ``given``; by default it has the machine to itself."""
+    return min(given or usable_cores(), MOST_THREADS)

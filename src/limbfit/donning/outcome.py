@@ -8,7 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fe import Problem, Result, State, Step, StepControl, System, Tractions, solve, tractions
+from ..fe import (
+    Checkpoints,
+    Problem,
+    Result,
+    Snapshot,
+    State,
+    Step,
+    StepControl,
+    System,
+    Tractions,
+    solve,
+    tractions,
+)
 from ..fe.kernel.laws import Laws
 from .inside import Strains
 from .model import SocketFit, socket_steps
@@ -97,6 +109,15 @@ class Donned:
     held: Mapping[str, Held]
 
 
+@dataclass(frozen=True, eq=False)
+class DonnedPart:
+    """A socket's simulation as far as donning, or a load, was held: ``snapshot`` is the solver's."""
+
+    snapshot: Snapshot
+    rows: tuple[SocketStep, ...]
+    held: Mapping[str, Held]
+
+
 def don(
     problem: Problem,
     fit: SocketFit,
@@ -104,6 +125,9 @@ def don(
     sensitivities: bool = False,
     on_row: Callable[[SocketStep], None] | None = None,
     steps: StepControl | None = None,
+    threads: int | None = None,
+    keep: Callable[[DonnedPart], None] | None = None,
+    begin: DonnedPart | None = None,
 ) -> Donned:
     """Simulate a socket's problem.
 
@@ -115,12 +139,15 @@ def don(
     on_row : called after every step.
     steps : by default `socket_steps`. Derivatives are those at a contact stiffness over the mean modulus, so
         that runs to be compared with them have the same steps.
+    threads : of those steps, as in `socket_steps`.
+    keep : called when donning and each load but the last have been held.
+    begin : of an earlier call of the same, which goes on from there.
     """
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     system = System(problem)
     patches = {WHOLE: np.ones(len(problem.bodies[0].faces), dtype=bool), **regions}
-    rows: list[SocketStep] = []
-    held: dict[str, Held] = {}
+    rows = [] if begin is None else list(begin.rows)
+    held = {} if begin is None else dict(begin.held)
 
     def note(step: Step) -> None:
         found = tractions(system, laws, step.state)
@@ -134,8 +161,15 @@ def don(
         if on_row is not None:
             on_row(rows[-1])
 
-    control = steps or socket_steps(fit, laws.modulus)
-    result = solve(problem, control, sensitivities, on_step=note, store="none", system=system)
+    control = steps or socket_steps(fit, laws.modulus, threads)
+    checkpoints = None
+    if keep is not None:
+        ends = [off for _, _, off in fit.ends[:-1]]
+        checkpoints = Checkpoints(ends, lambda now: keep(DonnedPart(now, tuple(rows), dict(held))))
+    result = solve(
+        problem, control, sensitivities, on_step=note, store="none", system=system, checkpoints=checkpoints,
+        begin=None if begin is None else begin.snapshot,
+    )  # fmt: skip
     shares = result.imbalance[1:, 0]
     told = tuple(replace(row, imbalance=float(share)) for row, share in zip(rows, shares, strict=True))
     return Donned(result, told, held)

@@ -7,7 +7,15 @@ order of the jobs whatever runs them, so a caller cannot tell one executor from 
 from .background import meanwhile
 from .choice import Placement, make_executor, placed, sharing
 from .cluster import QUEUES, DaskExecutor
-from .face import SAFE_PATH, THREAD_VARIABLES, Executor, Limits, SerialExecutor, usable_cores
+from .face import (
+    SAFE_PATH,
+    THREAD_VARIABLES,
+    Executor,
+    Limits,
+    SerialExecutor,
+    report_progress,
+    usable_cores,
+)
 from .processes import ProcessExecutor
 
 __all__ = [
@@ -23,6 +31,7 @@ __all__ = [
     "make_executor",
     "meanwhile",
     "placed",
+    "report_progress",
     "sharing",
     "usable_cores",
 ]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from ..errors import InputError
 from .cluster import DaskExecutor
@@ -96,8 +96,12 @@ class _Lent:
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
+        told: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return self._executor.map(function, jobs, keys, lost)
+        return self._executor.map(function, jobs, keys, lost, told)
+
+    def threads_for(self, jobs: int) -> int:
+        return self._executor.threads_for(jobs)
 
     def __enter__(self) -> Self:
         return self

@@ -49,14 +49,19 @@ class _Lost:
 _own = threading.local()  # of a Dask worker: the process that does the jobs of each of its threads
 
 
-def _guarded(function: Callable, job: Any, limits: Limits, contained: bool) -> Any:
-    """A job in a process of its own on a Dask worker; ``contained``: the answer says why it was lost."""
+def _guarded(function: Callable, job: Any, limits: Limits, contained: bool, number: int, topic: str) -> Any:
+    """A job in a process of its own on a Dask worker; ``contained``: the answer says why it was lost.
+
+    What it reports goes to those who listen to the ``topic``, with its ``number``.
+    """
     executor: ProcessExecutor | None = getattr(_own, "executor", None)
     if executor is None:
         executor = _own.executor = ProcessExecutor(1)
     executor.limits = limits
     lost = (lambda _, reason: _Lost(reason)) if contained else None
-    return next(executor.map(function, [job], lost=lost))
+    worker = _dask("distributed").get_worker()
+    told = (lambda _, message: worker.log_event(topic, (number, message))) if topic else None
+    return next(executor.map(function, [job], lost=lost, told=told))
 
 
 class DaskExecutor:
@@ -145,11 +150,20 @@ class DaskExecutor:
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
+        told: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return self._answers(function, *paired(jobs, keys), lost)
+        return self._answers(function, *paired(jobs, keys), lost, told)
+
+    def threads_for(self, jobs: int) -> int:
+        return 1
 
     def _answers(
-        self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None
+        self,
+        function: Callable,
+        jobs: list,
+        keys: Sequence[str | None],
+        lost: Callable | None,
+        told: Callable | None,
     ) -> Iterator[Any]:
         """Answers in order, with no more jobs at the scheduler than keep its workers busy.
 
@@ -158,8 +172,11 @@ class DaskExecutor:
         """
         name, contained = f"{function.__name__}-{uuid.uuid4().hex}", lost is not None
         futures: dict[int, Any] = {}  # whose answers were not given yet
-        ended: SimpleQueue[None] = SimpleQueue()
+        news: SimpleQueue[Any] = SimpleQueue()  # None: a job has ended; else its number and what it reports
+        topic = "" if told is None else name
         submitted, looked, present = 0, -math.inf, list[str]()
+        if topic:
+            self._client.subscribe_topic(topic, lambda event: news.put(event[1]))
         try:
             for i, job in enumerate(jobs):
                 while True:
@@ -169,27 +186,29 @@ class DaskExecutor:
                     room = _AHEAD * max(len(present), self._asked, 1) - under_way
                     for j in range(submitted, min(submitted + room, len(jobs))):
                         futures[j] = self._submit(
-                            f"{name}-{j}", function, jobs[j], contained, self._place(keys[j], present)
-                        )
-                        futures[j].add_done_callback(lambda _: ended.put(None))
+                            f"{name}-{j}", self._place(keys[j], present),
+                            function, jobs[j], self.limits, contained, j, topic,
+                        )  # fmt: skip
+                        futures[j].add_done_callback(lambda _: news.put(None))
                         submitted = j + 1
                     if futures[i].done():
                         break
                     with suppress(Empty):
-                        ended.get(timeout=_LOOK_S)
+                        said = news.get(timeout=_LOOK_S)
+                        if said is not None and told is not None:
+                            told(jobs[said[0]], said[1])
                 answer = self._result(futures.pop(i), contained)
                 yield lost(job, answer.reason) if isinstance(answer, _Lost) and lost else answer
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel([future for future in futures.values() if not future.done()])
+                if topic:
+                    self._client.unsubscribe_topic(topic)
 
-    def _submit(
-        self, name: str, function: Callable, job: Any, contained: bool, place: list[str] | None
-    ) -> Any:
+    def _submit(self, name: str, place: list[str] | None, *guarded: Any) -> Any:
         return self._client.submit(
-            _guarded, function, job, self.limits, contained,
-            key=name, pure=False, workers=place, allow_other_workers=place is not None,
-        )  # fmt: skip
+            _guarded, *guarded, key=name, pure=False, workers=place, allow_other_workers=place is not None
+        )
 
     def _place(self, key: str | None, present: list[str]) -> list[str] | None:
         """Where jobs of a key went before, if that worker lives; else the next worker in turn."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
-from typing import Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
@@ -35,6 +38,25 @@ class Limits:
 
 NO_LIMITS = Limits()
 
+_listener: ContextVar[Callable[[Any], None] | None] = ContextVar("_listener", default=None)
+
+
+def report_progress(message: Any) -> None:
+    """From within a job, to the ``told`` of whoever maps it: numbers and words, plain enough for JSON."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(message)
+
+
+@contextmanager
+def reporting_to(listener: Callable[[Any], None] | None) -> Iterator[None]:
+    """`report_progress` calls ``listener`` in this block."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
 
 class Executor(Protocol):
     """Runs a function over jobs; use it as a context, which ends its workers."""
@@ -46,12 +68,17 @@ class Executor(Protocol):
         """How many jobs it does at a time."""
         ...
 
+    def threads_for(self, jobs: int) -> int:
+        """How many threads each of so many jobs may have, so that no worker is idle beside them."""
+        ...
+
     def map(
         self,
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
+        told: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
         """Answers in the order of ``jobs``, as they are asked for.
 
@@ -63,6 +90,7 @@ class Executor(Protocol):
         ----------
         lost : makes the answer of a job that was lost twice, from it and the reason in words: its worker
             died, or it went over the executor's limits. Without it nothing limits the jobs.
+        told : is given a job and what it says by `report_progress`, while answers are waited for.
 
         Raises
         ------
@@ -107,8 +135,16 @@ class SerialExecutor:
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
+        told: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return map(function, paired(jobs, keys)[0])
+        def done(job: Job) -> Answer:
+            with reporting_to(None if told is None else partial(told, job)):
+                return function(job)
+
+        return map(done, paired(jobs, keys)[0])
+
+    def threads_for(self, jobs: int) -> int:
+        return usable_cores()
 
     def __enter__(self) -> Self:
         return self

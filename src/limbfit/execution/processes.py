@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from ..errors import RunError
 from .face import NO_LIMITS, Answer, Job, Limits, paired
-from .worker import GRACE_S, READY, JobOutcome, Worker
+from .worker import GRACE_S, READY, JobOutcome, JobReport, Worker
 
 TRIES = 2
 _LOOK_S = 0.25  # between two looks at what jobs take
@@ -38,11 +38,20 @@ class ProcessExecutor:
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
         lost: Callable[[Job, str], Answer] | None = None,
+        told: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return self._answers(function, *paired(jobs, keys), lost)
+        return self._answers(function, *paired(jobs, keys), lost, told)
+
+    def threads_for(self, jobs: int) -> int:
+        return max(self.workers * self.threads // max(jobs, 1), self.threads)
 
     def _answers(
-        self, function: Callable, jobs: list, keys: Sequence[str | None], lost: Callable | None
+        self,
+        function: Callable,
+        jobs: list,
+        keys: Sequence[str | None],
+        lost: Callable | None,
+        told: Callable | None,
     ) -> Iterator[Any]:
         if self._mapping:
             raise RuntimeError("the executor is already mapping: take all answers of one map before the next")
@@ -58,6 +67,10 @@ class ProcessExecutor:
                         busy[seat] = job
                         self._worker(seat).send(function, jobs[job])
                     for seat, outcome in self._collect(busy, limits):
+                        if isinstance(outcome, JobReport):
+                            if told is not None:
+                                told(jobs[busy[seat]], outcome.message)
+                            continue
                         job = busy.pop(seat)
                         if isinstance(outcome, JobOutcome):
                             answers[job] = outcome
@@ -87,8 +100,10 @@ class ProcessExecutor:
                 waiting.remove(job)
                 yield seat, job
 
-    def _collect(self, busy: dict[int, int], limits: Limits) -> Iterator[tuple[int, JobOutcome | str]]:
-        """Wait for workers to answer: (worker, outcome), or why there will be none."""
+    def _collect(
+        self, busy: dict[int, int], limits: Limits
+    ) -> Iterator[tuple[int, JobOutcome | JobReport | str]]:
+        """Wait for workers to say something: (worker, outcome or report), or why there will be none."""
         lines = {self._worker(seat).connection: seat for seat in busy}
         limited = limits.time_s or limits.memory_GB
         ready = wait(list(lines), _LOOK_S if limited else None)

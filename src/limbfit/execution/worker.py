@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from .face import SAFE_PATH, THREAD_VARIABLES, Limits
+from .face import SAFE_PATH, THREAD_VARIABLES, Limits, reporting_to
 
 GRACE_S = 2.0  # for workers to end when told so
 READY = "ready"  # a worker's first word: its start is not its first job's time
@@ -34,6 +35,13 @@ class JobOutcome:
         if self.error is not None:
             raise self.error from RuntimeError(f"in a worker process:\n{self.trace}")
         return self.answer
+
+
+@dataclass(frozen=True)
+class JobReport:
+    """What a job says while it goes on."""
+
+    message: Any
 
 
 class Worker:
@@ -55,8 +63,8 @@ class Worker:
         with suppress(OSError):  # it died while idle: reading its line tells so
             self.connection.send((function, job))
 
-    def receive(self) -> JobOutcome | str | None:
-        """The outcome of the job, `READY`, or None where the process is dead."""
+    def receive(self) -> JobOutcome | JobReport | str | None:
+        """The outcome of the job, what it reports, `READY`, or None where the process is dead."""
         try:
             message = self.connection.recv()
         except (EOFError, OSError):  # nothing more, or half a message
@@ -144,7 +152,8 @@ def serve(connection: Connection) -> None:
         connection.send(READY)
     while True:
         try:
-            outcome = _do(*connection.recv())
+            with reporting_to(lambda message: connection.send(JobReport(message))):
+                outcome = _do(*connection.recv())
         except (EOFError, ConnectionError):
             return
         except Exception as error:  # a function or job that this process cannot import

@@ -45,6 +45,7 @@ from .pressure import Pressure
 from .prestretch import isochoric_stretch
 from .problem import History, Problem, Support
 from .result import Result, State, Step
+from .snapshot import Checkpoints, Snapshot
 from .solution.compiling import are_compiled, compile_kernels
 from .solution.control import StepControl
 from .solution.guesses import tangent_at_rest
@@ -58,6 +59,7 @@ __all__ = [
     "ORDER_IN_TIME",
     "VOLUMETRIC_LAWS",
     "Activation",
+    "Checkpoints",
     "Contractile",
     "Doubt",
     "Fibred",
@@ -76,6 +78,7 @@ __all__ = [
     "RigidBody",
     "RigidSurface",
     "SmoothSurface",
+    "Snapshot",
     "State",
     "Step",
     "StepControl",

@@ -1,7 +1,7 @@
 """What others found where a socket presses, by region: to be read beside a result, without a verdict.
 
-Only findings that the cited abstracts state; figures in kPa depend on sensor, socket and activity and are
-left to the papers.
+Only findings that the cited abstracts state. Pressures in kPa, which depend on sensor, socket and activity,
+and thresholds of pain stand in the papers alone: no abstract gives them by region.
 """
 
 from __future__ import annotations
@@ -30,6 +30,24 @@ FINDINGS = (
         "the largest pressure and shear of stance, in its first half",
         "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
         SANDERS_1997,
+    ),
+    PublishedFinding(
+        ("tibial crest",),
+        "the skin across its distal part seemed to be in tension at both peaks of the load along the shank",
+        "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
+        SANDERS_1997,
+    ),
+    PublishedFinding(
+        ("lateral middle", "posterior proximal"),
+        "the directions of shear suggest that soft tissue moves towards the brim under load",
+        "measured at 13 sites, walking, 2 persons, total-contact patellar-tendon-bearing sockets",
+        SANDERS_1997,
+    ),
+    PublishedFinding(
+        ("fibular head",),
+        "a thicker gel liner lowers the peak pressure by 26 % (standard deviation 21 %)",
+        "measured, walking, liners of two uniform thicknesses, persons with a transtibial amputation",
+        "Boutwell et al., J Rehabil Res Dev 2012, 49:227",
     ),
     PublishedFinding(
         ("medial proximal", "lateral proximal"),

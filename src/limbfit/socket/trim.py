@@ -120,10 +120,23 @@ def trimmed(limb: LimbProfile, frame: Frame, trim: Trim) -> Trimmed:
         raise SurfaceError(
             f"the brim comes within {max(float(length[short].min()), 0.0):.0f} mm of the distal end, "
             f"and a socket needs {LEAST_MM:g} mm of face",
-            remedy="move the trimline up; the normals of its planes point proximally",
+            remedy="move the trimline up"
+            + ("; the normals of its planes point proximally" * bool(trim.planes)),
         )
     station = stations[after - 1] + share * (stations[after] - stations[after - 1])
     return Trimmed(points, ways, length, station)
+
+
+def brim_of(limb: LimbProfile, frame: Frame, trim: Trim, count: int) -> Array:
+    """Points (count, 3) of the limb where the brim runs, evenly around it, LPS mm; errors as of `trimmed`."""
+    found = trimmed(limb, frame, trim)
+    return frame.to_patient(found.along(found.length)[np.arange(count) * len(limb.angles) // count])
+
+
+def on_limb(limb: LimbProfile, frame: Frame, points: Array) -> Array:
+    """The points (k, 3) of the limb on the rays through others, LPS mm, such as those of a trimline."""
+    angle, station, _ = limb.rays.coordinates(frame.to_limb(points))
+    return frame.to_patient(limb.rays.points(angle, station, limb.at(angle, station)))
 
 
 def _over(points: Array, angles: Array, limb: LimbProfile, frame: Frame, trim: Trim) -> list[Array]:

@@ -55,7 +55,8 @@ def edit_study(file: Path, change: Callable[[tomlkit.TOMLDocument], None]) -> St
     written = Path(name)
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(tomlkit.dumps(document))
+            text = tomlkit.dumps(document)
+            stream.write(text if text.endswith("\n") else f"{text}\n")
         try:
             load_study(written, recorded=False)
         except StudyError as error:
@@ -160,14 +161,34 @@ def remove_area(file: Path, name: str) -> Study:
     return edit_study(file, change)
 
 
+def set_trimline(file: Path, points: Sequence[Sequence[float]] | None) -> Study:
+    """State ``socket.trimline`` (LPS, mm) in the place of any other brim; None: there is the default one."""
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        table = _socket(document)
+        for key in ("trim_mm", "trim_planes", "trimline"):
+            table.pop(key, None)
+        if points is not None:
+            rows = tomlkit.array()
+            rows.extend([[round(float(x), POSITION_DIGITS) + 0.0 for x in point] for point in points])
+            table["trimline"] = rows.multiline(True)
+
+    return edit_study(file, change)
+
+
 def _areas(document: tomlkit.TOMLDocument) -> Any:
     """The list of areas, made where there is none."""
-    if "socket" not in document:
-        document["socket"] = tomlkit.table()
-    table: Any = document["socket"]
+    table = _socket(document)
     if "areas" not in table:
         table["areas"] = tomlkit.aot()
     return table["areas"]
+
+
+def _socket(document: tomlkit.TOMLDocument) -> Any:
+    """The table ``[socket]``, made where there is none."""
+    if "socket" not in document:
+        document["socket"] = tomlkit.table()
+    return document["socket"]
 
 
 def _table_of(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:

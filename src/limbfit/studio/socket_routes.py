@@ -12,15 +12,18 @@ import numpy as np
 from fastapi import APIRouter, Response
 from pydantic import Field
 
-from ..errors import InputError
+from ..anatomy.frame import limb_frame
+from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
 from ..pipeline.shared.artefacts import digest
-from ..pipeline.shared.socket_shape import regions_of, socket_of
+from ..pipeline.shared.socket_shape import blaming, regions_of, socket_of, trim_of
 from ..socket import Socket
+from ..socket.rays import LimbProfile, profile
+from ..socket.trim import Trim, brim_of, on_limb, trimmed
 from ..study import Study
 from ..web.arrays import pack
 from ..web.shapes import patient_frame, volume_of
-from .editing import remove_area, set_area
+from .editing import remove_area, set_area, set_trimline
 from .folder import StudyFolder, fingerprint, stored
 from .identification_routes import last_run
 from .model_routes import Place, StrictModel, Text
@@ -33,6 +36,7 @@ router = APIRouter(prefix="/api/socket")
 SOCKET = "socket"  # the run of `limbfit socket`; others are designs, by their names
 NONE_YET = "there is no limb yet to draw a socket around: run the stages until surfaces"
 _FIELDS = {"pressure": "pressure_kPa", "shear": "shear_kPa"}
+HANDLES = 16  # along a brim that is no stated line
 Length = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -44,6 +48,12 @@ class AreaOfPage(StrictModel):
     region: Text | None = None
     radius_mm: Length
     depth_mm: Length
+
+
+class LineOfPage(StrictModel):
+    """A trimline of the page: ``points`` in order around the limb (LPS, mm), each put on its skin."""
+
+    points: Annotated[list[Place], Field(min_length=3, max_length=60)]
 
 
 class WantedRun(StrictModel):
@@ -127,8 +137,9 @@ def _block(arrays: dict[str, Any], facts: dict[str, Any]) -> Response:
 def shape_of(folder: StudyFolder) -> dict[str, Any]:
     """What ``[socket]`` says of the shape, and whether such a face can be drawn around the bare skin.
 
-    ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one,
-    ``mark``, which another face changes, ``problem`` in words or None, ``volume_cm3``.
+    ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one;
+    ``trim``: ``points`` where the brim runs on the skin, and whether they are those of a line; ``mark``,
+    which another face changes, ``problem`` in words or None, ``volume_cm3``.
     """
     study = folder.load()
     table, anatomy = study.socket, anatomy_of(folder, study)
@@ -139,6 +150,7 @@ def shape_of(folder: StudyFolder) -> dict[str, Any]:
     return {
         "file": None if table.file is None else table.file.name,
         "reduction_percent": table.reduction_percent,
+        "trim": {"points": _handles(folder, study), "is_line": bool(table.trimline)},
         "areas": [
             {
                 "name": area.name,
@@ -160,6 +172,30 @@ def _place(position: Any, region: str | None, regions: Mapping[str, Any]) -> lis
     if position is not None:
         return [float(x) for x in position]
     return [float(x) for x in regions[region].position] if region and region in regions else None
+
+
+def _handles(folder: StudyFolder, study: Study) -> list[list[float]]:
+    """Where the brim can be dragged: the points of the study's line alone, else some all around the brim."""
+    anatomy, table = anatomy_of(folder, study), study.socket
+    if anatomy is None or table.file is not None:
+        return []
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    try:
+        limb = _profile(folder, _surfaces_mark(folder, study))
+        if table.trimline and not table.trim_planes:
+            return [[*map(float, row)] for row in on_limb(limb, frame, np.array(table.trimline))]
+        return [[*map(float, row)] for row in brim_of(limb, frame, trim_of(study, anatomy), HANDLES)]
+    except SurfaceError:
+        return []  # `problem` says why there is no face
+
+
+@lru_cache(maxsize=2)
+def _profile(folder: StudyFolder, mark: str) -> LimbProfile:
+    """That of the bare skin; the last ones are kept, by the ``mark`` of the limb's surfaces."""
+    anatomy = anatomy_of(folder, folder.load())
+    if anatomy is None:
+        raise InputError(NONE_YET)
+    return profile(anatomy.skin, limb_frame(anatomy.cut_point, anatomy.cut_normal))
 
 
 def face_block(folder: StudyFolder) -> bytes:
@@ -186,11 +222,17 @@ def face_block(folder: StudyFolder) -> bytes:
 
 def _mark(folder: StudyFolder, study: Study) -> str:
     """Changes with the limb's surfaces, the socket's file and what the table says of the shape."""
-    table, given = study.socket, study.surfaces
-    files = [folder.results / "surfaces" / "surfaces.json"]
-    files += [study.path(path) for path in (() if given is None else (given.skin, *given.bones.values()))]
-    files += [] if table.file is None else [study.path(table.file)]
-    return f"{fingerprint(files)} {digest(table.model_dump(mode='json', exclude={'design', 'loads'}))}"
+    table = study.socket
+    file = fingerprint([] if table.file is None else [study.path(table.file)])
+    stated = digest(table.model_dump(mode="json", exclude={"design", "loads"}))
+    return f"{_surfaces_mark(folder, study)} {file} {stated}"
+
+
+def _surfaces_mark(folder: StudyFolder, study: Study) -> str:
+    given = study.surfaces
+    files = [study.path(path) for path in (() if given is None else (given.skin, *given.bones.values()))]
+    stated = digest(study.geometry.model_dump(mode="json"))
+    return f"{fingerprint([folder.results / 'surfaces' / 'surfaces.json', *files])} {stated}"
 
 
 @lru_cache(maxsize=2)
@@ -232,6 +274,35 @@ def post_area(folder: Folder, area: AreaOfPage) -> dict[str, Any]:
 def post_removal(folder: Folder, name: str) -> dict[str, Any]:
     """Take an area out of the study file."""
     remove_area(folder.file, name)
+    return shape_of(folder)
+
+
+@router.post("/trimline")
+def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
+    """Put a trimline into the study file, in the place of any other brim; the shape as it is afterwards.
+
+    Raises
+    ------
+    InputError
+        Where it does not go once around the limb, or leaves no socket; the file is left as it was.
+    """
+    study = folder.load()
+    anatomy = anatomy_of(folder, study)
+    if anatomy is None:
+        raise InputError(NONE_YET)
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    with blaming(study, "socket.trimline"):
+        limb = _profile(folder, _surfaces_mark(folder, study))
+        points = on_limb(limb, frame, np.array(line.points))
+        trimmed(limb, frame, Trim(line=points))
+    set_trimline(folder.file, points.tolist())
+    return shape_of(folder)
+
+
+@router.post("/trimline/remove")
+def post_default_brim(folder: Folder) -> dict[str, Any]:
+    """Take the trimline out of the study file: the brim is the default one."""
+    set_trimline(folder.file, None)
     return shape_of(folder)
 
 

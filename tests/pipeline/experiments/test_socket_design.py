@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import trimesh
 
 from limbfit import design_socket, load_study, report_study
 from limbfit.errors import InputError
+from limbfit.execution import Placement, placed
 from small_limb import small_limb
 
 SOCKET = """hold_s = 0.0
@@ -34,8 +38,15 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def designed(folder) -> dict:
-    return design_socket(load_study(folder))
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def designed(folder, said) -> dict:
+    """On two workers; ``said`` is its progress."""
+    with placed(Placement(workers=2)):
+        return design_socket(load_study(folder), listener=lambda progress: said.append(str(progress)))
 
 
 @pytest.mark.slow
@@ -53,6 +64,58 @@ def test_the_control_has_the_volume_of_the_design_and_the_same_load(designed):
     assert low < -0.3  # pressed in where tissue is deep
     assert high > 0.3  # and out of the way elsewhere, tissue does not vanish
     assert control["offset_mm"] != design["offset_mm"]
+
+
+@pytest.mark.slow
+def test_side_by_side_they_are_what_they_are_one_after_the_other(designed, said, folder, tmp_path):
+    names = [
+        name for line in said for name in ("control", "design") if f": {name}: " in line and " s: " in line
+    ]
+    assert {name: names.count(name) > 8 for name in ("control", "design")} == dict.fromkeys(names, True)
+    assert names.index("design") < len(names) - 1 - names[::-1].index("control")  # at the same time
+    shares = [float(line.split()[1]) for line in said if "kPa at most" in line]
+    assert shares == sorted(shares)
+    assert shares[-1] == 3.0
+    for file in ("study.toml", "skin.stl", "tibia.stl"):
+        shutil.copy(folder / file, tmp_path)
+    with placed(Placement(workers=1)):
+        alone = design_socket(load_study(tmp_path))
+    for one, other in zip(designed["designs"], alone["designs"], strict=True):
+        assert one["volume_cm3"] == other["volume_cm3"]
+        assert one["peaks_kPa"] == pytest.approx(other["peaks_kPa"], rel=1e-3)
+        assert one["simulation"]["steps"][-1]["move_mm"] == pytest.approx(
+            other["simulation"]["steps"][-1]["move_mm"], abs=1e-3
+        )
+
+
+@pytest.mark.slow
+def test_an_interrupt_ends_both_and_both_go_on_after_donning(designed, folder, tmp_path):
+    """Interrupted when both are loaded, after 2 of 3 s."""
+    for file in ("study.toml", "skin.stl", "tibia.stl"):
+        shutil.copy(folder / file, tmp_path)
+    times: dict[str, list[float]] = {"control": [], "design": []}
+
+    def listen(progress) -> None:
+        found = re.search(r": (control|design): ([0-9.]+) of 3 s", str(progress))
+        if found:
+            times[found[1]].append(float(found[2]))
+
+    def stop(progress) -> None:
+        listen(progress)
+        if all(max(told, default=0.0) > 2.05 for told in times.values()):
+            raise KeyboardInterrupt
+
+    with placed(Placement(workers=2)):
+        with pytest.raises(KeyboardInterrupt):
+            design_socket(load_study(tmp_path), listener=stop)
+        assert not [one for one in psutil.Process().children() if "spawn_main" in " ".join(one.cmdline())]
+        for told in times.values():
+            told.clear()
+        again = design_socket(load_study(tmp_path), listener=listen)
+    assert all(min(told) > 2.0 for told in times.values())
+    for one, other in zip(designed["designs"], again["designs"], strict=True):
+        assert one["peaks_kPa"] == pytest.approx(other["peaks_kPa"], rel=1e-3)
+    assert not list(tmp_path.glob("results/socket_design/runs/begun-*"))
 
 
 @pytest.mark.slow

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,6 +111,63 @@ def test_it_is_not_done_twice_and_the_report_shows_it(found, folder):
     assert "not a medical device" in page
     assert page.count("stance, anterior view") == 2  # pressure and shear
     assert "cuts along and across it through the largest shear" in page
+
+
+def begin(folder: Path) -> subprocess.Popen:
+    """The command on one core: what several threads add up comes in any order."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "limbfit", "socket", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: os.sched_setaffinity(0, {max(os.sched_getaffinity(0))}),
+    )
+
+
+def seconds_told(lines: list[str]) -> list[float]:
+    """The simulated times that a run says it is at."""
+    found = (re.search(r"([0-9.]+) of 5 s: ", line) for line in lines)
+    return [float(one[1]) for one in found if one]
+
+
+def stored_parts(folder: Path) -> tuple[dict, list[np.ndarray]]:
+    """What a run stored, but for how long it took: facts, and fields of every part."""
+    results = folder / "results" / "socket"
+    facts = json.loads((results / "socket.json").read_text())
+    meshes = [pv.read(results / f"held-{i}.vtu") for i in (0, 1)]
+    fields = [data[name] for mesh in meshes for data in (mesh.point_data, mesh.cell_data) for name in data]
+    return {key: value for key, value in facts.items() if key not in ("seconds", "mesh")}, fields
+
+
+@pytest.mark.slow
+def test_one_that_was_killed_in_its_load_goes_on_after_donning_to_the_same_end(folder, tmp_path):
+    """SIGKILL of the command when the load is on its way: donning and hold, 3 s of 5, are not done again."""
+    straight, killed = tmp_path / "straight", tmp_path / "killed"
+    for place in (straight, killed):
+        place.mkdir()
+        for file in ("study.toml", "skin.stl", "tibia.stl"):
+            shutil.copy(folder / file, place)
+    run = begin(killed)
+    while not any(time > 3.1 for time in seconds_told([run.stderr.readline()])):
+        assert run.poll() is None, "the run ended before"
+    run.send_signal(signal.SIGKILL)
+    run.communicate()
+    assert not (killed / "results" / "socket").exists()
+    assert len(list(killed.glob("results/.work-socket-*/runs/begun-*.npz"))) == 1
+    said = {}
+    for place in (straight, killed):
+        run = begin(place)
+        _, lines = run.communicate(timeout=600)
+        assert run.returncode == 0, lines
+        said[place] = seconds_told(lines.splitlines())
+    assert min(said[straight]) < 1.0
+    assert min(said[killed]) > 3.0
+    assert said[killed] == said[straight][-len(said[killed]) :]
+    (one, fields), (other, again) = map(stored_parts, (straight, killed))
+    assert other == one
+    for before, after in zip(fields, again, strict=True):
+        np.testing.assert_array_equal(after, before)
+    assert not list((killed / "results" / "socket" / "runs").iterdir())
 
 
 PULL = """friction = 0.0

@@ -77,8 +77,12 @@ class Factor:
         self._ground = body_stiffness(system, moduli)
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self._shift = self._next_shift = 0.0
-        self._costs = [0.0]
+        self._wanted = self._choice
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget every matrix: what follows does not depend on those that there were."""
+        self._choice, self._shift, self._next_shift, self._costs = self._wanted, 0.0, 0.0, [0.0]
         self.ready = False
         self._use(single=True)
 

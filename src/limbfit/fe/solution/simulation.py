@@ -100,16 +100,16 @@ class SteppedRun:
         start = problem.history.displacement_at(0.0)
         self.grips = begun(self.system, self.grips, rest, drives)
         self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
-        self.reason = ""
+        self.reason, self.pace = "", Pace(control.max_iterations)
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
         self.seconds["setup"] = time.perf_counter() - started
 
     def run(self) -> Iterator[Step]:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
-        targets = list(self.planned)
-        pace, why = Pace(self.control.max_iterations), ""
-        if len(self.system.prestretch) and not self._rested():
+        begun, pace, why = self.states[-1].time, self.pace, ""
+        targets = [t for t in self.planned if t > begun * (1.0 + 1e-9)]
+        if not begun and len(self.system.prestretch) and not self._rested():
             return
         times, forces = [0.0], [0.0]
         while targets:

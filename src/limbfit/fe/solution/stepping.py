@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -16,13 +17,21 @@ from numpy.typing import NDArray
 
 from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced, unsettled
 from ..observables import element_fields
-from ..problem import Problem
+from ..problem import Problem, ProblemError
 from ..result import Result, State, Step
+from ..snapshot import Checkpoints, Snapshot
 from ..system import System
 from .control import StepControl
 from .simulation import SteppedRun
 
 Array = NDArray[np.float64]
+# What is kept of steps; of a run as it is; and of its parts, as dataclasses.
+_COLUMNS = (
+    "time", "displacement", "force", "penetration", "contact_area", "newton_iterations", "force_sensitivity",
+    "reactions", "coordinates", "displacement_sensitivity",
+)  # fmt: skip
+_PLAIN = ("stiffness", "damping", "floor", "pushing", "unbalanced", "unsettled")
+_PARTS = ("memory", "slope", "pace")
 
 
 def iterate(
@@ -50,6 +59,8 @@ def solve(
     on_step: Callable[[Step], None] | None = None,
     store: str = "peak",
     system: System | None = None,
+    checkpoints: Checkpoints | None = None,
+    begin: Snapshot | None = None,
 ) -> Result:
     """Simulate an indentation.
 
@@ -61,6 +72,10 @@ def solve(
     store : which states to keep: ``peak`` (the deepest of the loading), ``all`` (its stresses only) or
         ``none``.
     system : the discretisation of the same mesh, supports and contact faces, where it is known.
+    checkpoints : when to keep what a later call can ``begin`` with; of problems without an indenter and with
+        stated times.
+    begin : of an earlier call with the same problem, steps, sensitivities and checkpoints, whose result this
+        one then has: with one thread, to the last bit.
 
     Raises
     ------
@@ -68,9 +83,14 @@ def solve(
         Before anything is solved, where the problem is impossible as stated.  A simulation that cannot go
         on is no error: the result says ``completed = False`` and why.
     """
+    if (checkpoints or begin) and (problem.indenter is not None or steps.times is None):
+        raise ProblemError("only a simulation without an indenter and with stated times can be gone on with")
     started = time.perf_counter()
     run = SteppedRun(problem, steps, sensitivities, warm_start, system)
     rows: list[Step] = []
+    if begin is not None:
+        rows = _resumed(run, begin)
+        started -= begin["seconds"]
     kept: list[State] = []
     deepest_state: State | None = None
     loading_s = problem.history.loading_s * (1.0 + 1e-9)
@@ -87,7 +107,50 @@ def solve(
             kept.append(step.state if deepest else replace(step.state, memory=None))
         if on_step is not None:
             on_step(step)
+        if checkpoints is not None and checkpoints.at(step.time):
+            checkpoints.keep(_snapshot(run, rows, time.perf_counter() - started))
+            for factor in {id(one): one for one in (run.factor, run.slopes)}.values():
+                factor.begin_anew()  # as that of a run that begins here does
     return _result(problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started)
+
+
+def _snapshot(run: SteppedRun, rows: list[Step], seconds: float) -> Snapshot:
+    """All that the further steps of a run, and its result, depend on."""
+    columns = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
+    return Snapshot.of(
+        states=[replace(state, memory=None, grips=()) for state in run.states],
+        driven=[body.motion.values for body in run.problem.bodies],
+        grips=run.grips,
+        count=len(run.states),
+        **{name: None if values[0] is None else np.array(values) for name, values in columns.items()},
+        **{name: copy(getattr(run, name)) for name in (*_PLAIN, *_PARTS)},
+        counts=dict(run.counts),
+        inexact=run.slopes.counts["inexact"],
+        seconds=seconds,
+    )
+
+
+def _resumed(run: SteppedRun, begin: Snapshot) -> list[Step]:
+    """Put a run where another was; the steps up to there, without their states."""
+    first = run.states[0]
+    values = zip(run.problem.bodies, begin["driven"], strict=True)
+    bodies = [replace(one, motion=replace(one.motion, values=np.array(driven))) for one, driven in values]
+    run.problem = replace(run.problem, bodies=tuple(bodies))
+    for name in _PLAIN:
+        setattr(run, name, copy(begin[name]))
+    for name in _PARTS:
+        if getattr(run, name) is not None:
+            setattr(run, name, begin.like(name, getattr(run, name)))
+    run.grips = tuple(grip and begin.like(f"grips.{i}", grip) for i, grip in enumerate(run.grips))
+    run.states = [replace(begin.like(f"states.{i}", first), grips=()) for i in range(begin["count"])]
+    run.counts.update(begin["counts"])
+    run.slopes.counts["inexact"] = begin["inexact"]
+    columns = {name: begin[name] for name in _COLUMNS if begin[name] is not None}
+    nothing: dict[str, Any] = dict.fromkeys(_COLUMNS)
+    return [
+        Step(state=first, **nothing | {name: column[i] for name, column in columns.items()})
+        for i in range(len(columns["time"]))
+    ]
 
 
 def _result(

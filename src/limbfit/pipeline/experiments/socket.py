@@ -14,6 +14,7 @@ from ...socket import Socket
 from ...socket.published import published
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
+from ..shared.kept import Begun, Kept
 from ..shared.socket_shape import socket_of
 from .socket_limb import Covariance, SocketLimb
 
@@ -40,7 +41,9 @@ def run_socket(
     def told(time: float, end: float, words: str) -> None:
         context.tell(NAME, time, end, words)
 
-    found = limb.don(mesh, limb.materials(parameters), socket, told, covariance_log is not None)
+    known = covariance_log is not None
+    begun = Begun(Kept(folder), limb.key(folder, parameters, socket, known))
+    found = limb.don(mesh, limb.materials(parameters), socket, told, known, begun=begun)
     content = limb.facts(found, socket, covariance_log) | {
         "parameters": parameters,
         "parameters_from": parameters_from,
@@ -51,6 +54,7 @@ def run_socket(
     write_json(folder / "socket.json", content)
     _write_fields(folder, mesh, found)
     _write_tables(folder, content)
+    begun.drop()
     return {}
 
 

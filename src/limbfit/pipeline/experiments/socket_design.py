@@ -21,6 +21,7 @@ from ...donning import outer_surface, press, pressed_problem
 from ...donning.model import OUTER
 from ...donning.relief import Relief, Trial
 from ...errors import RunError, SurfaceError
+from ...execution import Executor, SerialExecutor
 from ...fe import Step
 from ...fe.materials import Material
 from ...indentation import Parameters, fibre_field
@@ -31,12 +32,12 @@ from ...socket.rays import profile
 from ...socket.rectify import reduced_to
 from ...socket.targets import Target, zone
 from ...socket.wall import thickness, wall
-from ..shared.artefacts import digest, file_digest, write_json, write_table
+from ..shared.artefacts import digest, write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Kept, Made
 from ..shared.socket_shape import blaming, check_regions, recipe_of
 from ..shared.sources import code_digest
-from .socket_limb import SocketLimb
+from .socket_limb import SocketLimb, Wearing, wear, worn
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ def run_socket_design(
             design.face.volume_mm3, bench.limb.outer.skin, bench.frame, bench.recipe
         )
         control = _Made(CONTROL, control_face, facts={"reduction_percent": reduction})
-        done = {one.name: bench.put_on(one) for one in (control, design)}
+        done = {one.name: one for one in bench.put_on(control, design)}
         found: dict[str, Any] = {}
         if optimise:
             best, found = _optimised(bench, recipe, done, optimise, simulations)
@@ -122,7 +123,7 @@ class _Bench:
     recipe: Recipe
     plain: Socket
     kept: Kept
-    given: str
+    parameters: Parameters
     total: int
     count: int = 0
 
@@ -133,14 +134,9 @@ class _Bench:
         frame = limb_frame(limb.anatomy.cut_point, limb.anatomy.cut_normal)
         plain = rectified(limb.outer.skin, frame, replace(recipe, reduction_percent=0.0))
         mesh, facts = limb.mesh(context, NAME, folder, plain)
-        table = study.socket.model_dump(mode="json", exclude={"design"})
-        given = digest(
-            *(table, study.material.model_dump(mode="json"), parameters),
-            *(file_digest(folder / "limb.vtu"), code_digest(SocketLimb.of), code_digest(press)),
-        )
         kept = Kept(folder, also=[context.store[NAME]])
         laws = limb.materials(parameters)
-        return cls(context, limb, mesh, facts, laws, recipe, plain, kept, given, 3 + more)
+        return cls(context, limb, mesh, facts, laws, recipe, plain, kept, parameters, 3 + more)
 
     @property
     def frame(self) -> Frame:
@@ -175,7 +171,8 @@ class _Bench:
                 )
             return {"statistics": result.statistics}, {"displacement": result.states[-1].u}
 
-        _, fields = self.kept.get(digest("pressed", self.given, pressure.tolist()), make)
+        given = self._key(self.plain), code_digest(press), pressure.tolist()
+        _, fields = self.kept.get(digest("pressed", *given), make)
         self.count += 1
         limb = profile(self.limb.outer.skin, self.frame)
         before, after = outer_surface(self.mesh), outer_surface(self.mesh, fields["displacement"])
@@ -201,27 +198,35 @@ class _Bench:
             adapter_mm=table.adapter_mm,
         )
 
-    def put_on(self, one: _Made) -> _Made:
-        """With what happens when it is put on and loaded."""
-        face = one.face
+    def put_on(self, *made: _Made) -> list[_Made]:
+        """With what happens when each is put on and loaded: several side by side on the study's workers."""
+        jobs = [self._job(one) for one in made]
+        left = [job for job in jobs if self.kept.find(job.key) is None]
+        executor: Executor = self.context.executor if len(left) > 1 else SerialExecutor()
+        shares = dict.fromkeys((job.name for job in left), 0.0)
+        self.count += len(jobs) - len(left)
 
-        def told(time: float, end: float, words: str) -> None:
-            self.tell(time / end, f"{one.name}: {words}")
+        def told(job: Wearing, message: tuple[float, str]) -> None:
+            shares[job.name], words = message
+            self.tell(sum(shares.values()), f"{job.name}: {words}")
 
-        def make() -> Made:
-            found = self.limb.don(self.mesh, self.laws, face, told)
-            fields = {
-                f"{name}.{part}": getattr(held, part)
-                for name, held in found.held.items()
-                for part in ("pressure", "shear", "displacement")
-            }
-            return self.limb.facts(found, face), fields
+        threads = executor.threads_for(len(left))
+        for _ in executor.map(wear, [replace(job, threads=threads) for job in left], told=told):
+            pass  # each keeps what it found
+        self.count += len(left)
+        done = []
+        for one, job in zip(made, jobs, strict=True):
+            facts, fields = worn(job)
+            self.tell(0.0, f"{one.name}: {_peak(facts):.0f} kPa at most")
+            done.append(replace(one, facts={**one.facts, "simulation": facts}, fields=fields))
+        return done
 
-        key = digest(self.given, face.points.tolist(), face.clear.tolist())
-        facts, fields = self.kept.get(key, make)
-        self.count += 1
-        self.tell(0.0, f"{one.name}: {_peak(facts):.0f} kPa at most")
-        return replace(one, facts={**one.facts, "simulation": facts}, fields=fields)
+    def _job(self, one: _Made) -> Wearing:
+        key = self._key(one.face)
+        return Wearing(one.name, self.limb, self.mesh, self.laws, one.face, self.kept, key)
+
+    def _key(self, face: Socket) -> str:
+        return self.limb.key(self.kept.folder.parent, self.parameters, face)
 
     def told(self, one: _Made) -> dict[str, Any]:
         """What is stored of a design."""
@@ -284,7 +289,7 @@ def _optimised(
 def _tried(bench: _Bench, recipe: Recipe, depths: Mapping[str, float], number: int) -> _Made | str:
     """A design put on the limb; words where it cannot be."""
     try:
-        return bench.put_on(bench.made(f"{OPTIMISED}, {number}", recipe, depths))
+        return bench.put_on(bench.made(f"{OPTIMISED}, {number}", recipe, depths))[0]
     except (SurfaceError, RunError) as error:
         bench.count += 1
         bench.tell(0.0, f"{OPTIMISED}, {number}: {error}")

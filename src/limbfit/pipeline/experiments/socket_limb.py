@@ -15,9 +15,22 @@ from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.liner import under_liner
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
-from ...donning import SETTLING, Donned, Held, Load, Patch, SocketFit, SocketStep, don, socket_problem
+from ...donning import (
+    SETTLING,
+    Donned,
+    Held,
+    Load,
+    Patch,
+    SocketFit,
+    SocketStep,
+    don,
+    pack,
+    socket_problem,
+    unpack,
+)
 from ...donning.model import OUTER
 from ...errors import InputError, RunError
+from ...execution import report_progress
 from ...fe import Doubt
 from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
@@ -27,10 +40,12 @@ from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
 from ...socket.regions import SkinRegion
 from ...study import Study
-from ..shared.artefacts import read_json
+from ..shared.artefacts import digest, file_digest, read_json
 from ..shared.context import Context
+from ..shared.kept import Begun, Kept, Made
 from ..shared.simulations import fibres_of
 from ..shared.socket_shape import load_of, regions_of
+from ..shared.sources import code_digest
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
 from .socket_intervals import Spread, spread_facts
 
@@ -38,7 +53,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Covariance = Sequence[Sequence[float]] | None
 
-LINER = "liner"
+LINER, MESH = "liner", "limb.vtu"
 BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
 FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those below, and how elements grow
 
@@ -88,7 +103,7 @@ class SocketLimb:
 
     def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, dict[str, Any]]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
-        file = folder / "limb.vtu"
+        file = folder / MESH
         if not is_meshed(file):
             context.tell(name, 0, 0, "a mesh of the whole limb")
             fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
@@ -141,6 +156,15 @@ class SocketLimb:
         masks = {name: region.faces[below] & covered for name, region in self.regions.items()}
         return {name: mask for name, mask in masks.items() if mask.any()}
 
+    def key(self, folder: Path, parameters: Parameters, socket: Socket, sensitivities: bool = False) -> str:
+        """Of all that decides what a socket does to this limb, whose `mesh` is kept in the folder."""
+        table = self.study.socket.model_dump(mode="json", exclude={"design"})
+        return digest(
+            *(table, self.study.material.model_dump(mode="json"), parameters, sensitivities),
+            *(file_digest(folder / MESH), code_digest(SocketLimb.of), code_digest(don)),
+            *(socket.points.tolist(), socket.clear.tolist()),
+        )
+
     def don(
         self,
         mesh: Mesh,
@@ -148,12 +172,16 @@ class SocketLimb:
         socket: Socket,
         told: Callable[[float, float, str], None],
         sensitivities: bool = False,
+        threads: int | None = None,
+        begun: Begun | None = None,
     ) -> Donned:
         """Put a socket on and load it.
 
         Parameters
         ----------
         told : is given the time, the end of all, both s, and words.
+        threads : by default the machine's.
+        begun : where it is kept after donning and each load, and goes on where it was killed.
 
         Raises
         ------
@@ -169,7 +197,17 @@ class SocketLimb:
             told(row.time, end, words)
 
         problem = replace(socket_problem(mesh, laws, socket, fit), fibres=fibre_field(self.fibres, mesh))
-        found = don(problem, fit, self.faces(mesh, socket), sensitivities=sensitivities, on_row=on_row)
+        before = None if begun is None else begun.latest()
+        found = don(
+            problem,
+            fit,
+            self.faces(mesh, socket),
+            sensitivities=sensitivities,
+            on_row=on_row,
+            threads=threads,
+            keep=None if begun is None else lambda part: begun.put(pack(part)),
+            begin=None if before is None else unpack(*before),
+        )
         if not found.result.completed:
             raise RunError(_stopped(found, fit))
         return found
@@ -216,6 +254,47 @@ class SocketLimb:
         """What is stored of the liner."""
         table = self.study.socket.liner
         return {"thickness_mm": table.thickness_mm, "material": table.material} | table.parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Wearing:
+    """A job: a socket's face that is put on a limb and loaded, and where what comes of it is kept."""
+
+    name: str
+    limb: SocketLimb
+    mesh: Mesh
+    laws: Mapping[str, Material]
+    face: Socket
+    kept: Kept
+    key: str
+    threads: int | None = None
+
+
+def wear(job: Wearing) -> None:
+    """Do the job, which reports how far it is, from 0 to 1, in words."""
+    worn(job)
+
+
+def worn(job: Wearing) -> Made:
+    """Facts, and pressure, shear and displacement at the mesh's nodes after donning and each load."""
+
+    begun = Begun(job.kept, job.key)
+
+    def told(time: float, end: float, words: str) -> None:
+        report_progress([time / end, words])
+
+    def make() -> Made:
+        found = job.limb.don(job.mesh, job.laws, job.face, told, threads=job.threads, begun=begun)
+        fields = {
+            f"{name}.{part}": getattr(held, part)
+            for name, held in found.held.items()
+            for part in ("pressure", "shear", "displacement")
+        }
+        return job.limb.facts(found, job.face), fields
+
+    made = job.kept.get(job.key, make)
+    begun.drop()
+    return made
 
 
 def warning(doubt: Doubt) -> str:

@@ -36,7 +36,7 @@ def socket_section(store: Results, content: Json) -> Section:
         settling_figure(content),
         _regions(names, held),
         *interval_blocks(held[-1], names[-1]),
-        *published_blocks(content),
+        *published_blocks(content, held[-1], names[-1]),
         *inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
         _inside(names, held),
         Prose(

@@ -60,13 +60,21 @@ def interval_blocks(held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
     return (Table("socket-intervals", caption, tuple(head), tuple(lines)),)
 
 
-def published_blocks(content: Json) -> tuple[Block, ...]:
-    """What others found over the regions of this result."""
+def published_blocks(content: Json, held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
+    """What others found over the regions of this result, beside its pressures when a part has been held."""
     found = content["published"]
-    head = ("Region", "Found", "How", "Source")
-    rows = [
-        Row((heading(", ".join(one["regions"])), *(Cell(one[key]) for key in ("found", "method", "source"))))
-        for one in found
-    ]
-    caption = "What others found over these regions. No limit and no verdict is implied."
+    here = {row["region"]: row for row in held["regions"]}
+    regions = dict.fromkeys(name for one in found for name in one["regions"])
+    head = ("Region", "Here: mean (kPa)", "Here: peak (kPa)", "Found by others", "How", "Source")
+    rows = []
+    for name in regions:
+        own = [numeric(fixed(here.get(name, held)[key])) for key in ("mean_kPa", "peak_kPa")]
+        for one in found:
+            if name in one["regions"]:
+                told = (Cell(one[key]) for key in ("found", "method", "source"))
+                rows.append(Row((heading(name), *own, *told)))
+    caption = (
+        f"Pressures of this simulation, {title}, and what others found over these regions. No limit and no "
+        "verdict is implied."
+    )
     return (Table("socket-published", caption, head, tuple(rows)), Prose(PAPERS))

@@ -2,6 +2,7 @@
 import { el, replace } from "/static/dom.js";
 import { readArrays } from "/web/arrays.js";
 import { labelled } from "/static/views/parts.js";
+import { TrimHandles } from "/static/views/socket_trim.js";
 
 const FACE = "#b9c2cc", PRESSED = "#d55e00", RELIEVED = "#0072b2", DRAFT = "#cc79a7";
 const NEW = { position_mm: null, region: null, radius_mm: 25, depth_mm: 3 };
@@ -14,7 +15,8 @@ export class ShapeEditor {
     this.list = el("ul", { class: "plain site-list" });
     this.adder = el("button", { type: "button", onclick: () => this.begin({ ...NEW, name: this.nextName(), fresh: true }) }, "Add an area");
     this.form = el("div", { class: "site-form" });
-    this.part = el("div", {}, this.state, el("h2", {}, "Areas"), this.list, el("div", { class: "row" }, this.adder), this.form);
+    this.trim = new TrimHandles(view, (path, values, text) => this.send(path, values, text));
+    this.part = el("div", {}, this.state, this.trim.part, el("h2", {}, "Areas"), this.list, el("div", { class: "row" }, this.adder), this.form);
   }
 
   /** Show a shape of the server; its face is read where it is another one. */
@@ -34,6 +36,7 @@ export class ShapeEditor {
       this.draw(arrays);
       this.read = shape.mark;
     }
+    this.trim.take(shape);
     this.marks();
   }
 
@@ -64,6 +67,7 @@ export class ShapeEditor {
   leave() {
     this.turn++;
     Object.assign(this, { read: null, values: null, draft: null });
+    if (this.view.viewer) this.trim.clear();
     if (this.view.viewer) Object.assign(this.view.viewer, { placing: false });
   }
 
@@ -156,14 +160,17 @@ export class ShapeEditor {
       await this.take(shape);
       context.say(text);
       context.refresh();
+      return true;
     } catch (error) {
       context.warn(error.message);
+      return false;
     }
   }
 
   marks() {
     const { viewer, frame } = this.view;
     if (!viewer || !this.shape) return;
+    this.trim.aside(Boolean(this.draft));
     const inward = (point) => {
       const up = frame[2], from = viewer.view.home.target.map((value, k) => value - point[k]);
       const along = from.reduce((sum, value, k) => sum + value * up[k], 0);

@@ -1,0 +1,104 @@
+"""A socket's simulation that goes on from a kept part is the one that went through, to the last bit.
+
+With one thread: what several add up comes in any order.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
+from bodies import limb
+
+from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.meshing.layers import LayerSpec
+from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
+from limbfit.donning import Load, SocketFit, don, pack, socket_problem, unpack
+from limbfit.errors import ProblemError
+from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
+from limbfit.pipeline.shared.kept import Begun, Kept
+from limbfit.socket import Recipe, rectified
+from limbfit.socket.trim import Trim
+
+UP = np.array([0.0, 0.0, 1.0])
+TISSUES = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}
+
+
+@pytest.fixture(scope="module")
+def donned(tmp_path_factory):
+    """The arguments of a simulation with derivatives, its outcome, and what was kept of each part."""
+    anatomy, folder = limb(), tmp_path_factory.mktemp("parts")
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    trim = Trim([(anatomy.cut_point - 26.0 * anatomy.cut_normal, anatomy.cut_normal)])
+    socket = rectified(anatomy.skin, frame, Recipe(trim=trim, reduction_percent=3.0, distal_clearance_mm=3.0))
+    settings = MeshSettings(edge_near_mm=14.0, edge_far_mm=24.0, growth=0.6, layers=(LayerSpec("skin", 3.0),))
+    mesh, _ = mesh_limb(anatomy, settings, 10.0)
+    loads = [
+        Load(name, force * UP, np.zeros(3), anatomy.cut_point, 1.0, hold)
+        for name, force, hold in (("stance", 60.0, 0.0), ("walk", 90.0, 1.0))
+    ]
+    fit = SocketFit(anatomy.cut_point, UP, np.array([0.0, -1.0, 0.0]), 0.3, 1.0, 0.5, loads=loads)
+    problem = socket_problem(mesh, TISSUES, socket, fit)
+    middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
+    given = problem, fit, {"front": middles[:, 1] < anatomy.cut_point[1] - 20.0}
+    places: list[Begun] = []
+
+    def keep(part):
+        places.append(Begun(Kept(folder), str(len(places))))
+        places[-1].put(pack(part))
+
+    return given, don(*given, sensitivities=True, threads=1, keep=keep), places
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", [0, 1])
+def test_what_goes_on_from_a_part_is_what_went_through(donned, which):
+    """After donning, and after the first load: rows, fields and derivatives."""
+    given, whole, places = donned
+    assert len(places) == 2
+    told: list[float] = []
+    begin = unpack(*places[which].latest())
+    found = don(
+        *given,
+        sensitivities=True,
+        threads=1,
+        keep=lambda part: None,
+        begin=begin,
+        on_row=lambda row: told.append(row.time),
+    )
+    assert list(begin.held) == ["donning", "stance"][: which + 1]
+    assert min(told) > [1.5, 2.5][which]  # nothing before is done again
+    assert len(told) < len(whole.rows)
+    assert found.result.completed
+    np.testing.assert_equal([asdict(row) for row in found.rows], [asdict(row) for row in whole.rows])
+    np.testing.assert_equal(
+        {name: asdict(one) for name, one in found.held.items()},
+        {name: asdict(one) for name, one in whole.held.items()},
+    )
+    assert found.result.doubts == whole.result.doubts
+    for count in ("steps", "cuts", "newton_iterations"):
+        assert found.result.statistics[count] == whole.result.statistics[count]
+
+
+def test_what_is_at_its_end_is_not_kept_on(tmp_path):
+    begun = Begun(Kept(tmp_path), "a")
+    assert begun.latest() is None
+    begun.put(({"n": 1}, {"x": np.arange(3.0)}))
+    begun.put(({"n": 2}, {"x": np.arange(4.0)}))
+    facts, arrays = begun.latest()
+    assert (facts, arrays["x"].tolist()) == ({"n": 2}, [0.0, 1.0, 2.0, 3.0])
+    begun.drop()
+    assert begun.latest() is None
+    assert not list((tmp_path / "runs").iterdir())
+
+
+@pytest.mark.slow
+def test_only_stated_times_can_be_gone_on_with(donned):
+    (problem, *_), _, _ = donned
+    with pytest.raises(ProblemError, match="with stated times"):
+        solve(problem, StepControl(), checkpoints=Checkpoints([1.0], print))
