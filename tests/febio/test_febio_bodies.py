@@ -164,10 +164,11 @@ def test_a_pressure_alone_is_read_back(tmp_path):
     assert found.pressures[0].at(0.5) == pytest.approx(1e-3)
 
 
-def test_a_force_between_the_axes_is_refused_and_can_be_turned(tmp_path):
+def test_a_force_between_the_axes_beside_a_move_is_refused_and_can_be_turned(tmp_path):
     problem = punched_block("tet4", 4)
     oblique = replace(problem.indenter, axis=(0.1, 0.0, -1.0))
-    history = History(np.array([0.0, 1.0]), force=np.array([0.0, 1.0]))
+    across = np.array([[0.0, 0.0], [0.5, 0.0]])
+    history = History(np.array([0.0, 1.0]), force=np.array([0.0, 1.0]), across=across)
     faces = problem.contact_faces
     problem = replace(problem, indenter=oblique, history=history)
     with pytest.raises(ProblemError, match=r"between x, y and z.*in_indenter_frame"):

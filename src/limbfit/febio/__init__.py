@@ -1,6 +1,7 @@
 """FEBio beside limbfit: its inputs as problems, problems as its inputs, its runs and logs as results."""
 
 from .abaqus import write_inp
+from .beginning import end_of_file
 from .logs import Log, read_log
 from .optimising import Range, in_indenter_frame, write_optimisation
 from .penalty import FaceWise, mean_penalty
@@ -24,6 +25,7 @@ __all__ = [
     "axial_force",
     "contact_of",
     "differences",
+    "end_of_file",
     "find_febio",
     "in_indenter_frame",
     "judge",

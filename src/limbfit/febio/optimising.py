@@ -54,7 +54,8 @@ def in_indenter_frame(problem: Problem) -> Problem:
         there = shape.placed(place, frame @ shape.frame[2], frame @ shape.frame[0])
         bodies.append(replace(body, shape=there, pivot=(body.origin - centre) @ frame.T))
     fibres = None if problem.fibres is None else np.asarray(problem.fibres, dtype=float) @ frame.T
-    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies), fibres=fibres)
+    G = None if problem.prestretch is None else frame @ np.asarray(problem.prestretch, dtype=float) @ frame.T
+    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies), fibres=fibres, prestretch=G)
 
 
 def write_optimisation(

@@ -254,7 +254,7 @@ class SteppedRun:
         say nothing of it."""
         travel, little = self.problem.travel, 1e-9 * t
         turned = max((turn for turn in self.problem.turns if turn < t - little), default=-np.inf)
-        known = [state for state in self.states if state.time >= turned - little]
+        known = [state for state in self.states if state.time >= turned - little] or self.states[-1:]
         weights = np.zeros(len(self.states))
         weights[-len(known) :] = extrapolation([travel(state.time) for state in known], travel(t))
         return weights

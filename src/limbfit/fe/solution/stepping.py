@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import ProblemError
 from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced, unsettled
 from ..observables import element_fields
 from ..problem import Problem
@@ -88,6 +89,26 @@ def solve(
         if on_step is not None:
             on_step(step)
     return _result(problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started)
+
+
+def touching_place(problem: Problem, steps: StepControl = StepControl()) -> float:
+    """How far beyond where it would touch tissue at rest the indenter of a problem begins, mm along its axis.
+
+    What moves the tissue before (`Problem.touch_down_s`, `Problem.prestretch`) is solved for that.
+
+    Raises
+    ------
+    ProblemError
+        Where the problem is impossible as stated, and where the indenter's touch-down is not reached.
+    """
+    run = SteppedRun(problem, steps, False, None)
+    for _ in run.run():
+        if not run.touch.waits:
+            return run.touch.offset
+    raise ProblemError(
+        f"the tissue that moves before the indenter touches it found no equilibrium: {run.reason}",
+        remedy="take smaller steps (solver.load_steps), or less force",
+    )
 
 
 def _result(
