@@ -142,7 +142,9 @@ def test_bodies_under_force_go_along_their_own_axis(tmp_path, axis):
     assert [body.name for body in found.bodies] == ["left_one", "clamp_at_25_7"]
     assert len(model.rails) == 2 - (axis[0] == 0.0)
     mine, theirs = pushes(problem), pushes(found)
-    np.testing.assert_allclose(theirs, mine, atol=1e-6 * np.abs(mine).max())
+    # In the first step the file moves them; limbfit then holds them by springs 100 times as stiff as contact.
+    np.testing.assert_allclose(theirs[0], mine[0], atol=1e-5 * np.abs(mine).max())
+    np.testing.assert_allclose(theirs[1:], mine[1:], atol=1e-6 * np.abs(mine).max())
     along = np.einsum("bj,nbj->nb", [b.shape.frame[2] for b in bodies], mine)
     np.testing.assert_allclose(along[3], 0.65, rtol=1e-6)
     if len(model.rails) == 2:
@@ -222,6 +224,11 @@ def test_what_limbfit_writes_says_what_it_does(tmp_path):
         assert text.count(words) == 1
 
 
+def stepping(text):
+    """The number of the curve of the largest steps, which changes where the pre-strain rests."""
+    return re.search(r'id="(\d+)" name="must_points"', text)[1]
+
+
 RAMP = r'<ramp lc="\d+">1</ramp>'
 FORCED = (
     '<solid type="uncoupled active fiber stress"><smax>0.01</smax><activation lc="2">1</activation></solid>'
@@ -249,11 +256,11 @@ REFUSED = {
         "'frame', to which the joint is fixed, is not held still",
     ),
     "moves meanwhile": (
-        lambda t: changed(t, "</Rigid>", PUSHES + "</Rigid>"),
-        "grows while the rigid body 'clamp' changes; let it begin after the first step",
+        lambda t: changed(t, "</Rigid>", PUSHES.replace("LC", stepping(t)) + "</Rigid>"),
+        "settles while the rigid body 'clamp' changes; let it change after the first step",
     ),
 }  # fmt: skip
-PUSHES = '<rigid_load type="rigid_force"><rb>clamp</rb><dof>Rx</dof><value lc="4">0.1</value></rigid_load>'
+PUSHES = '<rigid_load type="rigid_force"><rb>clamp</rb><dof>Rx</dof><value lc="LC">0.1</value></rigid_load>'
 HOLDS = '<rigid_bc type="rigid_fixed"><rb>clamp</rb><Rx_dof>1</Rx_dof></rigid_bc>'
 
 

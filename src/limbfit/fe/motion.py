@@ -100,6 +100,8 @@ class Motion:
 
     def later(self, seconds: float) -> Motion:
         """The same after so many seconds at its first values."""
+        if not seconds:
+            return self
         times, forced = np.append(0.0, np.asarray(self.times) + seconds), np.asarray(self.forced)
         values, growth = np.vstack([self.values[:1], self.values]), np.asarray(self.growth)
         return Motion(times, values, np.vstack([forced[:1], forced]), np.append(growth[0], growth))

@@ -80,8 +80,8 @@ class Body:
     rail: Array | None
 
 
-def written_bodies(problem: Problem) -> list[Body]:
-    """The rigid bodies of a problem where they start.
+def written_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[Body]:
+    """The rigid bodies of a problem where they start; with other ``motions`` than it states, if given.
 
     Raises
     ------
@@ -92,16 +92,15 @@ def written_bodies(problem: Problem) -> list[Body]:
     found: list[Body] = []
     for i, body in enumerate([] if system.bodies is None else system.bodies.all):
         stated, first = body.stated, i == 0 and problem.indenter is not None
+        driven = motions[i] if motions else stated.motion
         name = INDENTER if first else re.sub(r"[^\w-]+", "_", stated.name) or f"body_{i + 1}"
         if name in {other.name for other in found}:
             raise ProblemError(f"two rigid bodies have the name {name!r}", remedy="give each its own")
         patch, front, pair = (PATCH, FRONT, "indentation") if first else (
             f"{name}_patch", f"{name}_front", f"{name}_contact"
         )  # fmt: skip
-        rail = guided(stated.motion, body.start.frame)
-        motion = (
-            in_space(name, stated.motion, body.start.frame) if rail is None else pushed(stated.motion, rail)
-        )
+        rail = guided(driven, body.start.frame)
+        motion = in_space(name, driven, body.start.frame) if rail is None else pushed(driven, rail)
         faces = np.asarray(stated.faces, dtype=np.int64)
         tool = _mesh_of(body.start)
         words = name, patch, front, pair

@@ -85,22 +85,22 @@ def in_space(name: str, motion: Motion, frame: Array) -> Motion:
 
 
 def guided(motion: Motion, frame: Array) -> Array | None:
-    """The direction (3,) along which a rail guides a body: where nothing but a force drives it, along one
-    axis of its ``frame (3, 3)`` that lies askew; None for any other motion."""
-    forced = np.asarray(motion.forced)
-    (own,) = np.nonzero(forced[0])
-    alike = (forced == forced[0]).all() and not motion.values[:, ~forced[0]].any()
-    if not (alike and len(own) == 1 and own[0] < 3) or motion.grows or np.isnan(motion.values).any():
+    """The direction (3,) along which a rail guides a body: where nothing drives it but a force, and what
+    moves it there, along one axis of its ``frame (3, 3)`` that lies askew; None for any other motion."""
+    (own,) = np.nonzero(motion.free)
+    if len(own) != 1 or own[0] > 2 or motion.grows or np.isnan(motion.values).any():
         return None
     along = np.asarray(frame[own[0]])
-    return None if np.isclose(np.abs(along).max(), 1.0, rtol=0.0, atol=1e-12) else along
+    askew = not np.isclose(np.abs(along).max(), 1.0, rtol=0.0, atol=1e-12)
+    return along if askew and not np.delete(motion.values, own[0], axis=1).any() else None
 
 
 def pushed(motion: Motion, along: Array) -> Motion:
     """The motion in space of a body that a rail guides ``along (3,)``: it bears all but the force."""
     values = np.zeros((len(motion.times), 6))
     values[:, :3] = motion.values[:, :3].sum(axis=1)[:, None] * along
-    return Motion(motion.times, values, (True,) * 6)
+    under = np.asarray(np.asarray(motion.forced).any(axis=1))
+    return Motion(motion.times, values, under[:, None].repeat(6, axis=1))
 
 
 def rail_lines(name: str, motion: Motion, along: Array, centre: Array, width: float) -> Iterator[str]:
@@ -108,7 +108,8 @@ def rail_lines(name: str, motion: Motion, along: Array, centre: Array, width: fl
 
     FEBio's own force on the joint is left out: the body's stands among its loads.
     """
-    stiff = 1e3 * float(np.linalg.norm(motion.values[:, :3], axis=1).max())
+    under = np.append(False, np.asarray(motion.forced)[:, 0])
+    stiff = 1e3 * float(np.linalg.norm(motion.values[under, :3], axis=1).max())
     across = np.eye(3)[np.argmin(np.abs(along))]
     yield f'<rigid_connector name="{name}_rail" type="rigid prismatic joint">'
     yield f"<body_a>{FRAME}</body_a><body_b>{name}</body_b><laugon>PENALTY</laugon><tolerance>0</tolerance>"

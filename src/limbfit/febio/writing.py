@@ -73,9 +73,10 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
     """
     settings = settings or FebSettings()
     bodies, there = _checked_bodies(problem), problem
-    if Beginning.of(problem).seconds or problem.touch_down_s:
-        there = as_written(problem, settings.steps)
-        bodies = written_bodies(there)
+    forced = any(np.asarray(body.motion.forced)[0].any() for body in problem.rigid_bodies)
+    if forced or Beginning.of(problem).seconds or problem.touch_down_s:
+        there, motions = as_written(problem, settings.steps)
+        bodies = written_bodies(there, motions)
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
             stream.writelines(f"{line}\n" for line in _lines(problem, there, bodies, settings))
@@ -146,6 +147,11 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
         lines.append(
             "touch-down: where limbfit has found it, which holds for these parameters alone; FEBio brings "
             "the indenter there"
+        )
+    if any(np.asarray(body.motion.forced)[0].any() for body in problem.rigid_bodies):
+        lines.append(
+            "forces: begin after limbfit's first step, in which FEBio moves the body to where limbfit has "
+            "found it then"
         )
     if any(body.rail is not None for body in written_bodies(problem)):
         lines.append("guides: bodies under a force go along a prismatic joint, held by a penalty")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -91,20 +91,36 @@ def solve(
     return _result(problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started)
 
 
-def touching_place(problem: Problem, steps: StepControl = StepControl()) -> float:
-    """How far beyond where it would touch tissue at rest the indenter of a problem begins, mm along its axis.
+@dataclass(frozen=True)
+class Onset:
+    """How a simulation began.
 
-    What moves the tissue before (`Problem.touch_down_s`, `Problem.prestretch`) is solved for that.
+    ``place``: how far beyond where it would touch tissue at rest the indenter began, mm along its axis.
+    ``times (2,)`` s: the start and the end of the first step, and ``coordinates (2, b, 6)`` the rigid bodies'
+    then, mm and rad.
+    """
+
+    place: float
+    times: Array
+    coordinates: Array
+
+
+def onset(problem: Problem, steps: StepControl = StepControl()) -> Onset:
+    """Solve a problem until its indenter, which may wait for tissue that moves before, begins.
 
     Raises
     ------
     ProblemError
-        Where the problem is impossible as stated, and where the indenter's touch-down is not reached.
+        Where the problem is impossible as stated, and where that is not reached.
     """
     run = SteppedRun(problem, steps, False, None)
-    for _ in run.run():
+    start, first = run.rest, None
+    for step in run.run():
+        if first is None:
+            start, first = run.rest if run.rested is None else run.rested, step
         if not run.touch.waits:
-            return run.touch.offset
+            times = np.array([0.0, first.time])
+            return Onset(run.touch.offset, times, np.array([start, first.coordinates]))
     raise ProblemError(
         f"the tissue that moves before the indenter touches it found no equilibrium: {run.reason}",
         remedy="take smaller steps (solver.load_steps), or less force",

@@ -225,12 +225,15 @@ def on_rail(motion: Motion, rail: RigidRail) -> Motion:
     ProblemError
         Where something else than forces drives the body.
     """
-    if not np.asarray(motion.forced).all() or motion.values[:, 3:].any():
+    forced, values = np.asarray(motion.forced), np.zeros_like(motion.values)
+    values[:, 2] = motion.values[:, :3] @ rail.along
+    under = np.asarray(forced.all(axis=1))
+    still = np.append(~under, False) | np.append(False, ~under)  # rows between which it is moved
+    off = np.abs(motion.values[:, :3] - values[:, 2:3] * rail.along)[still].max(initial=0.0)
+    if not (under | ~forced.any(axis=1)).all() or motion.values[:, 3:].any() or off > 1e-9:
         what = f"the rigid body {rail.body!r} is guided by a joint, and held, moved or turned otherwise"
         raise ProblemError(what, place=f"line {rail.line}, <rigid_connector>", remedy="give it forces only")
-    values = np.zeros_like(motion.values)
-    values[:, 2] = motion.values[:, :3] @ rail.along
-    return Motion(motion.times, values, (False, False, True, False, False, False))
+    return Motion(motion.times, values, under[:, None] & (np.arange(6) == 2))
 
 
 def agrees_in_turning(values: Array, forced: NDArray[np.bool_]) -> bool:

@@ -158,29 +158,34 @@ def settled_s(
         raise _refused(
             "grows in the only step", growing[0], "let it grow in a first step of its own, and rest"
         )
-    for one in growing:
-        points = curves[one.curve].points
-        if not len(points) or curves[one.curve].corners is None:
-            raise _refused("grows along no line through points", one, "use LINEAR points")
-        last = float(points[np.flatnonzero(points[:, 1] != points[-1, 1]).max(initial=-1) + 1, 0])
-        rest = first - last
-        if rest < 0.0:
-            raise _refused("goes on growing after the first step", one, None)
-        if rest < RELAXED * slowest:
-            what = (
-                f"rests for {rest:.4g} s in the first step, in which tissue of {slowest:.4g} s does not relax"
-            )
-            raise _refused(what, one, f"let it rest for {RELAXED * slowest:.4g} s")
-    times = np.linspace(0.0, first, 101)
+    rested = max(_rest_of(one, first, slowest, curves) for one in growing)
+    times = np.linspace(rested, first, 101)
     for number, words in others.items():
         values = curves[number].at(times)
         if np.abs(values - values[0]).max() > 0.0:
-            raise _refused(f"grows while {words} changes", growing[0], "let it begin after the first step")
+            raise _refused(f"settles while {words} changes", growing[0], "let it change after the first step")
     for held in conditions:
-        if held.kind == "moved" and held.step in (None, 0) and held.factor * curves[held.curve].at(0.0):
-            raise _refused(f"grows while the rigid body {held.body!r} is elsewhere", growing[0], None)
+        gone = held.curve and held.step == 0 and held.kind == "moved"
+        later = {(c.body, c.freedom) for c in conditions if c.kind == "moved" and c.step in (None, 1)}
+        if gone and held.factor * curves[held.curve].at(first) and (held.body, held.freedom) not in later:
+            raise _refused(f"settles while the rigid body {held.body!r} goes elsewhere", growing[0])
     return first
 
 
-def _refused(what: str, one: Prestrain, remedy: str | None) -> ProblemError:
+def _rest_of(one: Prestrain, first: float, slowest: float, curves: Mapping[int, Curve]) -> float:
+    """When a pre-strain has grown, s; it then rests until the first step ends."""
+    points = curves[one.curve].points
+    if not len(points) or curves[one.curve].corners is None:
+        raise _refused("grows along no line through points", one, "use LINEAR points")
+    grown = float(points[np.flatnonzero(points[:, 1] != points[-1, 1]).max(initial=-1) + 1, 0])
+    rest = first - grown
+    if rest < 0.0:
+        raise _refused("goes on growing after the first step", one)
+    if rest < RELAXED * slowest:
+        what = f"rests for {rest:.4g} s in the first step, in which tissue of {slowest:.4g} s does not relax"
+        raise _refused(what, one, f"let it rest for {RELAXED * slowest:.4g} s")
+    return grown
+
+
+def _refused(what: str, one: Prestrain, remedy: str | None = None) -> ProblemError:
     return ProblemError(f"a pre-strain {what}", place=f"line {one.line}, <prestrain>", remedy=remedy)
