@@ -28,6 +28,7 @@ from limbfit.fe import (
 from limbfit.febio import (
     FebSettings,
     RunVerdict,
+    check_fitted,
     read_feb,
     read_log,
     result_of_log,
@@ -308,5 +309,9 @@ def test_what_febio_cannot_express_is_refused(tmp_path):
             block(bodies=(ball((0.2, 0.0, -1.0), motion=dragged),)), tmp_path / "model.feb", FebSettings()
         )
     late = replace(punched_block("tet4", 4), history=COURSE, touch_down_s=HELD_S)
+    for held in (late, block(prestretch=TAUT), block(bodies=(ball(),))):
+        with pytest.raises(ProblemError, match="cannot follow where a clamped, tensed or pre-strained limb"):
+            check_fitted(held)
+    check_fitted(block(indenter=PUNCH))
     with pytest.raises(ProblemError, match="pre-stretch move first is not written for Abaqus"):
         write_inp(late, tmp_path / "m.inp", "abaqus", FebSettings())

@@ -39,6 +39,16 @@ class Range:
         return 3 + len(self.start)
 
 
+def check_fitted(problem: Problem) -> None:
+    """Raise `ProblemError` where what comes before the indentation moves with the fitted parameters."""
+    if problem.touch_down_s or problem.prestretch is not None or problem.bodies:
+        raise ProblemError(
+            "FEBio's fit cannot follow where a clamped, tensed or pre-strained limb is touched: it moves "
+            "with the parameters",
+            remedy="identify with limbfit, or leave these out of the study",
+        )
+
+
 def in_indenter_frame(problem: Problem) -> Problem:
     """The same problem in the frame of its indenter, which goes along z."""
     indenter = problem.indenter

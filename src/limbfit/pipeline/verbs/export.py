@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...febio import Range, differences, in_indenter_frame, write_feb, write_inp, write_optimisation
+from ...febio import (
+    Range,
+    check_fitted,
+    differences,
+    in_indenter_frame,
+    write_feb,
+    write_inp,
+    write_optimisation,
+)
 from ...indentation import Parameters
 from ...study import Indentation as Planned
 from ...study import Record, Study
@@ -88,13 +96,7 @@ def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...],
     if to == "febio-optimize":
         if problem.fibres is not None:
             raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
-        if problem.bodies or problem.prestretch is not None:
-            what = (
-                "FEBio's fit is not written for a clamped or pre-strained limb: where the indenter touches it"
-            )
-            raise InputError(
-                f"{what} moves with the parameters, which FEBio's fit cannot follow", place="--to"
-            )
+        check_fitted(problem)
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
         settings = replace(settings, penalty=None)
