@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..fe import History, Motion, Problem, StepControl, System
-from ..fe.solution.stepping import Onset, onset
+from ..fe.solution.stepping import FirstStep, onset
 from ..fe.solution.touchdown import CLEAR, IndenterStart
 
 STRAINED_S = 1.0  # in which the pre-strain grows
@@ -79,7 +79,7 @@ def as_written(problem: Problem, steps: StepControl) -> tuple[Problem, tuple[Mot
     return problem.later(beginning.settling_s), tuple(settled)
 
 
-def _seated(motion: Motion, begun: Onset, body: int) -> Motion:
+def _seated(motion: Motion, begun: FirstStep, body: int) -> Motion:
     """A motion whose first forces are displacements until the end of limbfit's first step."""
     first = np.asarray(motion.forced)[0]
     if not first.any() or first[3:].sum() > 1:  # FEBio adds turns about several axes up in another way

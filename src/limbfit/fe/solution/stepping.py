@@ -92,7 +92,7 @@ def solve(
 
 
 @dataclass(frozen=True)
-class Onset:
+class FirstStep:
     """How a simulation began.
 
     ``place``: how far beyond where it would touch tissue at rest the indenter began, mm along its axis.
@@ -105,7 +105,7 @@ class Onset:
     coordinates: Array
 
 
-def onset(problem: Problem, steps: StepControl = StepControl()) -> Onset:
+def onset(problem: Problem, steps: StepControl = StepControl()) -> FirstStep:
     """Solve a problem until its indenter, which may wait for tissue that moves before, begins.
 
     Raises
@@ -120,7 +120,7 @@ def onset(problem: Problem, steps: StepControl = StepControl()) -> Onset:
             start, first = run.rest if run.rested is None else run.rested, step
         if not run.touch.waits:
             times = np.array([0.0, first.time])
-            return Onset(run.touch.offset, times, np.array([start, first.coordinates]))
+            return FirstStep(run.touch.offset, times, np.array([start, first.coordinates]))
     raise ProblemError(
         f"the tissue that moves before the indenter touches it found no equilibrium: {run.reason}",
         remedy="take smaller steps (solver.load_steps), or less force",
