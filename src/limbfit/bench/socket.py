@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
 NORMALS = "FEBio's contact acts along the skin's normal, limbfit's along the body's"
 STICKS = "FEBio anchors a point where the first iteration of a step puts it"
-BRIM = "where the skin leaves the wall FEBio measures the gap along the skin's normal"
+BRIM = "limbfit pushes along the normals of the flare's facets, FEBio along the skin's"
 NEVER = math.inf
 
 

@@ -46,6 +46,11 @@ class Activation:
         """The share at time ``t``, s."""
         return float(np.interp(t, np.asarray(self.times), np.asarray(self.shares)))
 
+    def later(self, seconds: float) -> Activation:
+        """The same after so many seconds at its first share."""
+        times, shares = np.asarray(self.times), np.asarray(self.shares)
+        return Activation(np.append(0.0, times + seconds), np.append(shares[0], shares))
+
     def moving_s(self, t: float) -> float:
         """How long the share has changed up to time ``t``, s."""
         times, steps = np.asarray(self.times), np.diff(self.times)

@@ -98,6 +98,14 @@ class Motion:
             np.concatenate([np.asarray(self.growth), np.asarray(after.growth)]),
         )
 
+    def later(self, seconds: float) -> Motion:
+        """The same after so many seconds at its first values."""
+        if not seconds:
+            return self
+        times, forced = np.append(0.0, np.asarray(self.times) + seconds), np.asarray(self.forced)
+        values, growth = np.vstack([self.values[:1], self.values]), np.asarray(self.growth)
+        return Motion(times, values, np.vstack([forced[:1], forced]), np.append(growth[0], growth))
+
     def taken_over(self, t: float, reaction: Array) -> Motion:
         """With forces (6,) where values begin to be forces at time ``t`` and are left open."""
         here = np.isclose(self.times, t, rtol=1e-9, atol=0.0)[:, None] & np.isnan(self.values)

@@ -48,6 +48,11 @@ class Pressure:
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 
+    def later(self, seconds: float) -> Pressure:
+        """The same after so many seconds at its first value."""
+        times, values = np.asarray(self.times), np.asarray(self.values)
+        return Pressure(self.faces, np.append(0.0, times + seconds), np.append(values[0], values))
+
     def at(self, t: float) -> float:
         """The pressure at time ``t``, MPa."""
         return float(np.interp(t, np.asarray(self.times), np.asarray(self.values)))

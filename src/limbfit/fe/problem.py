@@ -225,6 +225,19 @@ class Problem:
         bodies = tuple(replace(body, motion=motion) for body, motion in zip(self.bodies, moved))
         return replace(self, bodies=bodies)
 
+    def later(self, seconds: float) -> Problem:
+        """The same after so many seconds in which whatever drives it rests."""
+        if not seconds:
+            return self
+        return replace(
+            self,
+            history=self.history.later(seconds),
+            bodies=tuple(replace(body, motion=body.motion.later(seconds)) for body in self.bodies),
+            pressures=tuple(pressure.later(seconds) for pressure in self.pressures),
+            activation=None if self.activation is None else self.activation.later(seconds),
+            touch_down_s=self.touch_down_s + seconds if self.touch_down_s else 0.0,
+        )
+
     def travel(self, t: float) -> float:
         """What grows evenly while the indenter moves, or what drives bodies or activates tissue changes."""
         contracting = 0.0 if self.activation is None else self.activation.moving_s(t)

@@ -1,8 +1,9 @@
 """FEBio beside limbfit: its inputs as problems, problems as its inputs, its runs and logs as results."""
 
 from .abaqus import write_inp
+from .beginning import end_of_file
 from .logs import Log, read_log
-from .optimising import Range, in_indenter_frame, write_optimisation
+from .optimising import Range, check_fitted, in_indenter_frame, write_optimisation
 from .penalty import FaceWise, mean_penalty
 from .problem import step_control, to_problem
 from .program import FebioRun, axial_force, find_febio, result_of_log, run_febio
@@ -22,8 +23,10 @@ __all__ = [
     "Range",
     "RunVerdict",
     "axial_force",
+    "check_fitted",
     "contact_of",
     "differences",
+    "end_of_file",
     "find_febio",
     "in_indenter_frame",
     "judge",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,11 +61,12 @@ def indenter_of(model: FebModel, axis: Array, name: str, depth: float, edge: Arr
 def rigid_body(
     model: FebModel, name: str, contacts: Sequence[Contact], motion: Motion, tissue: Tissue
 ) -> RigidBody:
-    """A rigid body with a motion of its own, in a frame along the axes of space.
+    """A rigid body with a motion of its own, in a frame along the axes of space, or along its rail.
 
     A closed one is an indenter whose front is the side that looks at the tissue, an open one the faces that
     touch.  It turns about its centre of mass.
     """
+    rail = next((rail.along for rail in model.rails if rail.body == name), None)
     faces = touched_faces(model, contacts, tissue)
     parts = model.parts_of({name: None}).values()
     own = np.concatenate([part.cells.ravel() for part in parts])
@@ -76,19 +78,32 @@ def rigid_body(
         towards = np.cross(b - a, c - a).sum(axis=0)
         main = int(np.abs(towards).argmax())
         axis, edge = np.sign(towards[main]) * np.eye(3)[main], np.eye(3)[(main + 1) % 3]
+        if rail is not None:
+            axis, edge = np.sign(towards @ rail) * rail, np.eye(3)[np.abs(rail).argmin()]
         shape = indenter_of(model, axis, name, thinnest(tissue.mesh, faces), edge)
     else:
         used, front = np.unique(front, return_inverse=True)
         try:
             shape = OpenSurface(model.geometry.points[used], front.reshape(-1, 3))
+            if rail is not None:
+                shape = _along(shape, rail)
         except ProblemError as error:
             raise _of_part(model, name, error) from None
-    turn = np.kron(np.eye(2), shape.frame)  # a permutation with signs
-    forced = np.asarray(motion.forced)[:, np.abs(turn).argmax(axis=1)]
-    moved = Motion(motion.times, motion.values @ turn.T, forced)
+    if rail is None:
+        turn = np.kron(np.eye(2), shape.frame)  # a permutation with signs
+        forced = np.asarray(motion.forced)[:, np.abs(turn).argmax(axis=1)]
+        moved = Motion(motion.times, motion.values @ turn.T, forced)
+    else:
+        moved = Motion(motion.times, motion.values * np.sign(shape.frame[2] @ rail), motion.forced)
     friction = contacts[0].friction or "frictionless"
     sticking = contacts[0].sticking
     return RigidBody(shape, faces, moved, friction, model.rigid[name].centre, name, sticking=sticking)
+
+
+def _along(surface: OpenSurface, axis: Array) -> OpenSurface:
+    """The same surface in a frame along ``axis (3,)``."""
+    placed = surface.placed(np.zeros(3), axis, np.eye(3)[np.abs(axis).argmin()])
+    return replace(placed, points=surface.points @ placed.frame.T)
 
 
 def _of_part(model: FebModel, name: str, error: ProblemError) -> ProblemError:

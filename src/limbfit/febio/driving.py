@@ -18,7 +18,7 @@ from ..fe import History, Motion
 from .reading.controls import step_times
 from .reading.geometry import boundary, closed
 from .reading.model import Contact, FebModel
-from .reading.motions import knots, names_of_free, rigid_motion, straight, turns_of
+from .reading.motions import knots, names_of_free, on_rail, rigid_motion, straight, turns_of
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,8 @@ class Drive:
 
     ``indenter`` is the name of the body that is one (empty: none), ``axis (3,)`` where it goes.  ``factors``
     of the node motions with respect to the history, in their order; ``travel (3,)`` of every rigid body per
-    mm of it, by name; ``motions`` of the other bodies that touch tissue, along and about the axes of space.
+    mm of it, by name; ``motions`` of the other bodies that touch tissue, along and about the axes of space,
+    or of a frame whose third axis is their rail's.
     """
 
     history: History
@@ -118,7 +119,8 @@ def _without_indenter(
     moving = list(courses.values())
     driven = any(motion.values.any() for motion in bodies.values())
     times = _times(model, moving)
-    if not (moving or driven or model.pressures):
+    strained = model.contractions or model.prestrains
+    if not (moving or driven or model.pressures or strained):
         raise ProblemError("nothing moves: there is no prescribed displacement, no force and no pressure")
     base = moving[0].at(times) if moving else np.zeros(len(times))
     if moving and not base.any():
@@ -148,11 +150,14 @@ def _scaled(
 
 def _motions(model: FebModel) -> dict[str, Motion]:
     """The motions of all rigid bodies of which there are parts, checked for what they carry."""
-    found, touching = {}, contacts_of_bodies(model)
+    found, touching, rails = {}, contacts_of_bodies(model), {rail.body: rail for rail in model.rails}
     for name, body in model.rigid.items():
         if not model.parts_of({name: None}) and name not in model.carried:
             continue
-        motion = found[name] = rigid_motion(name, model.conditions, model.curves, model.phases)
+        motion = rigid_motion(name, model.conditions, model.curves, model.phases)
+        if name in rails:
+            motion = on_rail(motion, rails[name])
+        found[name] = motion
         place = f"line {body.line}, <material>"
         if name in model.carried and motion.free.any():
             raise ProblemError(
@@ -167,6 +172,11 @@ def _motions(model: FebModel) -> dict[str, Motion]:
         if name not in model.carried and name not in touching and motion.values.any():
             what = f"the rigid body {name!r} moves, and neither touches nor carries tissue"
             raise ProblemError(what, place=f"line {lines[0]}")
+    for rail in model.rails:
+        base = found.get(rail.base)
+        if base is None or base.values.any() or base.free.any():
+            what = f"the rigid body {rail.base!r}, to which the joint is fixed, is not held still"
+            raise ProblemError(what, place=f"line {rail.line}, <rigid_connector>", remedy="fix it")
     return found
 
 

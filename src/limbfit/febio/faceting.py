@@ -6,6 +6,8 @@ contact from converging, and the skin under a punch does not reach them.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import ProblemError
 from ..fe import Indenter, Motion, OpenSurface, Problem, System
 from ..fe.contact.rigid import RigidShape
-from .moving import in_space
+from .moving import guided, in_space, pushed
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -60,7 +62,10 @@ def _placed(indenter: Indenter, local: Array) -> Array:
 @dataclass(frozen=True)
 class Body:
     """A rigid body as it is written: its mesh, where its centre of mass (3,) is put, its motion along and
-    about the axes of space, the faces (f, k) of tissue that it may touch, and what all that is called."""
+    about the axes of space, the faces (f, k) of tissue that it may touch, and what all that is called.
+
+    ``rail (3,)``: the direction along which it is guided, where forces in space alone would not do.
+    """
 
     name: str
     patch: str
@@ -71,10 +76,12 @@ class Body:
     motion: Motion
     faces: Indices
     friction: str | float
+    width: float
+    rail: Array | None
 
 
-def written_bodies(problem: Problem) -> list[Body]:
-    """The rigid bodies of a problem where they start.
+def written_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[Body]:
+    """The rigid bodies of a problem where they start; with other ``motions`` than it states, if given.
 
     Raises
     ------
@@ -85,17 +92,29 @@ def written_bodies(problem: Problem) -> list[Body]:
     found: list[Body] = []
     for i, body in enumerate([] if system.bodies is None else system.bodies.all):
         stated, first = body.stated, i == 0 and problem.indenter is not None
-        name = INDENTER if first else stated.name or f"body_{i + 1}"
+        driven = motions[i] if motions else stated.motion
+        name = INDENTER if first else re.sub(r"[^\w-]+", "_", stated.name) or f"body_{i + 1}"
         if name in {other.name for other in found}:
             raise ProblemError(f"two rigid bodies have the name {name!r}", remedy="give each its own")
         patch, front, pair = (PATCH, FRONT, "indentation") if first else (
             f"{name}_patch", f"{name}_front", f"{name}_contact"
         )  # fmt: skip
-        motion = in_space(name, stated.motion, body.start.frame)
+        rail = guided(driven, body.start.frame)
+        motion = in_space(name, driven, body.start.frame) if rail is None else pushed(driven, rail)
         faces = np.asarray(stated.faces, dtype=np.int64)
         tool = _mesh_of(body.start)
-        found.append(Body(name, patch, front, pair, tool, body.pivot, motion, faces, stated.friction))
+        words = name, patch, front, pair
+        width = body.start.width
+        found.append(Body(*words, tool, body.pivot, motion, faces, stated.friction, width, rail))
     return found
+
+
+def frame_mesh(bodies: Sequence[Body]) -> ToolMesh:
+    """A cube of 1 mm beside the bodies, which stands for what their rails are fixed to."""
+    corner = np.vstack([body.tool.points for body in bodies]).min(axis=0) - 10.0
+    cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    points = corner + cube
+    return ToolMesh(points, np.arange(8)[None], "hex8", np.zeros((0, 4), np.int64))
 
 
 def _mesh_of(shape: RigidShape) -> ToolMesh:

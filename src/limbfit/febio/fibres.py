@@ -34,17 +34,14 @@ def axis_of(own: Array | None) -> str:
 
 
 def axes_of_cells(problem: Problem) -> Iterator[str]:
-    """The section of axes that differ from cell to cell, if any."""
-    several = {name: own for name, own in directions(problem).items() if len(own) > 1}
-    if not several:
-        return
-    yield "<MeshData>"
-    for name, own in several.items():
+    """The axes that differ from cell to cell."""
+    for name, own in directions(problem).items():
+        if len(own) == 1:
+            continue
         yield f'<ElementData type="mat_axis" elem_set={quoteattr(name)}>'
         for i, direction in enumerate(own, 1):
             yield f'<elem lid="{i}">{_axes(direction)}</elem>'
         yield "</ElementData>"
-    yield "</MeshData>"
 
 
 def _axes(direction: Array) -> str:

@@ -17,6 +17,7 @@ from .reading.motions import agrees_in_turning, straight
 Array = NDArray[np.float64]
 AXES, TURNS = "xyz", "uvw"
 HELD = "held"
+FRAME = "frame"  # the rigid body that rails are fixed to
 
 
 @dataclass
@@ -83,9 +84,45 @@ def in_space(name: str, motion: Motion, frame: Array) -> Motion:
     return Motion(motion.times, values, own)
 
 
-def step_ends(motions: Iterable[Motion], end: float) -> list[float]:
-    """Where FEBio must begin another step, s, and the end: where what drives changes."""
-    found = {end}
+def guided(motion: Motion, frame: Array) -> Array | None:
+    """The direction (3,) along which a rail guides a body: where nothing drives it but a force, and what
+    moves it there, along one axis of its ``frame (3, 3)`` that lies askew; None for any other motion."""
+    (own,) = np.nonzero(motion.free)
+    if len(own) != 1 or own[0] > 2 or motion.grows or np.isnan(motion.values).any():
+        return None
+    along = np.asarray(frame[own[0]])
+    askew = not np.isclose(np.abs(along).max(), 1.0, rtol=0.0, atol=1e-12)
+    return along if askew and not np.delete(motion.values, own[0], axis=1).any() else None
+
+
+def pushed(motion: Motion, along: Array) -> Motion:
+    """The motion in space of a body that a rail guides ``along (3,)``: it bears all but the force."""
+    values = np.zeros((len(motion.times), 6))
+    values[:, :3] = motion.values[:, :3].sum(axis=1)[:, None] * along
+    under = np.asarray(np.asarray(motion.forced).any(axis=1))
+    return Motion(motion.times, values, under[:, None].repeat(6, axis=1))
+
+
+def rail_lines(name: str, motion: Motion, along: Array, centre: Array, width: float) -> Iterator[str]:
+    """The joint that lets a body go along a line only, stiff to a thousandth of a mm and of a radian.
+
+    FEBio's own force on the joint is left out: the body's stands among its loads.
+    """
+    under = np.append(False, np.asarray(motion.forced)[:, 0])
+    stiff = 1e3 * float(np.linalg.norm(motion.values[under, :3], axis=1).max())
+    across = np.eye(3)[np.argmin(np.abs(along))]
+    yield f'<rigid_connector name="{name}_rail" type="rigid prismatic joint">'
+    yield f"<body_a>{FRAME}</body_a><body_b>{name}</body_b><laugon>PENALTY</laugon><tolerance>0</tolerance>"
+    yield f"<force_penalty>{stiff!r}</force_penalty><moment_penalty>{stiff * width!r}</moment_penalty>"
+    yield f"<joint_origin>{row(centre)}</joint_origin><translation_axis>{row(along)}</translation_axis>"
+    yield f"<transverse_axis>{row(across)}</transverse_axis>"
+    yield "<prescribed_translation>0</prescribed_translation></rigid_connector>"
+
+
+def step_ends(motions: Iterable[Motion], end: float, settled: float = 0.0) -> list[float]:
+    """Where FEBio must begin another step, s, and the end: where what drives changes, and where pre-strained
+    tissue has ``settled``."""
+    found = {end} | ({settled} if settled else set())
     for motion in motions:
         times = np.asarray(motion.times)
         found |= {float(t) for t in times[1:][np.diff(times) == 0.0] if t < end}
@@ -118,8 +155,9 @@ def _conditions(
 ) -> Iterator[str]:
     moving = np.asarray(values.any(axis=0))
     free = forced | moving
-    held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(AXES + TURNS))
-    yield f'<rigid_bc name="{label}_guide" type="rigid_fixed"><rb>{name}</rb>{held}</rigid_bc>'
+    if not free.all():
+        held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(AXES + TURNS))
+        yield f'<rigid_bc name="{label}_guide" type="rigid_fixed"><rb>{name}</rb>{held}</rigid_bc>'
     on_line = None if forced.any() else straight(Motion(times - times[0], values))
     if on_line is not None:  # one curve, and its share along each axis
         direction, advance = on_line

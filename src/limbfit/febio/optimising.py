@@ -39,6 +39,16 @@ class Range:
         return 3 + len(self.start)
 
 
+def check_fitted(problem: Problem) -> None:
+    """Raise `ProblemError` where what comes before the indentation moves with the fitted parameters."""
+    if problem.touch_down_s or problem.prestretch is not None or problem.bodies:
+        raise ProblemError(
+            "FEBio's fit cannot follow where a clamped, tensed or pre-strained limb is touched: it moves "
+            "with the parameters",
+            remedy="identify with limbfit, or leave these out of the study",
+        )
+
+
 def in_indenter_frame(problem: Problem) -> Problem:
     """The same problem in the frame of its indenter, which goes along z."""
     indenter = problem.indenter
@@ -54,7 +64,8 @@ def in_indenter_frame(problem: Problem) -> Problem:
         there = shape.placed(place, frame @ shape.frame[2], frame @ shape.frame[0])
         bodies.append(replace(body, shape=there, pivot=(body.origin - centre) @ frame.T))
     fibres = None if problem.fibres is None else np.asarray(problem.fibres, dtype=float) @ frame.T
-    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies), fibres=fibres)
+    G = None if problem.prestretch is None else frame @ np.asarray(problem.prestretch, dtype=float) @ frame.T
+    return replace(problem, mesh=mesh, indenter=turned, bodies=tuple(bodies), fibres=fibres, prestretch=G)
 
 
 def write_optimisation(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import Indenter, Pressure, Problem, StepControl, Support
+from ..fe import Activation, Indenter, Pressure, Problem, StepControl, Support
 from .bodies import indenter_of, rigid_body, rigid_corners, touched_faces
 from .driving import Drive, contacts_of_bodies, drive
 from .penalty import mean_penalty, thinnest
@@ -75,6 +75,8 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         ),
         pressures=_pressures(model, tissue),
         fibres=_fibres(model, tissue),
+        activation=_activation(model),
+        prestretch=_prestretch(model, tissue),
         **{"element": element, "contact_rule": _contact_rule(model, tissue), **settings},
     )
 
@@ -88,6 +90,37 @@ def _fibres(model: FebModel, tissue: Tissue) -> Array | None:
         if name in model.fibres:
             found[tissue.mesh.regions == r] = model.fibres[name]
     return found
+
+
+def _prestretch(model: FebModel, tissue: Tissue) -> Array | None:
+    """The pre-strain of every cell, fully grown; the identity where there is none."""
+    if not model.prestrains:
+        return None
+    found = np.tile(np.eye(3), (len(tissue.mesh.cells), 1, 1))
+    for r, name in enumerate(tissue.mesh.region_names):
+        one = model.prestrains.get(name)
+        if one is not None:
+            grown = one.factor * (float(model.curves[one.curve].at(0.0)) if one.curve else 1.0)
+            found[tissue.mesh.regions == r] = (1.0 - grown) * np.eye(3) + grown * one.gradient
+    return found
+
+
+def _activation(model: FebModel) -> Activation | None:
+    """The one course of all contractions."""
+    if not model.contractions:
+        return None
+    end, every = sum(phase.seconds for phase in model.phases), step_times(model.phases, model.curves)
+    curves = [model.curves[one.curve] for one in model.contractions if one.curve]
+    times = knots(curves, every, 0.0, end)
+    courses = [
+        model.curves[one.curve].at(times) if one.curve else np.ones(len(times)) for one in model.contractions
+    ]
+    for one, course in zip(model.contractions, courses):
+        if np.abs(course - courses[0]).max() > 1e-9 * np.abs(courses[0]).max():
+            other = model.contractions[0].material
+            what = f"the contraction of {one.material!r} has another course than that of {other!r}"
+            raise ProblemError(what, place=f"line {one.line}, <solid>", remedy="give all one load curve")
+    return Activation(times, courses[0])
 
 
 def _contact_rule(model: FebModel, tissue: Tissue) -> str:

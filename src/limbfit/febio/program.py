@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Problem, Result
+from .beginning import Beginning
 from .logs import Log, read_log
 from .verdict import SLACK, RunVerdict, judge
 
@@ -146,7 +147,13 @@ def result_of_log(problem: Problem, log: Log | None, verdict: RunVerdict, second
     ProblemError
         Where the table holds no force along the indenter's axis, or goes beyond the history.
     """
-    times, force = (np.zeros(1), np.zeros(1)) if log is None else (log.times, axial_force(problem, log))
+    times, force = np.zeros(1), np.zeros(1)
+    if log is not None:
+        begun = Beginning.of(problem).seconds
+        own = log.times >= begun * (1.0 - SLACK)
+        times, force = np.maximum(log.times[own] - begun, 0.0), axial_force(problem, log)[own]
+    if not len(times):  # FEBio did not come so far
+        times, force = np.zeros(1), np.zeros(1)
     if times[0] > 0.0:
         times, force = np.concatenate([[0.0], times]), np.concatenate([[0.0], force])
     if times[-1] > problem.history.times[-1] * (1.0 + SLACK):

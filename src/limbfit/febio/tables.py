@@ -58,7 +58,7 @@ class Tables:
 
     def add(self, step: Step) -> None:
         """Write one accepted step."""
-        self._write(step.time, step)
+        self._write(self.model.settled_s + step.time, step)
 
     def _write(self, time: float, step: Step | None) -> None:
         needed = any(request.kind == "element_data" for request in self.model.requests)

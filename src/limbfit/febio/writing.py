@@ -15,21 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError, RunError
-from ..fe import Indenter, Material, Problem, StepControl
+from ..fe import Indenter, Motion, Problem, StepControl
 from ..fe.solution.control import schedule
-from .faceting import FRONT, INDENTER, PATCH, Body, ToolMesh, blunt, written_bodies
+from .beginning import STRAINED_S, Beginning, as_written
+from .faceting import FRONT, INDENTER, PATCH, Body, ToolMesh, blunt, frame_mesh, written_bodies
 from .fibres import axes_of_cells, axis_of, directions
-from .moving import HELD, Curves, boundary_lines, conditions, pressure_lines, row, step_ends
+from .materials import material_lines, prestrain_of, prestrains, prestrains_of_cells
+from .meshes import QUADRATURE, domain_lines, mesh_lines
+from .moving import (
+    FRAME,
+    HELD,
+    Curves,
+    boundary_lines,
+    conditions,
+    pressure_lines,
+    rail_lines,
+    row,
+    step_ends,
+)
 from .penalty import explicit_penalty, mean_stiffness
 from .reading.model import Contact
 
 Array = NDArray[np.float64]
 
-# FEBio's names of limbfit's elements; hex8 with an uncoupled material is three-field by itself.
-_QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10p0": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
-_FACE = {3: "tri3", 4: "quad4", 6: "tri6"}
-_PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
-MOST_TERMS = 6  # of Ogden and of Prony in FEBio
+HELD_STILL = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
 
 
 @dataclass(frozen=True)
@@ -58,15 +67,19 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
     ------
     ProblemError
         For a problem that FEBio cannot be given as it is: sticky contact, limbfit's own elements, a force
-        along an axis askew.
+        along an axis askew that is not all that drives a body; and as `as_written`.
     RunError
         Where the file cannot be written.
     """
     settings = settings or FebSettings()
-    bodies = _checked_bodies(problem)
+    bodies, there = _checked_bodies(problem), problem
+    forced = any(np.asarray(body.motion.forced)[0].any() for body in problem.rigid_bodies)
+    if forced or Beginning.of(problem).seconds or problem.touch_down_s:
+        there, motions = as_written(problem, settings.steps)
+        bodies = written_bodies(there, motions)
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _lines(problem, bodies, settings))
+            stream.writelines(f"{line}\n" for line in _lines(problem, there, bodies, settings))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
     return bodies[0].tool if bodies else None
@@ -81,13 +94,17 @@ def _checked_bodies(problem: Problem) -> list[Body]:
         Where it cannot.
     """
     check_element(problem, "FEBio")
-    if not (problem.rigid_bodies or problem.pressures or any(s.factor for s in problem.supports)):
+    prestrains(problem)
+    if problem.touch_down_s and any(support.factor for support in problem.supports):
+        raise ProblemError("nodes that move with an indenter which touches later are not written for FEBio")
+    tenses = problem.activation is not None and any(m.table().active for m in problem.materials.values())
+    if not (tenses or problem.rigid_bodies or problem.pressures or any(s.factor for s in problem.supports)):
         raise ProblemError("nothing drives the problem: there is nothing to write for FEBio")
     if any(body.friction == "sticky" for body in problem.rigid_bodies):
         raise ProblemError("FEBio has no sticky contact", remedy='export with friction = "frictionless"')
     bodies = written_bodies(problem)
     mesh = problem.mesh
-    own = {name for body in bodies for name in (body.name, body.patch, body.front)} | {HELD}
+    own = {name for body in bodies for name in (body.name, body.patch, body.front)} | {HELD, FRAME}
     taken = own & {*mesh.node_sets, *mesh.face_sets, *mesh.region_names}
     if taken:
         raise ProblemError(f"a set or tissue has the name {min(taken)!r}, which is a rigid body's")
@@ -120,6 +137,24 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     lines = [contact, "indenter: facets, without the side walls", "time: FEBio's own steps"]
     if not automatic:
         lines.append("force: within 2 % of the peak of limbfit's, as far as these go")
+    beginning = Beginning.of(problem)
+    if beginning.settling_s:
+        lines.append(
+            f"pre-strain: grows in {STRAINED_S:g} s and relaxes until {beginning.settling_s:g} s; the "
+            f"history begins at {beginning.seconds:g} s"
+        )
+    if beginning.approach_s or problem.touch_down_s:
+        lines.append(
+            "touch-down: where limbfit has found it, which holds for these parameters alone; FEBio brings "
+            "the indenter there"
+        )
+    if any(np.asarray(body.motion.forced)[0].any() for body in problem.rigid_bodies):
+        lines.append(
+            "forces: begin after limbfit's first step, in which FEBio moves the body to where limbfit has "
+            "found it then"
+        )
+    if any(body.rail is not None for body in written_bodies(problem)):
+        lines.append("guides: bodies under a force go along a prismatic joint, held by a penalty")
     if any(_slides(body.friction) and body.sticking == "anchored" for body in problem.rigid_bodies):
         lines.append(
             "sticking: FEBio anchors what sticks anew in every step, so that it slips on in time; "
@@ -135,19 +170,19 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
 
 
 def check_element(problem: Problem, program: str) -> None:
-    """Raise `ProblemError` where another program has no such element, or no such beginning."""
-    if problem.prestretch is not None or problem.touch_down_s:
-        what = f"a limb that clamps, contraction or pre-stretch move first is not written for {program}"
-        raise ProblemError(what, remedy="leave them out of the study")
+    """Raise `ProblemError` where another program has no such element."""
     name = problem.formulation.name
-    if name not in _QUADRATURE:
-        known = ", ".join(_QUADRATURE)
+    if name not in QUADRATURE:
+        known = ", ".join(QUADRATURE)
         raise ProblemError(f"{program} has no element {name!r}", remedy=f"export with one of {known}")
 
 
 def check_plain(problem: Problem, program: str) -> None:
     """Raise `ProblemError` where a problem is more than a frictionless indentation along the axis."""
     check_element(problem, program)
+    if problem.prestretch is not None or problem.touch_down_s or problem.activation is not None:
+        what = f"a limb that clamps, contraction or pre-stretch move first is not written for {program}"
+        raise ProblemError(what, remedy="leave them out of the study, or export for FEBio")
     if problem.indenter is None or problem.supports:
         raise ProblemError(f"only indentations with fixed nodes are written for {program}")
     if problem.history.across is not None:
@@ -165,42 +200,49 @@ def check_plain(problem: Problem, program: str) -> None:
         raise ProblemError(f"a set or tissue has the name {(*taken, INDENTER)[0]!r}, which is the indenter's")
 
 
-def _lines(problem: Problem, bodies: list[Body], settings: FebSettings) -> Iterator[str]:
+def _lines(problem: Problem, there: Problem, bodies: list[Body], settings: FebSettings) -> Iterator[str]:
+    """The file of a problem, which is ``there`` in the file's own time."""
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     for words in (f"limbfit: {settings.title}; mm, N, s, MPa", *differences(problem, settings)):
         yield f"<!-- {escape(' '.join(words.replace('--', '-').split()))} -->"
-    curves, regions = Curves(), problem.mesh.region_names
-    end = float(problem.history.times[-1])
-    ends = step_ends([body.motion for body in bodies], end)
+    curves, regions, settled = Curves(), problem.mesh.region_names, Beginning.of(problem).settling_s
+    ends = step_ends([body.motion for body in bodies], float(there.history.times[-1]), settled)
     rigid = [conditions(body.name, body.motion, ends, curves) for body in bodies]
     by_step = [[line for body in rigid for line in body[k]] for k in range(len(ends))]
-    musts = np.concatenate([[0.0], schedule(problem.history, settings.steps, problem.turns)])
-    largest = np.full(len(musts), largest_step(problem))
-    must = curves.add("must_points", np.column_stack([musts, largest]), "STEP")
-    boundary = list(boundary_lines(problem, curves))
-    loads = list(pressure_lines(problem, curves))
+    must = curves.add("must_points", _must_points(problem, settings), "STEP")
+    boundary = list(boundary_lines(there, curves))
+    loads = list(pressure_lines(there, curves))
     controls = [list(_control(problem, settings, must, *span)) for span in pairwise([0.0, *ends])]
+    tissues = list(_materials(there, curves, settled))
+    rails = [line for body in bodies if body.rail is not None
+             for line in rail_lines(body.name, body.motion, body.rail, body.centre, body.width)]  # fmt: skip
+    frame = frame_mesh(bodies) if rails else None
     yield '<febio_spec version="4.0">'
     yield '<Module type="solid"/>'
     if len(ends) == 1:
         yield from controls[0]
     yield "<Globals><Constants><T>0</T><R>0</R><Fc>0</Fc></Constants></Globals>"
-    yield "<Material>"
-    axes = directions(problem)
-    for i, name in enumerate(regions, 1):
-        yield from material_lines(i, name, problem.materials[name], axis_of(axes.get(name)))
-    for i, body in enumerate(bodies, len(regions) + 1):
+    yield from ("<Material>", *tissues)
+    rigids = [(body.name, body.centre) for body in bodies]
+    rigids += [] if frame is None else [(FRAME, frame.points[0])]
+    for i, (name, centre) in enumerate(rigids, len(regions) + 1):
         yield (
-            f'<material id="{i}" name={quoteattr(body.name)} type="rigid body"><density>1</density>'
-            f"<center_of_mass>{row(body.centre)}</center_of_mass></material>"
+            f'<material id="{i}" name={quoteattr(name)} type="rigid body"><density>1</density>'
+            f"<center_of_mass>{row(centre)}</center_of_mass></material>"
         )
     yield "</Material>"
-    yield from _mesh(problem, bodies)
-    yield from _domains(problem, bodies)
-    yield from axes_of_cells(problem)
+    meshes = {body.name: body.tool for body in bodies} | ({} if frame is None else {FRAME: frame})
+    yield from mesh_lines(problem, bodies, meshes)
+    yield from domain_lines(problem, meshes)
+    data = [*axes_of_cells(problem), *prestrains_of_cells(prestrains(problem))]
+    if data:
+        yield from ("<MeshData>", *data, "</MeshData>")
     yield from ("<Boundary>", *boundary, "</Boundary>")
-    if bodies and len(ends) == 1:
-        yield from ("<Rigid>", *by_step[0], "</Rigid>")
+    everywhere = rails + (by_step[0] if len(ends) == 1 else [])
+    if frame is not None:
+        everywhere += conditions(FRAME, HELD_STILL, ends[-1:], curves)[0]
+    if everywhere:
+        yield from ("<Rigid>", *everywhere, "</Rigid>")
     if bodies:
         contacts = (line for body in bodies for line in _contact(problem, body, settings))
         yield from ("<Contact>", *contacts, "</Contact>")
@@ -216,12 +258,39 @@ def _lines(problem: Problem, bodies: list[Body], settings: FebSettings) -> Itera
     yield "</febio_spec>"
 
 
+def _must_points(problem: Problem, settings: FebSettings) -> Array:
+    """Times (k,) that FEBio must meet and the largest step up to each, s."""
+    beginning = Beginning.of(problem)
+    own = beginning.seconds + schedule(problem.history, settings.steps, problem.turns)
+    times, largest = np.append(0.0, own), np.full(len(own) + 1, largest_step(problem))
+    if beginning.settling_s:
+        rest = beginning.settling_s - STRAINED_S
+        settling = [STRAINED_S, beginning.settling_s] if rest else [STRAINED_S]
+        times = np.concatenate([[0.0], settling, own])
+        largest = np.concatenate([[STRAINED_S / 10.0], [STRAINED_S / 10.0, rest / 10.0][: len(settling)],
+                                  largest[1:]])  # fmt: skip
+    return np.column_stack([times, largest])
+
+
+def _materials(there: Problem, curves: Curves, settled: float) -> Iterator[str]:
+    """The tissues, with the curves of their contraction and of their pre-strain."""
+    axes, strained, course = directions(there), prestrains(there), 0
+    if there.activation is not None:
+        points = np.column_stack([np.asarray(there.activation.times), np.asarray(there.activation.shares)])
+        course = curves.add("activation", points)
+    ramp = curves.add("prestrain", np.array([[0.0, 0.0], [STRAINED_S, 1.0]])) if settled else 0
+    for i, name in enumerate(there.mesh.region_names, 1):
+        prestrain = prestrain_of(name, strained.get(name), ramp)
+        yield from material_lines(i, name, there.materials[name], axis_of(axes.get(name)), course, prestrain)
+
+
 def _control(problem: Problem, settings: FebSettings, must: int, begin: float, end: float) -> Iterator[str]:
     """Steps that FEBio grows and halves; stiff contact needs a tangent in every iteration.
 
     With an explicit penalty quasi-Newton updates stall.
     """
-    size = _dividing(end - begin, 0.25 * largest_step(problem))
+    settles = end <= Beginning.of(problem).settling_s
+    size = _dividing(end - begin, 0.25 * (STRAINED_S / 10.0 if settles else largest_step(problem)))
     updates, reformations = (0, 60) if settings.penalty is None else (10, 25)
     yield f"<Control><analysis>STATIC</analysis><time_steps>{round((end - begin) / size)}</time_steps>"
     yield f"<step_size>{size!r}</step_size>"
@@ -244,7 +313,7 @@ def _slides(friction: str | float) -> bool:
 
 def largest_step(problem: Problem) -> float:
     """The largest step, s: a sixteenth of the first way in, half of that under sharp edges."""
-    ways = [] if problem.indenter is None else [problem.history.loading_s]
+    ways = [] if problem.indenter is None else [problem.history.loading_s - problem.touch_down_s]
     for body in problem.bodies:
         ends = [*body.motion.turns, body.motion.times[-1]]
         ways += [float(ends[0])] if body.motion.values.any() else []
@@ -261,110 +330,6 @@ def first_step(problem: Problem) -> float:
 def _dividing(span: float, size: float) -> float:
     """A whole part of a span of time, not above ``size``, s."""
     return span / float(np.ceil(span / size))
-
-
-def material_lines(number: int, name: str, material: Material, axis: str = "") -> Iterator[str]:
-    """A tissue: Ogden terms, fibres beside them along ``axis``, and relaxation around them.
-
-    Raises
-    ------
-    ProblemError
-        For more terms than FEBio takes, and for tissue that contracts.
-    """
-    table = material.table()
-    if table.active > 0.0:
-        raise ProblemError(f"tissue {name!r} contracts, which is not written for other programs")
-    prony = [(g, tau) for g, tau in table.prony if g != 0.0]
-    if max(len(prony), len(table.terms)) > MOST_TERMS:
-        raise ProblemError(f"tissue {name!r} has more than {MOST_TERMS} terms, which FEBio does not take")
-    terms = "".join(
-        f"<c{i}>{float(c)!r}</c{i}><m{i}>{float(m)!r}</m{i}>" for i, (c, m) in enumerate(table.terms, 1)
-    )
-    shared = (
-        f"<k>{float(table.kappa)!r}</k><pressure_model>{_PRESSURE_MODELS[table.volumetric]}</pressure_model>"
-    )
-    head = f'<material id="{number}" name={quoteattr(name)} type='
-    kind, content = "Ogden", terms
-    if table.fibre[0] > 0.0:
-        k1, k2 = map(float, table.fibre)
-        kind = "uncoupled solid mixture"
-        content = f'<solid type="Ogden">{terms}</solid><solid type="fiber-exp-pow-uncoupled">'
-        content += f"<ksi>{k1!r}</ksi><alpha>{k2!r}</alpha><beta>2</beta></solid>"
-    if not prony:
-        yield f'{head}"{kind}">{axis}{shared}{content}</material>'
-        return
-    relaxation = "".join(
-        f"<g{i}>{float(g)!r}</g{i}><t{i}>{float(tau)!r}</t{i}>" for i, (g, tau) in enumerate(prony, 1)
-    )
-    yield f'{head}"uncoupled viscoelastic">{axis}{shared}<g0>1</g0>{relaxation}'
-    yield f'<elastic type="{kind}"><k>0</k>{content}</elastic></material>'
-
-
-def _mesh(problem: Problem, bodies: list[Body]) -> Iterator[str]:
-    mesh = problem.mesh
-    firsts = np.cumsum([len(mesh.points), *(len(body.tool.points) for body in bodies)])
-    yield '<Mesh><Nodes name="all">'
-    for i, point in enumerate(np.vstack([mesh.points, *(body.tool.points for body in bodies)]), 1):
-        yield f'<node id="{i}">{row(point)}</node>'
-    yield "</Nodes>"
-    number = 1
-    for r, name in enumerate(mesh.region_names):
-        cells = mesh.cells[mesh.regions == r]
-        yield from _elements(name, mesh.cell_type, cells, number)
-        number += len(cells)
-    for body, first in zip(bodies, firsts):
-        yield from _elements(body.name, body.tool.cell_type, body.tool.cells + first, number)
-        number += len(body.tool.cells)
-    sets = {HELD: problem.fixed, **mesh.node_sets}
-    sets |= {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
-    for name, nodes in sets.items():
-        if len(nodes):
-            yield f"<NodeSet name={quoteattr(name)}>{_ids(nodes)}</NodeSet>"
-    named = {  # FEBio makes an element set of every part
-        f"{name}_surface" if name in mesh.region_names else name: faces
-        for name, faces in mesh.face_sets.items()
-    }
-    surfaces = {body.patch: body.faces for body in bodies}
-    surfaces |= {body.front: body.tool.front + first for body, first in zip(bodies, firsts)}
-    surfaces |= {f"pressed_{i}": np.asarray(one.faces) for i, one in enumerate(problem.pressures, 1)}
-    for name, faces in {**surfaces, **named}.items():
-        yield from _surface(name, faces)
-    for body in bodies:
-        yield f"<SurfacePair name={quoteattr(body.pair)}><primary>{body.patch}</primary>"
-        yield f"<secondary>{body.front}</secondary></SurfacePair>"
-    yield "</Mesh>"
-
-
-def _elements(name: str, cell_type: str, cells: NDArray[np.int64], first: int) -> Iterator[str]:
-    yield f"<Elements type={quoteattr(cell_type)} name={quoteattr(name)}>"
-    for i, cell in enumerate(cells, first):
-        yield f'<elem id="{i}">{_ids(cell)}</elem>'
-    yield "</Elements>"
-
-
-def _surface(name: str, faces: NDArray[np.int64]) -> Iterator[str]:
-    kind = _FACE[faces.shape[1]]
-    yield f"<Surface name={quoteattr(name)}>"
-    for i, face in enumerate(faces, 1):
-        yield f'<{kind} id="{i}">{_ids(face)}</{kind}>'
-    yield "</Surface>"
-
-
-def _domains(problem: Problem, bodies: list[Body]) -> Iterator[str]:
-    rule = _QUADRATURE[problem.formulation.name]
-    given = f' elem_type="{rule}"' if rule else ""
-    if problem.formulation.name == "tet10p0":  # one volume ratio and pressure per element
-        given += ' type="three-field-solid"'
-    yield "<MeshDomains>"
-    for name in problem.mesh.region_names:
-        yield f"<SolidDomain name={quoteattr(name)} mat={quoteattr(name)}{given}/>"
-    for body in bodies:
-        names = f"name={quoteattr(body.name)} mat={quoteattr(body.name)}"
-        if body.tool.cell_type == "hex8":
-            yield f"<SolidDomain {names}/>"
-        else:
-            yield f"<ShellDomain {names}><shell_thickness>0.01</shell_thickness></ShellDomain>"
-    yield "</MeshDomains>"
 
 
 def _contact(problem: Problem, body: Body, settings: FebSettings) -> Iterator[str]:
@@ -391,7 +356,3 @@ def _output(numbers: Iterable[int], settings: FebSettings) -> Iterator[str]:
     table = f'data="Fx;Fy;Fz;x;y;z" file={quoteattr(settings.force_file)} delim=","'
     rigid = f"<logfile><rigid_body_data {table}>{items}</rigid_body_data></logfile>"
     yield f"</plotfile>{rigid if items else ''}</Output>"
-
-
-def _ids(nodes: Iterable[int]) -> str:
-    return ",".join(str(int(node) + 1) for node in nodes)

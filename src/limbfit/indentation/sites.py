@@ -40,6 +40,8 @@ from .prestretch import prestretch_field
 
 Array = NDArray[np.float64]
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
+# Of the solver's tolerance: it is one of the reactions of all pins, of which the test pin's is a small part.
+FINELY = 0.1
 ROUGHLY = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
 
 
@@ -263,6 +265,8 @@ def steps_of(model: SiteModel) -> StepControl:
     control = StepControl(load_steps=table.load_steps, unload_steps=table.unload_steps)
     if model.within_mm is not None:
         control = replace(control, penetration=ROUGHLY * control.penetration)
+    if model.clamps is not None:
+        control = replace(control, tolerance=FINELY * control.tolerance)
     if table.penalty_per_mm is None:
         return control
     return replace(control, penalty=table.penalty_per_mm, hold_penalty=True)

@@ -97,6 +97,7 @@ class SteppedRun:
             rest = self.system.bodies.impose(rest, drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
         self.rest = self._coordinates(rest, drives)
+        self.rested: Array | None = None  # the same where pre-strained tissue is in equilibrium
         start = problem.history.displacement_at(0.0)
         self.grips = begun(self.system, self.grips, rest, drives)
         self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
@@ -148,6 +149,8 @@ class SteppedRun:
             found = self._attempt(0.0, self.control.max_iterations, LONG_SINCE)
         if isinstance(found, str):
             self.reason = f"the pre-strained tissue found no equilibrium: {found}"
+        else:
+            self.rested = found.coordinates
         self.states = self.states[-1:]
         return not self.reason
 
@@ -254,7 +257,7 @@ class SteppedRun:
         say nothing of it."""
         travel, little = self.problem.travel, 1e-9 * t
         turned = max((turn for turn in self.problem.turns if turn < t - little), default=-np.inf)
-        known = [state for state in self.states if state.time >= turned - little]
+        known = [state for state in self.states if state.time >= turned - little] or self.states[-1:]
         weights = np.zeros(len(self.states))
         weights[-len(known) :] = extrapolation([travel(state.time) for state in known], travel(t))
         return weights

@@ -8,16 +8,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import ProblemError
 from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced, unsettled
 from ..observables import element_fields
-from ..problem import Problem, ProblemError
+from ..problem import Problem
 from ..result import Result, State, Step
 from ..snapshot import Checkpoints, Snapshot
 from ..system import System
@@ -151,6 +152,42 @@ def _resumed(run: SteppedRun, begin: Snapshot) -> list[Step]:
         Step(state=first, **nothing | {name: column[i] for name, column in columns.items()})
         for i in range(len(columns["time"]))
     ]
+
+
+@dataclass(frozen=True)
+class FirstStep:
+    """How a simulation began.
+
+    ``place``: how far beyond where it would touch tissue at rest the indenter began, mm along its axis.
+    ``times (2,)`` s: the start and the end of the first step, and ``coordinates (2, b, 6)`` the rigid bodies'
+    then, mm and rad.
+    """
+
+    place: float
+    times: Array
+    coordinates: Array
+
+
+def onset(problem: Problem, steps: StepControl = StepControl()) -> FirstStep:
+    """Solve a problem until its indenter, which may wait for tissue that moves before, begins.
+
+    Raises
+    ------
+    ProblemError
+        Where the problem is impossible as stated, and where that is not reached.
+    """
+    run = SteppedRun(problem, steps, False, None)
+    start, first = run.rest, None
+    for step in run.run():
+        if first is None:
+            start, first = run.rest if run.rested is None else run.rested, step
+        if not run.touch.waits:
+            times = np.array([0.0, first.time])
+            return FirstStep(run.touch.offset, times, np.array([start, first.coordinates]))
+    raise ProblemError(
+        f"the tissue that moves before the indenter touches it found no equilibrium: {run.reason}",
+        remedy="take smaller steps (solver.load_steps), or less force",
+    )
 
 
 def _result(

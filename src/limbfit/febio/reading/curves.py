@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,13 @@ class Curve:
         if self.extend == "EXTRAPOLATE":
             inside = inside + self._beyond(t)
         return np.asarray(inside + offset)
+
+    def after(self, seconds: float) -> Curve:
+        """The same where time begins at what were so many seconds."""
+        given = self.formula
+        if given is not None:
+            return replace(self, formula=lambda t: given(t + seconds))
+        return replace(self, points=self.points - [seconds, 0.0])
 
     @property
     def corners(self) -> Array | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...fe import Material
 from .geometry import Part
+from .straining import MATRIX
 from .tree import Node
 
 Array = NDArray[np.float64]
@@ -29,11 +30,13 @@ def read_fibres(root: Node, materials: Mapping[str, Material], parts: Mapping[st
     axes = {node.attribute("name"): _of_material(node) for node in root.child("Material")}
     found = {}
     for name, part in parts.items():
-        if part.material in materials and materials[part.material].table().fibre[0] > 0.0:
+        if part.material in materials and materials[part.material].table().has_fibres:
             found[name] = np.tile(axes[part.material], (len(part.cells), 1))
     for data in root.find("MeshData") or ():
+        if data.attributes.get("data_type") == MATRIX:
+            continue
         if data.tag != "ElementData" or data.attribute("type") != "mat_axis":
-            raise data.refuse("of <MeshData> only the mat_axis of elements is supported")
+            raise data.refuse(f"of <MeshData> only the mat_axis of elements, and {MATRIX}, are supported")
         name = data.attribute("elem_set")
         if name not in parts:
             raise data.refuse(f"there is no part {name!r}")

@@ -1,5 +1,7 @@
 """Materials of FEBio as limbfit's: uncoupled hyperelastic laws, fibres beside and Prony terms around them.
 
+A contraction may stand beside, a pre-strain around all of it (`straining`).
+
 Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
 """
 
@@ -13,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from ...fe import Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from ...fe import Contractile, Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from ...fe.materials import Uncoupled
 from .tree import Node
 
@@ -25,7 +27,10 @@ ELASTIC = {
     "incomp neo-Hookean": {"G"},
 }
 _SHARED = {"k", "density", "pressure_model", "laugon", "atol", "mat_axis"}
-_MIXTURE, _FIBRE = "uncoupled solid mixture", "fiber-exp-pow-uncoupled"
+_MIXTURE, _RELAXED = "uncoupled solid mixture", "uncoupled viscoelastic"
+_FIBRE, ACTIVE, PRESTRAINED = (
+    "fiber-exp-pow-uncoupled", "uncoupled active fiber stress", "uncoupled prestrain elastic",
+)  # fmt: skip
 _RELAXING = {"g0", "elastic"} | {f"{letter}{i}" for letter in "gt" for i in range(1, 7)}
 _VOLUMETRIC = {
     "": "log", "default": "log", "0": "log",
@@ -82,11 +87,31 @@ def read_materials(
 
 
 def _law(node: Node) -> Material:
+    k, law = node.number("k", 0.0), _volumetric(node)
+    if node.attribute("type") != PRESTRAINED:
+        return _uncoupled(node, k, law)
+    _only(node, {"elastic", "prestrain"} | _SHARED)
+    inner = node.child("elastic")
+    if inner.number("k", 0.0) != 0.0:
+        raise inner.refuse("has a bulk modulus of its own in a pre-strain", "give that of the outer material")
+    return _uncoupled(inner, k, _agreeing(inner, law))
+
+
+def _uncoupled(node: Node, k: float, law: str) -> Material:
+    """The law of a material with bulk modulus ``k`` (MPa)."""
     kind = node.attribute("type")
-    if kind in ELASTIC or kind == _MIXTURE:
-        return _hyperelastic(node, 1.0, (), node.number("k", 0.0), _volumetric(node))
-    if kind != "uncoupled viscoelastic":
+    if kind == _RELAXED:
+        return _relaxing(node, k, law)
+    if kind not in (*ELASTIC, _MIXTURE):
         raise _unknown(node, kind)
+    if kind == _MIXTURE:
+        active = [one for one in node.all("solid") if one.attribute("type") == ACTIVE]
+        if active:
+            return _contractile(node, active, k, law)
+    return _hyperelastic(node, 1.0, (), k, law)
+
+
+def _relaxing(node: Node, k: float, law: str) -> Material:
     elastic = node.child("elastic")
     if elastic.attribute("type") not in (*ELASTIC, _MIXTURE):
         raise _unknown(elastic, elastic.attribute("type"))
@@ -96,11 +121,34 @@ def _law(node: Node) -> Material:
         raise node.refuse("g0 is not positive: nothing would hold the tissue in the long term")
     prony = [(node.number(f"g{i}", 0.0), i) for i in range(1, 7)]
     terms = tuple((g / g0, node.number(f"t{i}", 1.0)) for g, i in prony if g != 0.0)
-    law = _volumetric(node)
-    if elastic.find("pressure_model") is not None and _volumetric(elastic) != law:
-        raise elastic.refuse("its pressure_model differs from that of the material around it")
     # The wrapper adds its own k to the elastic material's; g0 scales the deviatoric part only.
-    return _hyperelastic(elastic, g0, terms, node.number("k", 0.0) + elastic.number("k", 0.0), law)
+    return _hyperelastic(elastic, g0, terms, k + elastic.number("k", 0.0), _agreeing(elastic, law))
+
+
+def _agreeing(inner: Node, law: str) -> str:
+    if inner.find("pressure_model") is not None and _volumetric(inner) != law:
+        raise inner.refuse("its pressure_model differs from that of the material around it")
+    return law
+
+
+def _contractile(node: Node, active: list[Node], k: float, law: str) -> Contractile:
+    """What a mixture bears passively, and the stress of its fibres at full activation beside it."""
+    if len(active) > 1:
+        raise active[1].refuse("a mixture is read with one contraction")
+    _only(node, {"solid"} | _SHARED)
+    (pull,) = active
+    _only(pull, {"smax", "activation", "k", "density"})
+    rest = [one for one in node.all("solid") if one is not pull]
+    if [one.attribute("type") for one in rest] == [_RELAXED]:
+        passive = _relaxing(rest[0], k, _agreeing(rest[0], law))
+    elif len(rest) == 1 and rest[0].attribute("type") in ELASTIC:
+        passive = _hyperelastic(rest[0], 1.0, (), k, law)
+    else:
+        passive = _mixed(node, rest, 1.0, (), k, law)
+    if not isinstance(passive, Fibred):
+        assert isinstance(passive, Uncoupled)
+        passive = Fibred(passive, 0.0, 1.0)
+    return Contractile(passive, pull.number("smax") * pull.number("activation"))
 
 
 def _hyperelastic(
@@ -110,10 +158,18 @@ def _hyperelastic(
     if node.attribute("type") != _MIXTURE:
         return _elastic(node, scale, prony, k, law)
     _only(node, {"solid"} | _SHARED)
-    solids = node.all("solid")
+    return _mixed(node, node.all("solid"), scale, prony, k, law)
+
+
+def _mixed(
+    node: Node, solids: list[Node], scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
+) -> Fibred:
+    """The ground and the fibres among the ``solids`` of a mixture."""
     fibres = [one for one in solids if one.attribute("type") == _FIBRE]
     grounds = [one for one in solids if one.attribute("type") in ELASTIC]
     if not len(fibres) == len(grounds) == 1 or len(solids) != 2:
+        if any(one.attribute("type") == ACTIVE for one in solids):
+            raise node.refuse("an active stress that relaxes is not read", f"put {ACTIVE} beside {_RELAXED}")
         raise node.refuse(f"a mixture is read of one {_FIBRE} and one of {', '.join(ELASTIC)}")
     (fibre,), (ground,) = fibres, grounds
     for one in solids:
@@ -127,7 +183,7 @@ def _hyperelastic(
 
 
 def _unknown(node: Node, kind: str) -> ProblemError:
-    remedy = "limbfit has uncoupled materials: " + ", ".join(ELASTIC) + ", and uncoupled viscoelastic"
+    remedy = "limbfit has uncoupled materials: " + ", ".join(ELASTIC) + ", uncoupled viscoelastic"
     if kind in ("neo-Hookean", "isotropic elastic"):
         remedy = "use 'incomp neo-Hookean' with G = E / (2 (1 + v)) and k = E / (3 (1 - 2 v))"
     return node.refuse(f"material type {kind!r} is not known", remedy)
@@ -145,7 +201,7 @@ def _only(node: Node, known: set[str]) -> None:
         if child.tag not in known:
             raise child.refuse("this parameter of the material is not known")
         varies = child.attributes.get("lc") or child.attributes.get("type") not in (None, "const")
-        if varies and child.tag not in ("elastic", "solid", "mat_axis"):
+        if varies and child.tag not in ("elastic", "solid", "mat_axis", "prestrain", "activation"):
             raise child.refuse("a parameter that changes in time or space is not supported")
     if node.flag("laugon"):
         raise node.child("laugon").refuse("augmented incompressibility is not supported")

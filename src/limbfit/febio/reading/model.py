@@ -7,7 +7,7 @@ understood is an error that names its line, never skipped (FEBio User Manual 4.0
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +20,10 @@ from .curves import Curve, read_curves
 from .fibres import read_fibres
 from .geometry import Geometry, Indices, Part, node_set, read_geometry
 from .materials import RigidMaterial, read_materials
-from .motions import RigidCondition, amount, body_of, curved, read_conditions
+from .motions import RigidCondition, RigidRail, amount, body_of, curved, read_conditions, read_rails
 from .requests import Request, read_requests
 from .rigid import carried_nodes, centre_of_mass
+from .straining import Contraction, Prestrain, read_contractions, read_prestrains, settled_s
 from .tree import Node, read_tree
 
 Array = NDArray[np.float64]
@@ -96,7 +97,8 @@ class FebModel:
     ``materials`` are the deformable ones, ``rigid`` the others, both by name; ``motions`` those of nodes,
     ``conditions`` those of rigid bodies; ``carried`` nodes of tissue that move with a rigid body, by its
     name; ``notes`` what was read and has no meaning for limbfit; ``fibres`` their direction in each
-    cell of the parts that have some.
+    cell of the parts that have some; ``rails`` what guides rigid bodies; ``settled_s``: how long, in FEBio's
+    time, pre-strained tissue settles before the model's own time begins.
     """
 
     geometry: Geometry
@@ -112,6 +114,10 @@ class FebModel:
     requests: tuple[Request, ...]
     notes: tuple[str, ...]
     fibres: Mapping[str, Array]
+    rails: tuple[RigidRail, ...] = ()
+    contractions: tuple[Contraction, ...] = ()
+    prestrains: Mapping[str, Prestrain] = field(default_factory=dict)
+    settled_s: float = 0.0
 
     def parts_of(self, materials: Mapping[str, object]) -> dict[str, Part]:
         """The parts made of any of these materials."""
@@ -157,7 +163,7 @@ def _model(root: Node) -> FebModel:
     load = root.find("LoadData")
     curves = read_curves(load)
     requests, notes = read_requests(root.find("Output"), geometry)
-    return FebModel(
+    model = FebModel(
         geometry,
         materials,
         rigid,
@@ -171,6 +177,29 @@ def _model(root: Node) -> FebModel:
         requests,
         (*unread, *notes),
         read_fibres(root, materials, geometry.parts),
+        read_rails(root, rigid),
+        read_contractions(root.child("Material"), materials, curves),
+        read_prestrains(root, materials, curves, geometry.parts),
+    )
+    return _settled(model)
+
+
+def _settled(model: FebModel) -> FebModel:
+    """The model from where its pre-strained tissue has settled; its time begins anew there."""
+    others = {m.curve: f"the node set {m.target!r}" for m in model.motions if m.curve}
+    others |= {c.curve: f"the rigid body {c.body!r}" for c in model.conditions if c.curve and not c.step}
+    others |= {p.curve: f"the pressure on {p.surface!r}" for p in model.pressures}
+    others |= {c.curve: f"the contraction of {c.material!r}" for c in model.contractions if c.curve}
+    first = settled_s(model.prestrains, model.materials, model.phases, model.curves, others, model.conditions)
+    if not first:
+        return model
+    kept = (c for c in model.conditions if c.step != 0)
+    return replace(
+        model,
+        curves={number: curve.after(first) for number, curve in model.curves.items()},
+        phases=model.phases[1:],
+        conditions=tuple(replace(c, step=None if c.step is None else c.step - 1) for c in kept),
+        settled_s=first,
     )
 
 

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 FREEDOMS = "xyzuvw"  # of a rigid body: along the axes, about them
 _FIXED, _MOVED = ("rigid_fixed", "fix"), ("rigid_displacement", "rigid_rotation", "prescribe")
 _FORCED = ("rigid_force", "rigid_moment", "force")
+_RAIL = "rigid prismatic joint"
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,39 @@ class RigidCondition:
     line: int
 
 
+@dataclass(frozen=True)
+class RigidRail:
+    """A joint that lets a rigid body go ``along (3,)`` a line only, beside a fixed one (``base``)."""
+
+    body: str
+    base: str
+    along: Array
+    line: int
+
+
+def read_rails(root: Node, rigid: Mapping[str, RigidMaterial]) -> tuple[RigidRail, ...]:
+    """The prismatic joints of rigid bodies.
+
+    Raises
+    ------
+    ProblemError
+        For those that move a body themselves, or are there in some steps only.
+    """
+    found: list[RigidRail] = []
+    for node in root.find("Rigid") or ():
+        if node.tag != "rigid_connector" or node.attribute("type") != _RAIL:
+            continue
+        if node.flag("prescribed_translation") or node.number("force", 0.0) != 0.0:
+            raise node.refuse("a joint that moves its body is not supported", "give the body a rigid_force")
+        base, body = (body_of(node, rigid, tag) for tag in ("body_a", "body_b"))
+        axis = node.find("translation_axis")
+        along = np.array([1.0, 0.0, 0.0] if axis is None else axis.numbers(3))
+        if not along.any() or base == body or body in {rail.body for rail in found}:
+            raise node.refuse("needs an axis and two bodies of which it alone guides the second")
+        found.append(RigidRail(body, base, along / np.linalg.norm(along), node.line))
+    return tuple(found)
+
+
 def read_conditions(
     root: Node, rigid: Mapping[str, RigidMaterial], curves: Mapping[int, Curve]
 ) -> tuple[RigidCondition, ...]:
@@ -56,7 +90,8 @@ def read_conditions(
     found: list[RigidCondition] = []
     for section, step in sections:
         for node in section or ():
-            found += _conditions(node, rigid, curves, step)
+            if not (step is None and node.tag == "rigid_connector" and node.attribute("type") == _RAIL):
+                found += _conditions(node, rigid, curves, step)
     return tuple(found)
 
 
@@ -65,7 +100,7 @@ def _conditions(
 ) -> Iterator[RigidCondition]:
     kind = node.attribute("type")
     if node.tag not in ("rigid_bc", "rigid_constraint", "rigid_load"):
-        raise node.refuse(f"{kind!r} is not supported", "limbfit knows no joints of rigid bodies")
+        raise node.refuse(f"{kind!r} is not supported", f"limbfit knows no joint but the {_RAIL}")
     if kind not in (*_FIXED, *_MOVED, *_FORCED):
         raise node.refuse(f"rigid condition {kind!r} is not supported")
     name = body_of(node, rigid)
@@ -86,10 +121,10 @@ def _conditions(
     )
 
 
-def body_of(condition: Node, rigid: Mapping[str, RigidMaterial]) -> str:
+def body_of(condition: Node, rigid: Mapping[str, RigidMaterial], tag: str = "rb") -> str:
     """The name of the rigid body that a condition is about; it gives its name or its number."""
     names = {str(body.number): name for name, body in rigid.items()}
-    name = names.get(condition.string("rb"), condition.string("rb"))
+    name = names.get(condition.string(tag), condition.string(tag))
     if name not in rigid:
         raise condition.refuse(f"there is no rigid body {name!r}")
     return name
@@ -178,6 +213,27 @@ def rigid_motion(
             remedy="hold two of Ru, Rv, Rw, or leave all three free",
         )
     return Motion(times, values, forced)
+
+
+def on_rail(motion: Motion, rail: RigidRail) -> Motion:
+    """The motion of a body that a joint guides, in a frame whose third axis is that of the joint.
+
+    The joint bears what forces have across it.
+
+    Raises
+    ------
+    ProblemError
+        Where something else than forces drives the body.
+    """
+    forced, values = np.asarray(motion.forced), np.zeros_like(motion.values)
+    values[:, 2] = motion.values[:, :3] @ rail.along
+    under = np.asarray(forced.all(axis=1))
+    still = np.append(~under, False) | np.append(False, ~under)  # rows between which it is moved
+    off = np.abs(motion.values[:, :3] - values[:, 2:3] * rail.along)[still].max(initial=0.0)
+    if not (under | ~forced.any(axis=1)).all() or motion.values[:, 3:].any() or off > 1e-9:
+        what = f"the rigid body {rail.body!r} is guided by a joint, and held, moved or turned otherwise"
+        raise ProblemError(what, place=f"line {rail.line}, <rigid_connector>", remedy="give it forces only")
+    return Motion(motion.times, values, under[:, None] & (np.arange(6) == 2))
 
 
 def agrees_in_turning(values: Array, forced: NDArray[np.bool_]) -> bool:

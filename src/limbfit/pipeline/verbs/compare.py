@@ -20,6 +20,7 @@ from ...febio import (
     Log,
     RunVerdict,
     contact_of,
+    end_of_file,
     find_febio,
     mean_penalty,
     read_log,
@@ -98,13 +99,13 @@ def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
     penalty = mean_penalty(contact, problem, float(times[0]))
     steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
     system = System(problem)
-    weights = FaceWise(system, (contact,), times)
+    weights = FaceWise(system, (contact,) * len(problem.rigid_bodies), times)
     return solve(problem, steps, store="none", on_step=weights.after, system=system)
 
 
 def _of_log(problem: Problem, log: Log, file: Path) -> Result:
     """A table from elsewhere, complete where it reaches the end of the history."""
-    reached, end = float(log.times[-1]), float(problem.history.times[-1])
+    reached, end = float(log.times[-1]), end_of_file(problem)
     reason = "" if reached > end * (1.0 - SLACK) else f"the table ends at {reached:.4g} s of {end:.4g} s"
     verdict = RunVerdict("partial" if reason else "normal", reason, reached, "")
     try:

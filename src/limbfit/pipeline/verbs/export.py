@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...febio import Range, differences, in_indenter_frame, write_feb, write_inp, write_optimisation
+from ...febio import (
+    Range,
+    check_fitted,
+    differences,
+    in_indenter_frame,
+    write_feb,
+    write_inp,
+    write_optimisation,
+)
 from ...indentation import Parameters
 from ...study import Indentation as Planned
 from ...study import Record, Study
@@ -88,6 +96,7 @@ def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...],
     if to == "febio-optimize":
         if problem.fibres is not None:
             raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
+        check_fitted(problem)
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
         settings = replace(settings, penalty=None)
