@@ -32,6 +32,7 @@ class Grip(ABC):
     places, normals : (f, q, 3) anchor, mm, and unit normal of the tangent plane.
     bounds : (f, q) slip at which a point gives way, mm; infinite where it never does.
     d_places : (f, q, 3, p) derivative of the anchors with respect to the parameters.
+    pulls : (f, q, 3) the dual variable, mm: the part of the slip that pulls, as the tangent takes it to be.
     """
 
     held: Bools
@@ -39,6 +40,7 @@ class Grip(ABC):
     normals: Array
     bounds: Array
     d_places: Array
+    pulls: Array
 
     # Stiffness that holds a point over that of the contact.
     hardness = 1.0
@@ -46,10 +48,10 @@ class Grip(ABC):
     lags: ClassVar[bool] = False
 
     @property
-    def arrays(self) -> tuple[Bools, Array, Array, Array]:
+    def arrays(self) -> tuple[Bools, Array, Array, Array, Array]:
         """What the contact kernel takes of it, point by point."""
-        places, normals = self.places.reshape(-1, 3), self.normals.reshape(-1, 3)
-        return self.held.ravel(), places, normals, self.bounds.ravel()
+        places, normals, pulls = (x.reshape(-1, 3) for x in (self.places, self.normals, self.pulls))
+        return self.held.ravel(), places, normals, self.bounds.ravel(), pulls
 
     def bare(self) -> Self:
         """The grip without derivatives, to be kept."""
@@ -57,6 +59,10 @@ class Grip(ABC):
 
     def begun(self, tool: Tool) -> Grip:
         """The grip before the first step, with the tool where it starts."""
+        return self
+
+    def foreseen(self, tool: Tool, du: Array) -> Self:
+        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of the tool's ``u``."""
         return self
 
     @abstractmethod

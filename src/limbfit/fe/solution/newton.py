@@ -106,6 +106,7 @@ def equilibrate(
         last = norm
         if norm <= NEAR * scale:
             evaluate.exactly()
+        evaluate.foresee(u, direction)
         going_on = control.tangent or forcing > sufficient
         found = _line_search(evaluate, u, here, direction, control.max_backtracks, going_on)
         if found is None:
@@ -160,6 +161,14 @@ class _Evaluator:
     def exactly(self) -> None:
         """From here on with the indenter's curvature everywhere."""
         self._increment = replace(self._increment, flat_from=np.inf)
+
+    def foresee(self, u: Array, direction: Array) -> None:
+        """From here on with the pulls of friction that the tangent at ``u`` foresees for a full step."""
+        if not any(self._increment.grips):
+            return
+        tools = self._system.tools(u, self._increment)
+        grips = tuple(g and g.foreseen(tool, direction) for g, tool in zip(self._increment.grips, tools))
+        self._increment = replace(self._increment, grips=grips)
 
     def __call__(self, u: Array, tangent: bool = True) -> Evaluation:
         started = time.perf_counter()
