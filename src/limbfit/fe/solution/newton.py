@@ -164,11 +164,8 @@ class _Evaluator:
 
     def foresee(self, u: Array, direction: Array) -> None:
         """From here on with the pulls of friction that the tangent at ``u`` foresees for a full step."""
-        if not any(self._increment.grips):
-            return
-        tools = self._system.tools(u, self._increment)
-        grips = tuple(g and g.foreseen(tool, direction) for g, tool in zip(self._increment.grips, tools))
-        self._increment = replace(self._increment, grips=grips)
+        now = self._increment
+        self._increment = now.foreseen(self._system.tools(u, now) if any(now.grips) else [], direction)
 
     def __call__(self, u: Array, tangent: bool = True) -> Evaluation:
         started = time.perf_counter()
