@@ -63,7 +63,7 @@ class Increment:
         return bool(self.pressures) or any(grip is not None and grip.lags for grip in self.grips)
 
     def foreseen(self, tools: Sequence[Tool], du: Array) -> Increment:
-        """With the grips that their tangents foresee after a change ``du (r, 3)`` of where the ``tools`` are."""
+        """With the grips that their tangents foresee after a change ``du (r, 3)``; the ``tools`` as now."""
         if not any(self.grips):
             return self
         return replace(self, grips=tuple(g and g.foreseen(tool, du) for g, tool in zip(self.grips, tools)))

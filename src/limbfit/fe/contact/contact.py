@@ -155,10 +155,10 @@ def contact(  # type: ignore[no-untyped-def]
     ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
     ``weights, areas (c,)``: penalty times area (N/mm) and area of every point.  ``flat_from``: penetration
     from which a point's tangent leaves the body's curvature out (mm).  ``grip``: the held points, their
-    anchors, normals, bounds and pulls (`Grip`), by ``hardness`` times the weights.  ``forces (c, 3)`` receive the
-    derivative of the energy with respect to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks (c,
-    3, 3)`` distance, its gradient and the tangent of each point, ``stick (c, 3, 3)`` the part of the tangent
-    that holds it along the body.
+    anchors, normals, bounds and pulls (`Grip`), by ``hardness`` times the weights.  ``forces (c, 3)`` receive
+    the derivative of the energy with respect to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks
+    (c, 3, 3)`` distance, its gradient and the tangent of each point, ``stick (c, 3, 3)`` the part of the
+    tangent that holds it along the body.
     Returns energy, largest penetration (mm), reference area in touch (mm^2).
     """
     points, local, phis, slopes, bends = near
@@ -209,7 +209,8 @@ def _rotated(frame, h, out):  # type: ignore[no-untyped-def]
 def _hold(local, place, normal, bound, pull, w, t, h):  # type: ignore[no-untyped-def]
     """Add the force of an anchor at the point ``local (3,)`` and fill its tangent; returns its energy.
 
-    Of a point that slips the tangent is that of the direction in which the dual ``pull (3,)`` points, mm.
+    Of a point that slips the tangent is stiff across the dual ``pull (3,)``, mm, and along it only as far as
+    the pull is short of the bound.
     """
     slip, lead = np.empty(3), np.empty(3)
     across = length = 0.0

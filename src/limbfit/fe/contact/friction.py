@@ -50,7 +50,7 @@ class Coulomb(Grip):
         return replace(now, pulls=_Slip.of(now, tool.local).elastic)
 
     def foreseen(self, tool: Tool, du: Array) -> Self:
-        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of the tool's ``u``."""
+        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
         slip = _Slip.of(self, tool.local)
         moved = tool.moved(du[..., None])[..., 0]
         lead = _within(self.pulls, self.bounds) / np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]

@@ -5,6 +5,12 @@ A held point has an anchor ``a`` in the indenter's frame.  With its move along t
 bound ``b`` and ``b s - b^2 / 2`` beyond it: it sticks by the contact's own penalty up to a slip of ``b`` mm,
 and beyond pulls with ``eps b`` whatever the slip.  In a step anchors, planes and bounds are constant, so this
 is a convex potential with a symmetric tangent.
+
+Its kink is sharp, ``b`` is thousandths of a mm: Newton's method with the second derivative does not foresee
+that a slip turns round or ends, and then takes as many iterations as there are points that do.  So it is
+primal-dual (Chan, Golub and Mulet 1999): the part ``p`` of the slip that pulls, ``|s| p = b s``, is a
+variable of its own, with which the tangent of a point that slips is ``eps b / |s| (P - (p s^T + s p^T) / (2 b
+|s|))``.  It is the second derivative where ``p`` is what the slip says, and positive where ``|p| <= b``.
 """
 
 from __future__ import annotations
@@ -62,7 +68,7 @@ class Grip(ABC):
         return self
 
     def foreseen(self, tool: Tool, du: Array) -> Self:
-        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of the tool's ``u``."""
+        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
         return self
 
     @abstractmethod

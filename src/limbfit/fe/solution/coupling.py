@@ -125,16 +125,16 @@ def couple(
 ) -> tuple[tuple[Equilibrium, Increment] | None, int]:  # fmt: skip
     """Equilibrium near ``u (r, 3)`` with grips and rims as they are there, or None, and the iterations spent.
 
-    Newton's method on the residual, for there is no energy.  It is not smooth: where points stick, slip, touch
-    or let go anew, a full step raises it, and the next ones lower it.  So full steps are taken (as in
+    Newton's method on the residual, for there is no energy.  It is not smooth: where points stick, slip,
+    touch or let go anew, a full step raises it, and the next ones lower it.  So full steps are taken (as in
     semi-smooth Newton methods, Hueber, Stadler and Wohlmuth 2008), and given up where they lead nowhere.
     """
 
-    def look(x: Array, foreseen: Increment | None = None) -> tuple[Increment, Evaluation]:
+    def look(x: Array, by: Increment | None = None) -> tuple[Increment, Evaluation]:
         started = time.perf_counter()
         there = renewed(system, increment, x)
-        if foreseen is not None:
-            there = replace(there, grips=_led(there.grips, foreseen.grips))
+        if by is not None:
+            there = replace(there, grips=_led(there.grips, by.grips))
         at = system.evaluate(x, laws, there)
         seconds["assembly"] += time.perf_counter() - started
         return there, at
@@ -144,6 +144,7 @@ def couple(
     for iteration in range(MOST_ITERATIONS):
         norm, scale = residual_norm(system, here), reaction_scale(system, here, floor)
         if norm <= control.tolerance * scale:
+            now, here = look(u) if control.tangent else (now, here)  # derivatives take the slip as it is
             return (Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now), iteration
         vain = 0 if norm <= (1.0 - LOWERED) * lowest else vain + 1
         lowest = min(norm, lowest)
