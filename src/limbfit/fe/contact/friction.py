@@ -44,7 +44,7 @@ class Coulomb(Grip):
         slopes = np.zeros((*shape, 3, parameters))
         return cls(nothing > 0.0, vectors, vectors, nothing, slopes, vectors, mu, hardness)
 
-    def renewed(self, tool: Tool) -> Coulomb:
+    def renewed(self, tool: Tool) -> Self:
         """Planes, bounds and pulls as they are where the tool is."""
         now = self._at(Distances.of(tool, self.held))
         return replace(now, pulls=_Slip.of(now, tool.local).elastic)
