@@ -9,11 +9,22 @@ import pytest
 from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference
 
 from limbfit.errors import ProblemError
-from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, Support, System, solve
+from limbfit.fe import (
+    History,
+    Indenter,
+    NeoHookean,
+    OgdenQLV,
+    Problem,
+    StepControl,
+    Support,
+    System,
+    solve,
+)
 from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.tool import Tool
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.system import Increment
 
 
@@ -245,3 +256,52 @@ def test_iterations_that_lead_nowhere_count_and_a_step_keeps_to_the_bound(most):
     found = solve(problem, StepControl(times=(1.0, 2.0), tolerance=1e-15, most_iterations=most))
     assert found.reason.endswith(f"no more than {most} Newton iterations were allowed")
     assert found.statistics["newton_iterations"] <= most
+
+
+def soft_skin(n: int, mu: float) -> Problem:
+    """A skin so soft that it slips within a ten-thousandth of a mm."""
+    laws = {"skin": OgdenQLV(1e-4, 10.0, 0.2, 1.0), "muscle": OgdenQLV(4.5e-3, 11.0, 0.05, 0.3)}
+    return replace(punch("tet10", n, 1, depth=2.0, friction=mu), materials=laws)
+
+
+def test_points_that_stick_slip_and_turn_round_are_found_in_few_iterations():
+    """With the second derivative alone it takes 217 iterations."""
+    result = solve(soft_skin(2, 0.3))
+    assert result.completed, result.reason
+    assert not result.doubts
+    assert result.statistics["newton_iterations"] <= 150
+
+
+def test_friction_that_follows_the_displacement_is_found_though_the_residual_rises_first():
+    """Where every step had to lower the residual, 27 iterations led nowhere."""
+    run = SteppedRun(soft_skin(2, 0.3), StepControl(), False, None)
+    steps = list(run.run())
+    assert not run.reason
+    assert len(steps) == 18
+    assert run.counts["vain_iterations"] <= 9
+
+
+def test_the_tangent_of_slip_is_convex_whatever_its_dual():
+    one = Dragged("gauss")
+    pulls = one.rng.normal(size=one.grip.pulls.shape) * one.grip.bounds.max()
+    led = replace(one.grip, pulls=pulls)
+    here, exact = one.at(one.u, grip=led), one.at(one.u)
+    assert here.energy == exact.energy
+    np.testing.assert_array_equal(here.residual, exact.residual)
+    stick = here.touch.stick
+    assert np.abs(stick - exact.touch.stick).max() > 0.1 * np.abs(exact.touch.stick).max()
+    assert np.linalg.eigvalsh(stick).min() > -1e-12 * np.abs(stick).max()
+
+
+def test_the_dual_foreseen_is_the_slip_that_comes():
+    """To first order, and never beyond the bound."""
+    one = Dragged("gauss")
+    d = one.field(1.0)
+
+    def missed(h: float) -> float:
+        come = one.grip.foreseen(one.tool(one.u + h * d), 0.0 * d).pulls
+        return float(np.abs(one.grip.foreseen(one.tool(one.u), h * d).pulls - come).max())
+
+    assert missed(1e-5) < 0.02 * missed(1e-4)
+    far = one.grip.foreseen(one.tool(one.u), d)
+    assert (np.linalg.norm(far.pulls, axis=-1) <= far.bounds * (1.0 + 1e-12)).all()

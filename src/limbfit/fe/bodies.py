@@ -78,7 +78,7 @@ class _Body:
         self.columns = slice(0, 0)
         nothing = np.zeros(surface.areas.size)
         vectors = np.zeros((nothing.size, 3))
-        self.loose = (nothing > 0.0, vectors, vectors, nothing), 1.0
+        self.loose = (nothing > 0.0, vectors, vectors, nothing, vectors), 1.0
 
     @property
     def pivot(self) -> Array:

@@ -6,8 +6,8 @@ every entry of every element's upper triangle knows its place in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -61,6 +61,12 @@ class Increment:
     def lags(self) -> bool:
         """Whether the step holds something constant that follows the displacement."""
         return bool(self.pressures) or any(grip is not None and grip.lags for grip in self.grips)
+
+    def foreseen(self, tools: Sequence[Tool], du: Array) -> Increment:
+        """With the grips that their tangents foresee after a change ``du (r, 3)``; the ``tools`` as now."""
+        if not any(self.grips):
+            return self
+        return replace(self, grips=tuple(g and g.foreseen(tool, du) for g, tool in zip(self.grips, tools)))
 
 
 @dataclass(frozen=True)

@@ -155,14 +155,14 @@ def contact(  # type: ignore[no-untyped-def]
     ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
     ``weights, areas (c,)``: penalty times area (N/mm) and area of every point.  ``flat_from``: penetration
     from which a point's tangent leaves the body's curvature out (mm).  ``grip``: the held points, their
-    anchors, normals and bounds (`Grip`), by ``hardness`` times the weights.  ``forces (c, 3)`` receive the
-    derivative of the energy with respect to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks (c,
-    3, 3)`` distance, its gradient and the tangent of each point, ``stick (c, 3, 3)`` the part of the tangent
-    that holds it along the body.
+    anchors, normals, bounds and pulls (`Grip`), by ``hardness`` times the weights.  ``forces (c, 3)`` receive
+    the derivative of the energy with respect to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks
+    (c, 3, 3)`` distance, its gradient and the tangent of each point, ``stick (c, 3, 3)`` the part of the
+    tangent that holds it along the body.
     Returns energy, largest penetration (mm), reference area in touch (mm^2).
     """
     points, local, phis, slopes, bends = near
-    held, places, planes, bounds = grip
+    held, places, planes, bounds, pulls = grip
     t, h, hold = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     energy = deepest = area = 0.0
     for p in range(len(points)):
@@ -181,7 +181,7 @@ def contact(  # type: ignore[no-untyped-def]
                 for j in range(3):
                     h[i, j] = w * (g[i] * g[j] + (phi * bends[p, i, j] if phi > -flat_from else 0.0))
         if held[c]:
-            energy += _hold(local[p], places[c], planes[c], bounds[c], hardness * w, t, hold)
+            energy += _hold(local[p], places[c], planes[c], bounds[c], pulls[c], hardness * w, t, hold)
             _rotated(frame, hold, stick[c])
             for i in range(3):
                 for j in range(3):
@@ -206,9 +206,13 @@ def _rotated(frame, h, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _hold(local, place, normal, bound, w, t, h):  # type: ignore[no-untyped-def]
-    """Add the force of an anchor at the point ``local (3,)`` and fill its tangent; returns its energy."""
-    slip = np.empty(3)
+def _hold(local, place, normal, bound, pull, w, t, h):  # type: ignore[no-untyped-def]
+    """Add the force of an anchor at the point ``local (3,)`` and fill its tangent; returns its energy.
+
+    Of a point that slips the tangent is stiff across the dual ``pull (3,)``, mm, and along it only as far as
+    the pull is short of the bound.
+    """
+    slip, lead = np.empty(3), np.empty(3)
     across = length = 0.0
     for i in range(3):
         across += normal[i] * (local[i] - place[i])
@@ -218,12 +222,19 @@ def _hold(local, place, normal, bound, w, t, h):  # type: ignore[no-untyped-def]
     length = np.sqrt(length)
     stuck = length < bound
     share = 1.0 if stuck else (bound / length if length > 0.0 else 0.0)
+    if share > 0.0 and not stuck:
+        along = pull[0] * normal[0] + pull[1] * normal[1] + pull[2] * normal[2]
+        for i in range(3):
+            lead[i] = pull[i] - along * normal[i]
+        longest = max(bound, np.sqrt(lead[0] * lead[0] + lead[1] * lead[1] + lead[2] * lead[2]))
+        for i in range(3):
+            lead[i] /= longest
     for i in range(3):
         t[i] += w * share * slip[i]
         for j in range(3):
             h[i, j] = w * share * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
             if share > 0.0 and not stuck:
-                h[i, j] -= w * share * slip[i] / length * slip[j] / length
+                h[i, j] -= 0.5 * w * share * (lead[i] * slip[j] + slip[i] * lead[j]) / length
     return w * (0.5 * length * length if stuck else bound * (length - 0.5 * bound))
 
 

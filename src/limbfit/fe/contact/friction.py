@@ -41,11 +41,23 @@ class Coulomb(Grip):
     def none(cls, mu: float, surface: ContactSurface, parameters: int = 0, hardness: float = 1.0) -> Self:
         shape = surface.areas.shape
         nothing, vectors = np.zeros(shape), np.zeros((*shape, 3))
-        return cls(nothing > 0.0, vectors, vectors, nothing, np.zeros((*shape, 3, parameters)), mu, hardness)
+        slopes = np.zeros((*shape, 3, parameters))
+        return cls(nothing > 0.0, vectors, vectors, nothing, slopes, vectors, mu, hardness)
 
-    def renewed(self, tool: Tool) -> Coulomb:
-        """Planes and bounds as they are where the tool is."""
-        return self._at(Distances.of(tool, self.held))
+    def renewed(self, tool: Tool) -> Self:
+        """Planes, bounds and pulls as they are where the tool is."""
+        now = self._at(Distances.of(tool, self.held))
+        return replace(now, pulls=_Slip.of(now, tool.local).elastic)
+
+    def foreseen(self, tool: Tool, du: Array) -> Self:
+        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
+        slip = _Slip.of(self, tool.local)
+        moved = tool.moved(du[..., None])[..., 0]
+        lead = _within(self.pulls, self.bounds) / np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
+        across = moved - np.einsum("fqi,fqi->fq", self.normals, moved)[..., None] * self.normals
+        along = np.einsum("fqi,fqi->fq", slip.unit, across)[..., None]
+        change = slip.share[..., 0] * (across - np.where(slip.stuck[..., None], 0.0, along * lead))
+        return replace(self, pulls=_within(slip.elastic + change, self.bounds))
 
     def _at(self, near: Distances) -> Self:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
@@ -69,7 +81,8 @@ class Coulomb(Grip):
             d_elastic = tangent @ moved - slip.tangent @ d_places
             d_drawn = np.where(drawn[..., None], moved - d_elastic, d_places)
             d_places = np.where(new[..., None], moved, d_drawn)
-        return replace(now, held=closed, places=places, d_places=d_places)
+        pulls = np.where((closed & self.held)[..., None], slip.elastic, 0.0)
+        return replace(now, held=closed, places=places, d_places=d_places, pulls=pulls)
 
     def explicit(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
@@ -96,6 +109,12 @@ class Coulomb(Grip):
         return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)
 
 
+def _within(vectors: Array, bounds: Array) -> Array:
+    """Vectors (f, q, 3) shortened to the bounds (f, q)."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return vectors * np.minimum(1.0, bounds / np.where(length > 0.0, length, 1.0))[..., None]
+
+
 @dataclass(frozen=True)
 class StepwiseCoulomb(Coulomb):
     """`Coulomb` with every point anchored where it was at the end of the last step, in touch or not.
@@ -113,7 +132,8 @@ class StepwiseCoulomb(Coulomb):
     def after(self, tool: Tool, du: Array | None) -> StepwiseCoulomb:
         """Every point where it is at the end of a step."""
         places, d_places = tool.local, self.d_places if du is None else tool.moved(du)
-        return replace(self, held=np.ones_like(self.held), places=places, d_places=d_places)._at(
+        now = self.renewed(tool)
+        return replace(now, held=np.ones_like(self.held), places=places, d_places=d_places)._at(
             Distances.of(tool, np.ones_like(self.held))
         )
 

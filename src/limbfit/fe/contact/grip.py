@@ -5,6 +5,12 @@ A held point has an anchor ``a`` in the indenter's frame.  With its move along t
 bound ``b`` and ``b s - b^2 / 2`` beyond it: it sticks by the contact's own penalty up to a slip of ``b`` mm,
 and beyond pulls with ``eps b`` whatever the slip.  In a step anchors, planes and bounds are constant, so this
 is a convex potential with a symmetric tangent.
+
+Its kink is sharp, ``b`` is thousandths of a mm: Newton's method with the second derivative does not foresee
+that a slip turns round or ends, and then takes as many iterations as there are points that do.  So it is
+primal-dual (Chan, Golub and Mulet 1999): the part ``p`` of the slip that pulls, ``|s| p = b s``, is a
+variable of its own, with which the tangent of a point that slips is ``eps b / |s| (P - (p s^T + s p^T) / (2 b
+|s|))``.  It is the second derivative where ``p`` is what the slip says, and positive where ``|p| <= b``.
 """
 
 from __future__ import annotations
@@ -32,6 +38,7 @@ class Grip(ABC):
     places, normals : (f, q, 3) anchor, mm, and unit normal of the tangent plane.
     bounds : (f, q) slip at which a point gives way, mm; infinite where it never does.
     d_places : (f, q, 3, p) derivative of the anchors with respect to the parameters.
+    pulls : (f, q, 3) the dual variable, mm: the part of the slip that pulls, as the tangent takes it to be.
     """
 
     held: Bools
@@ -39,6 +46,7 @@ class Grip(ABC):
     normals: Array
     bounds: Array
     d_places: Array
+    pulls: Array
 
     # Stiffness that holds a point over that of the contact.
     hardness = 1.0
@@ -46,10 +54,10 @@ class Grip(ABC):
     lags: ClassVar[bool] = False
 
     @property
-    def arrays(self) -> tuple[Bools, Array, Array, Array]:
+    def arrays(self) -> tuple[Bools, Array, Array, Array, Array]:
         """What the contact kernel takes of it, point by point."""
-        places, normals = self.places.reshape(-1, 3), self.normals.reshape(-1, 3)
-        return self.held.ravel(), places, normals, self.bounds.ravel()
+        places, normals, pulls = (x.reshape(-1, 3) for x in (self.places, self.normals, self.pulls))
+        return self.held.ravel(), places, normals, self.bounds.ravel(), pulls
 
     def bare(self) -> Self:
         """The grip without derivatives, to be kept."""
@@ -57,6 +65,10 @@ class Grip(ABC):
 
     def begun(self, tool: Tool) -> Grip:
         """The grip before the first step, with the tool where it starts."""
+        return self
+
+    def foreseen(self, tool: Tool, du: Array) -> Self:
+        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
         return self
 
     @abstractmethod

@@ -32,7 +32,8 @@ class Anchors(Grip):
     def none(cls, surface: ContactSurface, parameters: int = 0) -> Anchors:
         shape = surface.areas.shape
         vectors, slopes = np.zeros((*shape, 3)), np.zeros((*shape, 3, parameters))
-        return cls(np.zeros(shape, dtype=bool), vectors, vectors, np.full(shape, np.inf), slopes, slopes)
+        held, bounds = np.zeros(shape, dtype=bool), np.full(shape, np.inf)
+        return cls(held, vectors, vectors, bounds, slopes, vectors, slopes)
 
     def bare(self) -> Self:
         """The anchors without derivatives, to be kept."""
@@ -63,7 +64,7 @@ class Anchors(Grip):
             d_places = np.where(new[..., None], moved, d_places)
             d_normals = np.where(new[..., None], curvatures @ moved, d_normals)
         places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)
-        return Anchors(closed, places, normals, self.bounds, d_places, d_normals)
+        return Anchors(closed, places, normals, self.bounds, d_places, self.pulls, d_normals)
 
     def explicit(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from ..contact.grip import Grip
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
 from .direction import preconditioner, touching
@@ -29,8 +31,11 @@ Array = NDArray[np.float64]
 # GMRES: vectors that it keeps, and how often it starts anew; the residual of Newton's directions, and of
 # derivatives, which no adjoint corrects.
 VECTORS, RESTARTS, FORCING, TOLERANCE = 40, 4, 1e-2, 2e-5
-# Newton's iterations, halvings of its step, and the share by which a full step must lower the residual.
-MOST_ITERATIONS, MOST_HALVINGS, LOWERED = 20, 6, 0.1
+# Newton's iterations, and cuts of its step where an element is inverted.
+MOST_ITERATIONS, MOST_CUTS = 25, 6
+# The share by which the residual falls where it gets closer, steps in a row that may bring it no closer, and
+# residual over reactions from which it does not come back.
+LOWERED, VAIN_STEPS, ASTRAY = 0.1, 5, 1.0
 
 
 class Coupling:
@@ -120,21 +125,31 @@ def couple(
 ) -> tuple[tuple[Equilibrium, Increment] | None, int]:  # fmt: skip
     """Equilibrium near ``u (r, 3)`` with grips and rims as they are there, or None, and the iterations spent.
 
-    Newton's method on the residual, which must fall at every step: there is no energy.
+    Newton's method on the residual, for there is no energy.  It is not smooth: where points stick, slip,
+    touch or let go anew, a full step raises it, and the next ones lower it.  So full steps are taken (as in
+    semi-smooth Newton methods, Hueber, Stadler and Wohlmuth 2008), and given up where they lead nowhere.
     """
 
-    def look(x: Array) -> tuple[Increment, Evaluation]:
+    def look(x: Array, by: Increment | None = None) -> tuple[Increment, Evaluation]:
         started = time.perf_counter()
         there = renewed(system, increment, x)
+        if by is not None:
+            there = replace(there, grips=_led(there.grips, by.grips))
         at = system.evaluate(x, laws, there)
         seconds["assembly"] += time.perf_counter() - started
         return there, at
 
+    lowest, vain = np.inf, 0
     now, here = look(u)
     for iteration in range(MOST_ITERATIONS):
         norm, scale = residual_norm(system, here), reaction_scale(system, here, floor)
         if norm <= control.tolerance * scale:
+            now, here = look(u) if control.tangent else (now, here)  # derivatives take the slip as it is
             return (Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now), iteration
+        vain = 0 if norm <= (1.0 - LOWERED) * lowest else vain + 1
+        lowest = min(norm, lowest)
+        if vain > VAIN_STEPS or norm > ASTRAY * scale:
+            return None, iteration
         b = -here.residual.ravel()[system.free][:, None]
         try:
             d = _gmres(here, factor, Coupling(system, now, u), b, np.zeros_like(b), FORCING)
@@ -143,12 +158,18 @@ def couple(
         direction = np.zeros(here.residual.size)
         direction[system.free] = d[:, 0]
         way, step = direction.reshape(u.shape), 1.0
-        for _ in range(MOST_HALVINGS):
-            there, at = look(u + step * way)
-            if np.isfinite(at.energy) and residual_norm(system, at) <= (1.0 - LOWERED * step) * norm:
+        foreseen = now.foreseen(system.tools(u, now), way)
+        for _ in range(MOST_CUTS):
+            there, at = look(u + step * way, foreseen)
+            if np.isfinite(at.energy):
                 break
             step *= 0.5
         else:
             return None, iteration + 1
         u, now, here = u + step * way, there, at
     return None, MOST_ITERATIONS
+
+
+def _led(grips: Sequence[Grip | None], by: Sequence[Grip | None]) -> tuple[Grip | None, ...]:
+    """The grips with the pulls of others."""
+    return tuple(g and other and replace(g, pulls=other.pulls) for g, other in zip(grips, by))

@@ -39,6 +39,7 @@ TINY = 1e-300  # N; before the first touch there are no reactions
 class NewtonControl:
     """Tolerance of the residual relative to the reactions, limits, and the damping to begin with.
 
+    ``enough``: share of the first residual that will do instead of the tolerance.
     ``bearable``: penetration (mm) that near equilibrium ends the search, for the penalty is too small.
     ``tangent``: whether the tangent is wanted at the equilibrium.
     """
@@ -47,6 +48,7 @@ class NewtonControl:
     max_iterations: int = 30
     max_backtracks: int = 12
     damping: float = 0.0
+    enough: float = 0.0
     bearable: float = np.inf
     tangent: bool = True
 
@@ -91,13 +93,14 @@ def equilibrate(
         first = first if iteration else share
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
         unbearable = norm <= NEAR * scale and here.penetration > control.bearable
-        if norm <= control.tolerance * scale or rounding or unbearable:
+        tolerance = max(control.tolerance, control.enough * first)
+        if norm <= tolerance * scale or rounding or unbearable:
             return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
         if not np.isfinite(norm):
             return Equilibrium(u, here, iteration, "the residual is not finite")
         if here.data is None:
             here = evaluate(u)
-        sufficient = 0.3 * control.tolerance * scale / norm
+        sufficient = 0.3 * tolerance * scale / norm
         forcing = min(0.02, max(0.1 * norm / scale, sufficient))
         try:
             direction = newton_direction(system, here, factor, forcing, damping)
@@ -106,6 +109,7 @@ def equilibrate(
         last = norm
         if norm <= NEAR * scale:
             evaluate.exactly()
+        evaluate.foresee(u, direction)
         going_on = control.tangent or forcing > sufficient
         found = _line_search(evaluate, u, here, direction, control.max_backtracks, going_on)
         if found is None:
@@ -160,6 +164,11 @@ class _Evaluator:
     def exactly(self) -> None:
         """From here on with the indenter's curvature everywhere."""
         self._increment = replace(self._increment, flat_from=np.inf)
+
+    def foresee(self, u: Array, direction: Array) -> None:
+        """From here on with the pulls of friction that the tangent at ``u`` foresees for a full step."""
+        now = self._increment
+        self._increment = now.foreseen(self._system.tools(u, now) if any(now.grips) else [], direction)
 
     def __call__(self, u: Array, tangent: bool = True) -> Evaluation:
         started = time.perf_counter()

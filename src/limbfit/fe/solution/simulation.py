@@ -42,6 +42,8 @@ NEARLY = 0.1
 MOST_RENEWALS, UNSETTLED = 30, 1e-2
 # Renewals in a row that may bring it no closer: then it goes round, or away.
 VAIN_RENEWALS, CLOSER = 6, 0.9
+# Share of the residual that renewing the grip causes which is left before it is renewed again.
+ENOUGH = 0.05
 # Force over the mean shear modulus and the square of a body's width against which a residual is judged before
 # anything is touched.
 NOTHING = 1e-6
@@ -194,6 +196,7 @@ class SteppedRun:
         start = self.system.impose(u, increment)
         lags = increment.lags
         loosely = replace(control, tolerance=max(control.tolerance, NEARLY)) if lags else control
+        roughly = replace(control, enough=ENOUGH) if lags else control
         found = self._equilibrate(increment, start, loosely)
         closest, vain = np.inf, 0
         for _ in range(MOST_RENEWALS):
@@ -211,15 +214,18 @@ class SteppedRun:
             if again is increment:
                 return found, increment
             increment = again
-            found = self._equilibrate(increment, found.u, control)
+            found = self._equilibrate(increment, found.u, roughly)
             if not found.iterations:
                 return found, increment
             vain = 0 if found.first < CLOSER * closest else vain + 1
             closest = min(closest, found.first)
             if vain > VAIN_RENEWALS or self._spent():
                 break
-        reason = "" if found.first <= UNSETTLED else "friction, or the rim of a pressure, does not settle"
-        return replace(found, reason=found.reason or reason, unsettled=found.first), increment
+        unsettled = found.first
+        if not found.reason:
+            found = self._equilibrate(increment, found.u, control)
+        reason = "" if unsettled <= UNSETTLED else "friction, or the rim of a pressure, does not settle"
+        return replace(found, reason=found.reason or reason, unsettled=unsettled), increment
 
     def _spent(self) -> bool:
         """Whether no more Newton iterations are allowed, those that led nowhere counted."""
