@@ -8,7 +8,6 @@ lengths that change in time, and the gauges of one simulation tell them (`SiteMo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,11 +16,6 @@ from numpy.typing import NDArray
 from ...identify.fit.objective import largest
 from ...identify.uncertainty.noise import SiteNoise, alike_on_skin, depth_slope
 from ...indentation import Simulation
-from ...study import Record
-from ...traces import SurfaceMotion, Thinning
-from ..shared.artefacts import read_curves
-from ..shared.surface_points import ChosenPoints, read_motion
-from .files import LAYERS
 
 Array = NDArray[np.float64]
 
@@ -61,14 +55,13 @@ class Observed:
         """Standard deviation of the lengths, root mean square."""
         return float(np.sqrt(np.diag(self.covariance).mean()))
 
-    def weight(self, force_error_percent: float) -> float:
+    def weight(self, error_share: float) -> float:
         """How much its residuals count beside those of a force, 1 at most.
 
-        A force counts as one whose error is ``force_error_percent`` of its largest. Where this is off by more
-        than that share of the largest length, it counts by as much less.
+        A force counts as one whose error is ``error_share`` of its largest. Where this is off by more than
+        that share of the largest length, it counts by as much less.
         """
-        error = self.noise_mm / largest(self.value_mm)
-        return min(1.0, (force_error_percent / 100.0 / error) ** 2)
+        return min(1.0, (error_share * largest(self.value_mm) / self.noise_mm) ** 2)
 
     def noise(
         self, name: str, simulated_mm: Array, depth_mm: Array | None, touch_down_sd_mm: float
@@ -133,82 +126,3 @@ class SeenSurface(Observed):
     def columns(self) -> dict[str, Array]:
         places = dict(zip(("x_mm", "y_mm", "z_mm"), self.points.T, strict=True))
         return {"time_s": self.time_s, **places, "component": self.components.astype(np.float64)}
-
-
-def load_observed(
-    folder: Path,
-    record: Record,
-    facts: dict[str, Any],
-    times_s: Array,
-    points: ChosenPoints | None,
-) -> tuple[Observed, ...]:
-    """What is compared beside a record, in the order of a simulation's gauges.
-
-    ``times_s`` (t,) are those of the record's simulation, ``points`` those of its surface.
-    """
-    stated = facts.get("layers", {})
-    tissues = [tissue for tissue, one in stated.items() if one["compared"]]
-    found: list[Observed] = []
-    if tissues:
-        curves = read_curves(folder / LAYERS.format(record.name))
-        for number, tissue in enumerate(tissues):
-            found.append(_seen_layer(tissue, stated[tissue], curves, number, times_s))
-    if points is not None:
-        motion = read_motion(folder, record)
-        found.append(_seen_surface(record, points, motion, len(tissues), times_s))
-    return tuple(found)
-
-
-def _seen_layer(
-    tissue: str, stated: dict[str, Any], curves: dict[str, Array], number: int, times_s: Array
-) -> SeenLayer:
-    thinning = Thinning(
-        tissue,
-        stated["thickness_mm"],
-        curves["time_s"],
-        curves[f"{tissue}_mm"],
-        curves["samples"],
-        stated["before"],
-        stated["sd_mm"],
-    )
-    n = len(thinning.time_s)
-    return SeenLayer(
-        tissue,
-        thinning.compression_mm,
-        thinning.time_s,
-        np.full(n, number),
-        _interpolating(times_s, thinning.time_s),
-        thinning.covariance,
-        {"sd_mm": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
-    )
-
-
-def _seen_surface(
-    record: Record, points: ChosenPoints, motion: SurfaceMotion, first: int, times_s: Array
-) -> SeenSurface:
-    means = motion.means(points.which)
-    sd, words = record.surface_sd_mm, ("x", "y", "z")
-    if record.surface_frame == "site":
-        words = ("along the edge", "across it", "along the axis")
-    facts = {
-        "sd_mm": sd,
-        "left_out": dict(points.left_out),
-        "components": list(words),
-        "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
-    }
-    return SeenSurface(
-        "surface",
-        means.moved_mm,
-        means.time_s,
-        first + 3 * means.point + means.component,
-        means.frames @ _interpolating(times_s, motion.time_s),
-        np.diag(sd**2 / means.samples),
-        facts,
-        np.array(points.points)[means.point],
-        means.component,
-    )
-
-
-def _interpolating(from_s: Array, to_s: Array) -> Array:
-    """Matrix (n, t) of linear interpolation from times (t,) to times (n,)."""
-    return np.array([np.interp(to_s, from_s, row) for row in np.eye(len(from_s))]).T

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +15,13 @@ from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.uncertainty.noise import depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Site
+from ...traces import SurfaceMotion, Thinning
 from ..shared.artefacts import read_curves
 from ..shared.context import Context
 from ..shared.simulations import recorded_model, surface_points
-from .files import SMOOTHING
-from .observed import Observed, load_observed
+from ..shared.surface_points import ChosenPoints, read_motion
+from .files import LAYERS, SMOOTHING
+from .observed import Observed, SeenLayer, SeenSurface
 
 Array = NDArray[np.float64]
 
@@ -29,9 +33,9 @@ class SiteRecord:
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
     blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
-    same mesh. With ``seen`` it is what was seen beside the force that is compared, of the same simulation;
-    ``weight`` is how much that counts beside a force. ``touch_down_sd_mm`` is how far the touch-down may be
-    off, ``error_share`` how far forces may be beside that.
+    same mesh. With ``seen`` it is what was seen beside the force that is compared, of the same simulation.
+    ``touch_down_sd_mm`` is how far the touch-down may be off, ``error_share`` how far forces may be beside
+    that.
     """
 
     record: Record
@@ -43,7 +47,6 @@ class SiteRecord:
     smoothing: Array
     nested_mm: float | None = None
     seen: Observed | None = None
-    weight: float = 1.0
     touch_down_sd_mm: float = 0.0
     error_share: float = 0.01
 
@@ -64,7 +67,7 @@ class SiteRecord:
     @property
     def measured(self) -> Measured:
         """What the calibration compares with."""
-        weight = self.weight * self.record.weight
+        weight = self.record.weight * (1.0 if self.seen is None else self.seen.weight(self.error_share))
         doubt = self.touch_down_sd_mm * self._by_depth if self.seen is None else None
         return Measured(self.name, self.compared, weight, self.site.name, self.unit, doubt, self.error_share)
 
@@ -143,9 +146,8 @@ def all_compared(context: Context, records: Sequence[SiteRecord]) -> list[SiteRe
     for one in records:
         found.append(one)
         own, points = facts[one.record.name], surface_points(context, one.record)
-        for seen in load_observed(folder, one.record, own, one.times_s, points):
-            weight = seen.weight(context.study.calibration.force_error_percent)
-            found.append(replace(one, seen=seen, weight=weight))
+        observed = _load_observed(folder, one.record, own, one.times_s, points)
+        found += [replace(one, seen=seen) for seen in observed]
     return found
 
 
@@ -154,3 +156,82 @@ def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[Sit
     if not context.study.is_searched_apart:
         return records
     return [replace(one, model=recorded_model(context, one.record, searched=True)) for one in records]
+
+
+def _load_observed(
+    folder: Path,
+    record: Record,
+    facts: dict[str, Any],
+    times_s: Array,
+    points: ChosenPoints | None,
+) -> tuple[Observed, ...]:
+    """What is compared beside a record, in the order of a simulation's gauges.
+
+    ``times_s`` (t,) are those of the record's simulation, ``points`` those of its surface.
+    """
+    stated = facts.get("layers", {})
+    tissues = [tissue for tissue, one in stated.items() if one["compared"]]
+    found: list[Observed] = []
+    if tissues:
+        curves = read_curves(folder / LAYERS.format(record.name))
+        for number, tissue in enumerate(tissues):
+            found.append(_seen_layer(tissue, stated[tissue], curves, number, times_s))
+    if points is not None:
+        motion = read_motion(folder, record)
+        found.append(_seen_surface(record, points, motion, len(tissues), times_s))
+    return tuple(found)
+
+
+def _seen_layer(
+    tissue: str, stated: dict[str, Any], curves: dict[str, Array], number: int, times_s: Array
+) -> SeenLayer:
+    thinning = Thinning(
+        tissue,
+        stated["thickness_mm"],
+        curves["time_s"],
+        curves[f"{tissue}_mm"],
+        curves["samples"],
+        stated["before"],
+        stated["sd_mm"],
+    )
+    n = len(thinning.time_s)
+    return SeenLayer(
+        tissue,
+        thinning.compression_mm,
+        thinning.time_s,
+        np.full(n, number),
+        _interpolating(times_s, thinning.time_s),
+        thinning.covariance,
+        {"sd_mm": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
+    )
+
+
+def _seen_surface(
+    record: Record, points: ChosenPoints, motion: SurfaceMotion, first: int, times_s: Array
+) -> SeenSurface:
+    means = motion.means(points.which)
+    sd, words = record.surface_sd_mm, ("x", "y", "z")
+    if record.surface_frame == "site":
+        words = ("along the edge", "across it", "along the axis")
+    facts = {
+        "sd_mm": sd,
+        "left_out": dict(points.left_out),
+        "components": list(words),
+        "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
+    }
+    return SeenSurface(
+        "surface",
+        means.moved_mm,
+        means.time_s,
+        first + 3 * means.point + means.component,
+        means.frames @ _interpolating(times_s, motion.time_s),
+        np.diag(sd**2 / means.samples),
+        facts,
+        np.array(points.points)[means.point],
+        means.component,
+    )
+
+
+def _interpolating(from_s: Array, to_s: Array) -> Array:
+    """Matrix (n, t) of linear interpolation from times (t,) to times (n,)."""
+    return np.array([np.interp(to_s, from_s, row) for row in np.eye(len(from_s))]).T
