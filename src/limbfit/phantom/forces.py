@@ -169,17 +169,17 @@ def site_force(job: ForceJob) -> TrueForce:
         "steps": int(result.statistics["steps"]),
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
+    found = TrueForce(job.site, times, result.force_at(times), facts)
+    if not (job.ultrasound or job.surface):
+        return found
     gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.ultrasound else ()
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     around = points_around(job.mesh, indenter) if job.surface else np.zeros((0, 3))
     layers = tuple(gauge.region for gauge in gauges)
     seen, _ = observed(result, replace(model, layers=layers, skin_points=tuple(map(tuple, around))), times)
-    return TrueForce(
-        job.site,
-        times,
-        result.force_at(times),
-        facts,
-        {one.region: (one.thickness_mm, row) for one, row in zip(gauges, seen)},
-        around,
-        seen[len(layers) :].reshape(len(around), 3, -1),
+    return replace(
+        found,
+        layers={one.region: (one.thickness_mm, row) for one, row in zip(gauges, seen)},
+        skin_points=around,
+        skin_moves=seen[len(layers) :].reshape(len(around), 3, len(times)),
     )
