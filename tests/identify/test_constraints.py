@@ -143,6 +143,15 @@ def test_random_starts_are_of_their_seed_and_within_the_bounds():
     assert all(np.array_equal(start[:4], start[4:]) for start in one)
 
 
+def test_random_starts_leave_what_is_fixed_and_keep_what_is_tied():
+    names = list(PAPER.names)
+    grouping = constrained(shared(names), names, fixed=[names[1]], tied=[[names[3], names[7]]])
+    drawn = np.array(random_starts(PAPER, 6, 1, grouping))
+    assert np.all(drawn[:, 1] == PAPER.start[1])
+    assert drawn[:, 3] == pytest.approx(drawn[:, 7])
+    assert len(np.unique(drawn[:, 5].round(9))) == 6
+
+
 def test_a_start_that_fails_is_told_and_the_others_count():
     def run(number, unknowns):
         failing = Counted(forbidden=lambda p: number == 1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError
-from .parameters import Unknowns, search_space, shared
+from .parameters import Grouping, Unknowns, search_space, shared
 from .state import Calibration
 
 Array = NDArray[np.float64]
@@ -49,19 +49,26 @@ class Multistart:
         return sum(start.same for start in self.starts)
 
 
-def random_starts(unknowns: Unknowns, count: int, seed: int) -> tuple[Array, ...]:
+def random_starts(
+    unknowns: Unknowns, count: int, seed: int, grouping: Grouping | None = None
+) -> tuple[Array, ...]:
     """``count`` full parameter vectors (p,): the first is the stated start, the others are random.
 
-    Logarithms are uniform between the bounds, and the same in all tissues, as the first stage needs them.
+    Logarithms are uniform between the bounds. ``grouping`` is that of the first stage, by default one
+    material: what moves together is drawn together, and what is fixed stays at the stated start.
     """
-    space = search_space(unknowns, shared(unknowns.names))
+    space = search_space(unknowns, shared(unknowns.names) if grouping is None else grouping)
     random = np.random.default_rng(seed)
     drawn = [space.expand(random.uniform(space.lower, space.upper)) for _ in range(count - 1)]
     return (unknowns.start, *drawn)
 
 
 def multistart(
-    run: Callable[[int, Unknowns], Calibration], unknowns: Unknowns, count: int, seed: int = 0
+    run: Callable[[int, Unknowns], Calibration],
+    unknowns: Unknowns,
+    count: int,
+    seed: int = 0,
+    grouping: Grouping | None = None,
 ) -> Multistart:
     """Run ``run(number, unknowns)`` from ``count`` starts; see :func:`random_starts`.
 
@@ -70,7 +77,7 @@ def multistart(
     CalibrationError
         Where no start can be simulated.
     """
-    starts = random_starts(unknowns, count, seed)
+    starts = random_starts(unknowns, count, seed, grouping)
     found: list[Calibration | None] = []
     reasons = []
     for number, start in enumerate(starts):

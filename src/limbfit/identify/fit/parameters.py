@@ -124,13 +124,15 @@ class Unknowns:
 class Space:
     """The search space of one stage: ``log(parameters) = fixed + tie @ z`` with ``lower <= z <= upper``.
 
-    ``fixed`` is (p,), ``tie`` (p, k) of zeros and ones, ``lower`` and ``upper`` (k,).
+    ``fixed`` is (p,), ``tie`` (p, k) of zeros and ones, ``lower`` and ``upper`` (k,). ``stated`` (p,) are the
+    values of parameters that do not move, which they keep to the last digit.
     """
 
     fixed: Array
     tie: Array
     lower: Array
     upper: Array
+    stated: Array
 
     def logarithms(self, z: Array) -> Array:
         """Logarithms (p,) of the full parameters at z (k,)."""
@@ -138,7 +140,7 @@ class Space:
 
     def expand(self, z: Array) -> Array:
         """The full parameters (p,) at z (k,)."""
-        return np.exp(self.logarithms(z))
+        return np.where(self.tie.any(axis=1), np.exp(self.logarithms(z)), self.stated)
 
     def reduce(self, logarithms: Array) -> Array:
         """z (k,) of logarithms (p,): group members are averaged, and clipped to the bounds."""
@@ -164,4 +166,4 @@ def search_space(unknowns: Unknowns, grouping: Sequence[int]) -> Space:
     if not groups or np.any(lower >= upper):
         raise ProblemError("no parameter is left to move", remedy="check the groups and their bounds")
     fixed = np.where(members == FIXED, np.log(unknowns.start), 0.0)
-    return Space(fixed, tie, lower, upper)
+    return Space(fixed, tie, lower, upper, unknowns.start)

@@ -44,7 +44,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         return found
 
     with laboratory.meshing(folder / "coarser") as meshed:
-        tried = multistart(run, unknowns(study), table.starts, table.seed)
+        tried = multistart(run, unknowns(study), table.starts, table.seed, stages[0])
         meshed()
     found = tried.best
     known = laboratory.uncertainty(found, stages[-1], folder / "coarser")
