@@ -161,6 +161,29 @@ def test_a_body_goes_over_from_displacement_to_force():
         solve(replace(problem, indenter=None, bodies=(replace(tool, motion=left),), history=history))
 
 
+def test_a_force_that_is_taken_over_depends_on_the_parameters():
+    """Of a stiffer block: what held the tool was larger, and the force begins with that."""
+    problem = punch("tet10", 4, 1)
+    pressed = Motion.of([0.0, 1.0, 2.0], z=[0.0, 3.0, 3.0])
+    left = Motion.of([0.0, 1.0, 1.5], force={"z": [np.nan, 0.5, 0.5]})
+    tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed.then(left), 0.4)
+    problem = replace(problem, indenter=None, bodies=(tool,), history=History([0.0, 3.5], [0.0, 0.0]))
+    control = replace(CONTROL, times=(0.5, 1.0, 1.5, 2.0, 2.3, 2.7, 3.0, 3.5), tolerance=1e-9, penalty=20.0)
+    centre = solve(problem, control, sensitivities=True, store="all")
+    slopes = np.array([state.bodies[0, 2] for state in centre.states])
+    for i, (region, name) in enumerate(problem.parameter_names):
+        if name not in ("c", "tau"):
+            continue
+        ways = []
+        for sign in (1.0, -1.0):
+            law = problem.materials[region]
+            other = replace(law, **{name: getattr(law, name) * (1.0 + 1e-3 * sign)})
+            ways.append(solve(problem.with_materials({**problem.materials, region: other}), control))
+        step = 2e-3 * problem.parameters[i]
+        difference = (ways[0].coordinates[:, 0, 2] - ways[1].coordinates[:, 0, 2]) / step
+        np.testing.assert_allclose(slopes[:, i], difference[1:], atol=1e-3 * np.abs(difference).max())
+
+
 def test_a_free_plate_lies_down_on_what_is_askew():
     """A plate pressed by a force and free to turn rests without moment, turned towards the softer side."""
     problem = punch("tet10", 4, 1)

@@ -332,6 +332,26 @@ class Bodies:
             norm += float((pulls[under] ** 2).sum())
         return energy, Loads(residual, norm**0.5)
 
+    @property
+    def own_rows(self) -> tuple[slice, ...]:
+        """Of every body, its rows beyond those of the nodes."""
+        first = [body.row - self.nodes for body in self.all]
+        return tuple(slice(row, row + 2 * bool(len(body.free))) for row, body in zip(first, self.all))
+
+    def holding_slopes(self, drives: Drives, penalty: float, du: Array) -> Array:
+        """Derivatives (r - n, 3, p) of what holds the free coordinates that displacements drive.
+
+        As forces of `driven`, zero for the others; ``du (r - n, 3, p)`` are those of the coordinates, for
+        which the stiffness that holds them is a constant.
+        """
+        out = np.zeros_like(du)
+        for body, rows, forced in zip(self.all, self.own_rows, drives.forced):
+            held = np.zeros(6, dtype=bool)
+            held[body.free] = ~forced[body.free]
+            if held.any():
+                out[rows] = -self._holding(body, penalty) * held.reshape(2, 3, 1) * du[rows]
+        return out
+
 
 def impose_on(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) -> Array:
     """``u (r, 3)`` with the coordinates of a body at ``value (6,)`` that are free and not ``forced`` now."""

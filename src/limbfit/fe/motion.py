@@ -111,6 +111,15 @@ class Motion:
         here = np.isclose(self.times, t, rtol=1e-9, atol=0.0)[:, None] & np.isnan(self.values)
         return replace(self, values=np.where(here, reaction, self.values)) if here.any() else self
 
+    def lasting(self, since: float, t: float) -> float:
+        """Share at time ``t`` of forces that were `taken_over` at time ``since``: they go over into the next
+        values.  Nothing where ``since`` is not a number."""
+        if np.isnan(since):
+            return 0.0
+        i = int(np.searchsorted(self.times, since * (1.0 + 1e-9), side="right")) - 1
+        start, end = self.times[i : i + 2]
+        return float(np.clip((end - t) / (end - start), 0.0, 1.0))
+
     @property
     def free(self) -> NDArray[np.bool_]:
         """(6,) which coordinates a force drives at some time."""

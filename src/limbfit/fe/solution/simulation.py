@@ -17,6 +17,7 @@ from ..motion import Drives
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
+from ..takeover import Takeover
 from ..threads import single_threaded_numpy
 from .beginning import begun, elastic_residual, grips_of, system_of, travel
 from .control import StepControl, schedule
@@ -103,6 +104,9 @@ class SteppedRun:
         start = problem.history.displacement_at(0.0)
         self.grips = begun(self.system, self.grips, rest, drives)
         self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
+        self.takeover = None
+        if still is not None:
+            self.takeover = Takeover.never(problem.rigid_bodies, still[self.system.nodes :])
         self.reason, self.pace = "", Pace(control.max_iterations)
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
@@ -134,7 +138,7 @@ class SteppedRun:
                 continue
             pace.done(now, t, self.counts["newton_iterations"] - before)
             why = ""
-            self.problem = self.problem.taken_over(t, found.reactions)
+            self._take_over(found)
             times.append(t)
             forces.append(found.force)
             if t == targets[0]:
@@ -142,6 +146,14 @@ class SteppedRun:
                 if self.control.times is None:
                     targets = foresee(self.problem.history, self.planned, targets, times, forces)
             yield found
+
+    def _take_over(self, step: Step) -> None:
+        """Forces that are left open from here on are those that held the bodies in a step."""
+        before, self.problem = self.problem, self.problem.taken_over(step.time, step.reactions)
+        bodies = zip(before.rigid_bodies, self.problem.rigid_bodies)
+        took = [old.motion is not new.motion for old, new in bodies]
+        if any(took) and self.takeover is not None and self.system.bodies is not None:
+            self.takeover = self.takeover.after(took, self.system.bodies, step.state, self.laws.modulus)
 
     def _rested(self) -> bool:
         """Whether pre-strained tissue is brought to the equilibrium that it has had long since."""
@@ -361,6 +373,10 @@ class SteppedRun:
             change += tool.distributed(held)
             if i == 0:
                 d_reaction -= held[:, :, 2].sum(axis=(0, 1))
+        if self.takeover is not None and system.bodies is not None:
+            change[system.nodes :] -= self.takeover.left(
+                self.problem.rigid_bodies, system.bodies, increment.time
+            )
         coupling = Coupling(system, increment, u)
         b = -change.reshape(-1, laws.count)[system.free]
         pushed = self.touch.pushed(system, at, coupling)

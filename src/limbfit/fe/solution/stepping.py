@@ -32,7 +32,7 @@ _COLUMNS = (
     "reactions", "coordinates", "displacement_sensitivity",
 )  # fmt: skip
 _PLAIN = ("stiffness", "damping", "floor", "pushing", "unbalanced", "unsettled")
-_PARTS = ("memory", "slope", "pace")
+_PARTS = ("memory", "slope", "pace", "takeover")
 
 
 def iterate(
