@@ -35,6 +35,12 @@ def fit(
     study: StudyPath,
     parameters: OfTissues = None,
     literature: OfPeople = False,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            help="draws of the identified parameters to simulate too, for intervals beyond first order", min=2
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Put a socket on the limb and load it: pressure and shear by region, settling, balance."""
@@ -45,6 +51,7 @@ def fit(
             checked,
             parameters=parse_parameters(parameters, checked),
             literature=literature,
+            samples=samples or 0,
             listener=listener,
         )
     tell_stored(found, show_socket, as_json)
@@ -69,6 +76,10 @@ def show_socket(found: dict[str, Any]) -> None:
             numbers = [f"{row[key]:.1f}" for key in ("mean_kPa", "peak_kPa", "shear_kPa")]
             table.add_row(row["region"], numbers[0], interval, _mostly(row["interval_from"]), *numbers[1:])
         STDOUT.print(table)
+    if found["samples"]:
+        drawn, failed = found["samples"]["simulated"], found["samples"]["failed"]
+        words = "".join(f"; another failed: {reason}" for reason in failed)
+        STDOUT.print(f"95 %: by derivatives and {drawn} simulated draws{words}", soft_wrap=True)
     STDOUT.print(
         f"tissues: {found['parameters_from']}; contact balances the loads within "
         f"{found['balance_percent']:.2g} %; not a medical device",

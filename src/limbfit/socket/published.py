@@ -51,8 +51,8 @@ FINDINGS = (
     ),
     PublishedFinding(
         ("anterior middle", "posterior middle", "medial middle"),
-        "peaks larger by 34 % in front, 24 % behind and 7 % medially with a sealing liner than with a cushion "
-        "one; laterally no difference",
+        "peaks are 34 % larger in front, 24 % behind and 7 % medially with a sealing liner than another; "
+        "laterally no difference",
         "measured, walking on the level, 9 persons, each with a prosthesis of either kind",
         "Ali et al., Clin Biomech 2012, 27:943",
     ),

@@ -19,11 +19,15 @@ import pyvista as pv
 from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
+from limbfit.cli.socket import show_socket
 from limbfit.donning import Load, SocketFit, don, socket_problem, socket_steps
-from limbfit.errors import RunError
+from limbfit.errors import InputError, RunError
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
+from limbfit.identify.uncertainty.uncertainty import NORMAL_95
+from limbfit.indentation import to_parameters
 from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.pipeline.verbs.run import run_experiment
 from small_limb import limb, small_limb
 
 SOCKET = """hold_s = 1.0
@@ -33,6 +37,8 @@ force_N = [0.0, 0.0, 150.0]
 duration_s = 1.0
 hold_s = 1.0
 """
+
+TISSUES = np.array([9.0, 6.0, 2.0, 0.5, 4.0, 4.0, 3.0, 0.3])  # kPa, 1, 1, s of skin and muscle
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +191,47 @@ def test_a_load_that_nothing_carries_is_named(tmp_path):
     """A socket without friction, pulled off the limb."""
     with pytest.raises(RunError, match=r"the load 'pull' could not be carried .*socket\.friction"):
         fit_socket(load_study(small_limb(tmp_path, PULL)))
+
+
+@pytest.mark.slow
+def test_simulated_draws_widen_the_intervals_and_are_kept(folder, tmp_path, capsys):
+    """With a covariance of the muscle's c and m; more draws later simulate only those."""
+    for file in ("study.toml", "skin.stl", "tibia.stl"):
+        shutil.copy(folder / file, tmp_path)
+    study, covariance, said = load_study(tmp_path), np.zeros((8, 8)), []
+    covariance[4:6, 4:6] = [[0.04, -0.02], [-0.02, 0.04]]
+    known = {"parameters": to_parameters(TISSUES, study.tissues), "parameters_from": "identified"}
+
+    def run(samples: int) -> dict:
+        said.clear()
+        return run_experiment(
+            study,
+            "socket",
+            listener=said.append,
+            covariance_log=covariance.tolist(),
+            samples=samples,
+            **known,
+        )
+
+    plain, two, three = run(0), run(2), run(3)
+    assert plain["samples"] is None
+    assert two["samples"] == {"simulated": 2, "failed": []}
+    assert not [line for line in said if "draw 1: " in str(line) or "draw 2: " in str(line)]
+    assert [line for line in said if "draw 3: " in str(line)]
+    for one, other in zip(plain["loads"][0]["regions"], three["loads"][0]["regions"], strict=True):
+        assert one["mean_kPa"] == pytest.approx(other["mean_kPa"], rel=1e-3)
+        narrow, wide = np.diff(one["interval_kPa"])[0], np.diff(other["interval_kPa"])[0]
+        missed = 2 * NORMAL_95 * other["missed_kPa"][1]
+        assert wide == pytest.approx(np.hypot(narrow, missed), rel=1e-2)
+        assert missed > 0.0
+    show_socket(three)
+    assert "95 %: by derivatives and 3 simulated draws" in capsys.readouterr().out
+    assert "by derivatives and 3 simulated draws" in report_study(study)["file"].read_text()
+
+
+def test_samples_of_tissues_that_were_not_identified_are_refused(folder):
+    with pytest.raises(InputError, match=r"--samples: there is nothing to draw 2 samples from"):
+        fit_socket(load_study(folder), samples=2)
 
 
 @pytest.mark.slow

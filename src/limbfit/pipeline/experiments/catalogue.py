@@ -129,7 +129,7 @@ _OWN: tuple[Experiment, ...] = (
         needs=("surfaces",),
         tables=("socket", "geometry", "mesh", "material"),
         apart=("socket.design",),
-        options={"parameters": {}, "parameters_from": "", "covariance_log": None},
+        options={"parameters": {}, "parameters_from": "", "covariance_log": None, "samples": 0},
     ),
     Experiment(
         "socket_design",

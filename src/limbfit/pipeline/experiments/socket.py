@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...anatomy.surfaces.surfaces import write_surface
 from ...donning import Donned
-from ...indentation import Parameters
+from ...indentation import Parameters, flat_names, to_parameters, to_vector
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
 from ...socket.published import published
@@ -16,7 +19,8 @@ from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Begun, Kept
 from ..shared.socket_shape import socket_of
-from .socket_limb import Covariance, SocketLimb
+from .socket_intervals import drawn, widen
+from .socket_limb import Covariance, SocketLimb, Wearing, wear_all, worn
 
 NAME = "socket"
 
@@ -28,10 +32,14 @@ def run_socket(
     parameters: Parameters,
     parameters_from: str,
     covariance_log: Covariance,
+    samples: int,
 ) -> dict[str, Any]:
     """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues.
 
-    ``covariance_log`` (p, p) is that of the parameters' logarithms, where they were identified.
+    Parameters
+    ----------
+    covariance_log : (p, p) that of the parameters' logarithms, where they were identified.
+    samples : draws from it that are simulated too; the intervals then count what derivatives miss.
     """
     limb = SocketLimb.of(context, NAME)
     socket = socket_of(context.study, limb.anatomy, limb.outer.skin)
@@ -50,12 +58,46 @@ def run_socket(
         "socket": _shape(limb, socket),
         "mesh": facts,
         "published": published(limb.faces(mesh, socket)),
+        "samples": None,
     }
+    if covariance_log is not None and samples:
+        steps = [drawn(np.array(covariance_log), number) for number in range(samples)]
+        content["samples"] = _sampled(context, folder, (limb, mesh, socket), content, steps)
     write_json(folder / "socket.json", content)
     _write_fields(folder, mesh, found)
     _write_tables(folder, content)
     begun.drop()
     return {}
+
+
+def _sampled(
+    context: Context,
+    folder: Path,
+    donned: tuple[SocketLimb, Mesh, Socket],
+    content: dict[str, Any],
+    steps: Sequence[NDArray[np.float64]],
+) -> dict[str, Any]:
+    """Simulate parameters whose logarithms differ by ``steps (k,)``, and widen the intervals by the misses.
+
+    Told are how many came to their end, and why others did not.
+    """
+    limb, mesh, socket = donned
+    kept, tissues = Kept(folder, also=[context.store[NAME]]), context.study.tissues
+    jobs = []
+    for number, step in enumerate(steps):
+        moved = to_parameters(to_vector(content["parameters"], tissues) * np.exp(step), tissues)
+        key = limb.key(folder, moved, socket)
+        jobs.append(Wearing(f"draw {number + 1}", limb, mesh, limb.materials(moved), socket, kept, key))
+    reasons = wear_all(jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words))
+    names = [f"{tissue}.{key}" for tissue, key in flat_names(tissues)]
+    found = [
+        (dict(zip(names, step, strict=True)), worn(job)[0])
+        for step, job, reason in zip(steps, jobs, reasons, strict=True)
+        if not reason
+    ]
+    if len(found) > 1:
+        widen(content, found)
+    return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
 
 
 def _shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from ...donning import outer_surface, press, pressed_problem
 from ...donning.model import OUTER
 from ...donning.relief import Relief, Trial
 from ...errors import RunError, SurfaceError
-from ...execution import Executor, SerialExecutor
 from ...fe import Step
 from ...fe.materials import Material
 from ...indentation import Parameters, fibre_field
@@ -37,7 +36,7 @@ from ..shared.context import Context
 from ..shared.kept import Kept, Made
 from ..shared.socket_shape import blaming, check_regions, recipe_of
 from ..shared.sources import code_digest
-from .socket_limb import SocketLimb, Wearing, wear, worn
+from .socket_limb import SocketLimb, Wearing, wear_all, worn
 
 Array = NDArray[np.float64]
 
@@ -201,19 +200,9 @@ class _Bench:
     def put_on(self, *made: _Made) -> list[_Made]:
         """With what happens when each is put on and loaded: several side by side on the study's workers."""
         jobs = [self._job(one) for one in made]
-        left = [job for job in jobs if self.kept.find(job.key) is None]
-        executor: Executor = self.context.executor if len(left) > 1 else SerialExecutor()
-        shares = dict.fromkeys((job.name for job in left), 0.0)
-        self.count += len(jobs) - len(left)
-
-        def told(job: Wearing, message: tuple[float, str]) -> None:
-            shares[job.name], words = message
-            self.tell(sum(shares.values()), f"{job.name}: {words}")
-
-        threads = executor.threads_for(len(left))
-        for _ in executor.map(wear, [replace(job, threads=threads) for job in left], told=told):
-            pass  # each keeps what it found
-        self.count += len(left)
+        for reason in filter(None, wear_all(jobs, self.context.executor, self.tell)):
+            raise RunError(reason)
+        self.count += len(jobs)
         done = []
         for one, job in zip(made, jobs, strict=True):
             facts, fields = worn(job)

@@ -3,11 +3,14 @@
 To first order a value with the slopes g by the logarithms of the parameters, whose covariance is C, has the
 variance g'Cg.  The share of a parameter i is what of it would go if that one were known: (C g)_i^2 / C_ii,
 the squared correlation of the two.  Parameters are correlated, so that shares do not add up to one.
+
+Contact and large strain are not of first order.  Where parameters drawn from C were simulated too, the mean
+of what g misses of them is added to the value, and its variance to that of the value.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +24,9 @@ from ...study import Study
 Array = NDArray[np.float64]
 
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
+_CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
+# Of every value: the beginning of the names of what is known of it, and its unit.
+MEAN, SETTLED = ("", "kPa"), ("settling_", "mm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +73,7 @@ class Spread:
         scale = np.maximum(np.diag(self.covariance) * variance, np.finfo(float).tiny)
         shares = 100.0 * along**2 / scale
         found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-shares)}
-        by = np.log1p(CHANGE_PERCENT / 100.0) * slopes
+        by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
         return [max(value - half, 0.0), value + half], found, changes
 
@@ -83,3 +89,43 @@ def spread_facts(
     keys = (f"{name}interval_{unit}", f"{name}interval_from", f"{name}change_{unit}")
     found = (None,) * len(keys) if spread is None or slopes is None else spread.told(value, slopes)
     return dict(zip(keys, found, strict=True))
+
+
+def drawn(covariance: Array, number: int, seed: int = 0) -> Array:
+    """The ``number``-th draw (k,) from the ``covariance (k, k)``, of the logarithms of parameters."""
+    random = np.random.default_rng([seed, number])
+    return random.multivariate_normal(np.zeros(len(covariance)), covariance, method="eigh")
+
+
+def first_order(row: Mapping[str, Any], name: str, unit: str, step: Mapping[str, float]) -> float:
+    """A stored value's change by its derivatives, where the logarithms of parameters change by ``step``."""
+    slopes = row[f"{name}change_{unit}"]
+    return float(sum(slopes[key] * by for key, by in step.items() if key in slopes)) / _CHANGE
+
+
+def widen(facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], Mapping[str, Any]]]) -> None:
+    """Widen the intervals of stored facts by what derivatives miss of ``draws``: steps, and facts there.
+
+    That, mean and standard deviation, is stored beside each interval: ``missed_kPa``, ``settling_missed_mm``.
+    There are two draws or more.
+    """
+    others = [list(_values(found)) for _, found in draws]
+    for i, (row, key, name, unit) in enumerate(_values(facts)):
+        value, (_, high) = row[key], row[f"{name}interval_{unit}"]
+        missed = [
+            other[i][0][key] - value - first_order(row, name, unit, step)
+            for (step, _), other in zip(draws, others, strict=True)
+        ]
+        mean, sd = float(np.mean(missed)), float(np.std(missed, ddof=1))
+        half = float(np.hypot(high - value, NORMAL_95 * sd))
+        row[f"{name}interval_{unit}"] = [max(value + mean - half, 0.0), value + mean + half]
+        row[f"{name}missed_{unit}"] = [mean, sd]
+
+
+def _values(facts: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str, str]]:
+    """Every value with an interval: its row, its key there, how names of its facts begin, and its unit."""
+    for held in (facts["donning"], *facts["loads"]):
+        for row in held["regions"]:
+            yield row, "mean_kPa", *MEAN
+        if "settling_mm" in held:
+            yield held, "settling_mm", *SETTLED

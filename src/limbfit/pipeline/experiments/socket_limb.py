@@ -30,7 +30,7 @@ from ...donning import (
 )
 from ...donning.model import OUTER
 from ...errors import InputError, RunError
-from ...execution import report_progress
+from ...execution import Executor, SerialExecutor, report_progress
 from ...fe import Doubt
 from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
@@ -270,9 +270,34 @@ class Wearing:
     threads: int | None = None
 
 
-def wear(job: Wearing) -> None:
-    """Do the job, which reports how far it is, from 0 to 1, in words."""
-    worn(job)
+def wear_all(
+    jobs: Sequence[Wearing], executor: Executor, tell: Callable[[float, str], None]
+) -> list[str]:  # fmt: skip
+    """Do the jobs side by side; why each could not be done, in words, nothing where it was.
+
+    ``tell`` is given how many are done, with parts, and words. What was kept before is not done again.
+    """
+    left = [job for job in jobs if job.kept.find(job.key) is None]
+    beside: Executor = executor if len(left) > 1 else SerialExecutor()
+    shares, before = dict.fromkeys((job.name for job in left), 0.0), len(jobs) - len(left)
+
+    def told(job: Wearing, message: tuple[float, str]) -> None:
+        shares[job.name], words = message
+        tell(before + sum(shares.values()), f"{job.name}: {words}")
+
+    threads = beside.threads_for(len(left))
+    reasons = beside.map(_wear, [replace(job, threads=threads) for job in left], told=told)
+    found = dict(zip(shares, reasons, strict=True))
+    return [found.get(job.name, "") for job in jobs]
+
+
+def _wear(job: Wearing) -> str:
+    """Do a job, which reports how far it is, from 0 to 1, in words; why it does not come to its end."""
+    try:
+        worn(job)
+    except RunError as error:
+        return str(error)
+    return ""
 
 
 def worn(job: Wearing) -> Made:

@@ -23,6 +23,7 @@ def fit_socket(
     *,
     parameters: Parameters | None = None,
     literature: bool = False,
+    samples: int = 0,
     listener: Listener = quiet,
 ) -> dict[str, Any]:
     """Put the study's socket on its limb and load it.
@@ -33,6 +34,8 @@ def fit_socket(
     ----------
     parameters : per tissue; by default the identified ones, or those of people where none were identified.
     literature : those of people even so: medians of the priors, the others as the study starts them.
+    samples : draws from the identified parameters' covariance that are simulated too; intervals then count
+        what derivatives miss.
 
     Returns
     -------
@@ -42,7 +45,8 @@ def fit_socket(
     Raises
     ------
     InputError
-        For a socket that does not fit the limb, or identified parameters that are stale.
+        For a socket that does not fit the limb, identified parameters that are stale, or samples of
+        parameters that were not identified.
     RunError
         Where the simulation does not come to its end.
     """
@@ -51,6 +55,9 @@ def fit_socket(
     if origin == IDENTIFIED:
         calibration = Store(study.results).read("calibrate", "calibration.json")
         covariance = calibration["uncertainty"]["covariance_log"]
+    elif samples:
+        what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
+        raise InputError(what, place="--samples", remedy="identify them (limbfit run)")
     return run_experiment(
         study,
         "socket",
@@ -58,6 +65,7 @@ def fit_socket(
         parameters=used,
         parameters_from=origin,
         covariance_log=covariance,
+        samples=samples,
     )
 
 

@@ -34,7 +34,7 @@ def socket_section(store: Results, content: Json) -> Section:
         Prose(_loads(loads)),
         *pressure_figures(store, {name: folder / f"held-{i}.vtu" for i, name in enumerate(names)}),
         settling_figure(content),
-        _regions(names, held),
+        _regions(names, held, (content.get("samples") or {}).get("simulated", 0)),
         *interval_blocks(held[-1], names[-1]),
         *published_blocks(content, held[-1], names[-1]),
         *inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
@@ -82,7 +82,7 @@ def _loads(loads: list[Json]) -> str:
     return "; ".join(words) + "."
 
 
-def _regions(names: list[str], held: list[Mapping[str, Any]]) -> Table:
+def _regions(names: list[str], held: list[Mapping[str, Any]], draws: int) -> Table:
     head = (
         "Region",
         "Mean pressure (kPa)",
@@ -101,9 +101,10 @@ def _regions(names: list[str], held: list[Mapping[str, Any]]) -> Table:
             cells = [fixed(region["mean_kPa"]), interval, mostly(region["interval_from"])]
             cells += [fixed(region[key]) for key in ("peak_kPa", "shear_kPa", "shear_peak_kPa")]
             rows.append(Row((heading(region["region"]), *map(numeric, cells))))
+    order = f"by derivatives and {draws} simulated draws" if draws else "to first order"
     caption = (
         "Pressure and shear by region of the limb, when donning and each load have been held. 95 %: from the "
-        "identified parameters' covariance, to first order; liner and friction count as known."
+        f"identified parameters' covariance, {order}; liner and friction count as known."
     )
     return Table("socket-regions", caption, head, tuple(rows))
 
