@@ -8,7 +8,8 @@ STUDY has identified parameters, or takes those of OTHER with their covariance. 
 loaded once with derivatives, and then with parameters drawn from the lognormal distribution of that
 covariance (by the seed and the number of the draw alone).  Told for the mean pressure of every region and
 the settling: the standard deviation by derivatives and of the draws, how far the draws are from what the
-derivatives foresee (rms), and how many lie within the 95 % interval, simulated and foreseen.  Also the change
+derivatives foresee (rms), and how many lie within the 95 % interval, simulated and foreseen; and how many of
+the second half lie within those that the first half widens (``limbfit socket --samples``).  Also the change
 for a coefficient of friction 10 % larger, which counts as known; left out without draws.  ``--truth``: also
 what the tissues of the synthetic patient of that seed do, and whether it lies within the intervals.  Draws
 in the file of ``--json`` are not run again.
@@ -31,7 +32,7 @@ from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import true_parameters
-from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT
+from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT, drawn
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, quiet
 from limbfit.pipeline.shared.socket_shape import socket_of
@@ -79,11 +80,6 @@ class Bench:
             row["change"][SETTLING] = load["settling_change_mm"]
         return row
 
-    def drawn(self, seed: int, number: int) -> np.ndarray:
-        """By how much the logarithms of a draw's parameters differ from the identified ones."""
-        random = np.random.default_rng([seed, number])
-        return random.multivariate_normal(np.zeros(len(self.centre)), self.covariance, method="eigh")
-
     def foreseen(self, centre: dict[str, Any], name: str, step: np.ndarray) -> float:
         """A value of a draw, by the derivatives at the centre."""
         keys = [f"{tissue}.{key}" for tissue, key in flat_names(self.study.tissues)]
@@ -94,7 +90,7 @@ class Bench:
 def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
     """Of each region, and settling."""
     centre, draws = rows["centre"], {int(name): row for name, row in rows.items() if name.isdigit()}
-    steps = [bench.drawn(seed, number) for number in draws]
+    steps = [drawn(bench.covariance, number, seed) for number in draws]
     found = []
     for name, value in centre["values"].items():
         sample, sd = np.array([draw["values"][name] for draw in draws.values()]), centre["sd"][name]
@@ -111,6 +107,7 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
                 "within": int((np.abs(sample - value) <= NORMAL_95 * sd).sum()),
                 "within_linear": int((np.abs(linear - value) <= NORMAL_95 * sd).sum()),
                 "draws": len(sample),
+                "within_widened": _within_widened(sample, linear, value, sd),
                 "mostly_from": f"{first} {percent:.0f} %",
                 "liner_c": centre["change"][name].get("liner.c_kPa"),
                 "friction": rows["friction"]["values"][name] - value if "friction" in rows else None,
@@ -118,6 +115,16 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def _within_widened(sample: np.ndarray, linear: np.ndarray, value: float, sd: float) -> int | None:
+    """How many draws of the second half lie within the interval that those of the first half widen."""
+    half = len(sample) // 2
+    if half < 2:
+        return None
+    missed = sample[:half] - linear[:half]
+    middle, width = value + missed.mean(), NORMAL_95 * np.hypot(sd, missed.std(ddof=1))
+    return int((np.abs(sample[half:] - middle) <= width).sum())
 
 
 def main() -> None:
@@ -140,7 +147,7 @@ def main() -> None:
     for name in (*wanted, *map(str, range(asked.draws))):
         if name not in rows:
             if name.isdigit():
-                rows[name] = bench.run(bench.centre * np.exp(bench.drawn(asked.seed, int(name))))
+                rows[name] = bench.run(bench.centre * np.exp(drawn(bench.covariance, int(name), asked.seed)))
             elif name == "truth":
                 rows[name] = bench.run(to_vector(true_parameters(asked.truth), study.tissues))
             else:

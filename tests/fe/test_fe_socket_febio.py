@@ -50,7 +50,7 @@ def test_a_press_fit_with_friction_is_febios(tmp_path):
     off = np.abs(found - expected)[:, :3] / np.abs(expected[:, :3]).max()
     pushing = t <= 2.5
     assert off[pushing, 2].max() < 0.01  # axial
-    assert off[pushing, :2].max() < 0.011  # radial
+    assert off[pushing, :2].max() < 0.01  # radial
     assert off[~pushing].max() < 0.01
 
 
@@ -74,6 +74,6 @@ def test_a_load_on_the_socket_is_febios(tmp_path):
     t, found, expected = both("cone-load", tmp_path)
     off = np.abs(found[:, 5] - expected[:, 5]) / expected[:, 5].max()
     assert off.max() < 0.01
-    assert off[t <= 6.5].max() < 0.003
+    assert off[t <= 6.5].max() < 0.0035
     forced = t > 5.5
     np.testing.assert_allclose(found[forced, 2], expected[forced, 2], atol=2e-3)

@@ -20,6 +20,7 @@ from limbfit.fe import (
     OpenSurface,
     Pressure,
     RigidBody,
+    SmoothSurface,
     StepControl,
     Support,
     solve,
@@ -254,6 +255,8 @@ def test_febios_own_inputs_are_written_anew(tmp_path, case):
     """A dragged plate, a socket that goes over to a force, a tube under pressure: read, written, read."""
     problem = to_problem(read_feb(SOCKET / f"{case}.feb"))
     found = back(problem, tmp_path)
+    smooth = [isinstance(body.shape, SmoothSurface) for body in (*problem.rigid_bodies, *found.rigid_bodies)]
+    assert smooth == [case == "cone-load"] * len(smooth)  # the hollow of the socket, not the plate
     assert len(found.rigid_bodies) == len(problem.rigid_bodies)
     for mine, theirs in zip(problem.rigid_bodies, found.rigid_bodies):
         assert (theirs.name, theirs.friction) == (mine.name, mine.friction)

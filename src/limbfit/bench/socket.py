@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
 NORMALS = "FEBio's contact acts along the skin's normal, limbfit's along the body's"
 STICKS = "FEBio anchors a point where the first iteration of a step puts it"
-BRIM = "limbfit pushes along the normals of the flare's facets, FEBio along the skin's"
 NEVER = math.inf
 
 
@@ -65,7 +64,7 @@ SOCKET = (
             CasePart("pushed on, radial", ("Fx", "Fy"), ((0.0, 2.5),), 1.0, note=NORMALS),
             CasePart("held, axial", ("Fz",), ((2.5, NEVER),), 3.0, note=STICKS),
             CasePart("held, radial", ("Fx", "Fy"), ((2.5, NEVER),), 3.0, note=STICKS),
-            CasePart("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", BRIM),
+            CasePart("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", NORMALS),
             CasePart("meridian, held", PLACES, ((2.5, NEVER),), 3.0, "cone-line", STICKS),
         ),
     ),

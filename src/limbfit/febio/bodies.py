@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import Indenter, Motion, OpenSurface, RigidBody, RigidSurface
+from ..fe import Indenter, Motion, OpenSurface, RigidBody, RigidSurface, SmoothSurface
 from ..shapes import SHARP_EDGE
 from .penalty import thinnest
 from .reading.geometry import boundary, bulging, closed, refuse_part, triangles
@@ -32,6 +31,36 @@ def _contact_faces(model: FebModel, contact: Contact, tissue: Tissue) -> Indices
 def touched_faces(model: FebModel, contacts: Sequence[Contact], tissue: Tissue) -> Indices:
     """The faces (f, k) of tissue in contacts, each once, in the numbers of the tissue's nodes."""
     return _union([_contact_faces(model, contact, tissue) for contact in contacts])
+
+
+# Facets of a hollow wall that meet at no more than this, rad, stand for a smooth one: FEBio's contact acts
+# along the skin's normal, which does not jump where a point passes from facet to facet (docs/benchmarks.md).
+SMOOTH = 0.3
+
+
+def hollow(model: FebModel, name: str, contacts: Sequence[Contact]) -> bool:
+    """Whether the faces of a rigid body that touch are those of a hollow, all but smooth wall: a socket."""
+    corners = model.geometry.points[_front(model, name, contacts)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    middles = corners.mean(axis=1)
+    ahead = middles @ normals.T - (middles * normals).sum(axis=1)  # of each middle over each facet's plane
+    if not ahead.mean() > 0.05 * np.abs(ahead).max():
+        return False
+    edges: dict[tuple[tuple[float, ...], ...], list[int]] = {}
+    for i, points in enumerate(corners):
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            edges.setdefault(tuple(sorted((tuple(points[a]), tuple(points[b])))), []).append(i)
+    pairs = np.array([pair for pair in edges.values() if len(pair) == 2]).reshape(-1, 2)
+    cosines = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1)
+    return bool((cosines > np.cos(SMOOTH)).all())
+
+
+def _front(model: FebModel, name: str, contacts: Sequence[Contact]) -> Indices:
+    """The triangles (m, 3) of a rigid body's faces that touch, in the numbers of the model's nodes."""
+    own = np.concatenate([part.cells.ravel() for part in model.parts_of({name: None}).values()])
+    sides = [model.geometry.surfaces[side] for contact in contacts for side in contact.surfaces]
+    return triangles(_union([side for side in sides if np.isin(side, own).all()]))
 
 
 def rigid_corners(model: FebModel, name: str) -> Array:
@@ -63,17 +92,15 @@ def rigid_body(
 ) -> RigidBody:
     """A rigid body with a motion of its own, in a frame along the axes of space, or along its rail.
 
-    A closed one is an indenter whose front is the side that looks at the tissue, an open one the faces that
-    touch.  It turns about its centre of mass.
+    A closed one is an indenter whose front is the side that looks at the tissue, an open or hollow one the
+    faces that touch.  It turns about its centre of mass.
     """
     rail = next((rail.along for rail in model.rails if rail.body == name), None)
     faces = touched_faces(model, contacts, tissue)
-    parts = model.parts_of({name: None}).values()
-    own = np.concatenate([part.cells.ravel() for part in parts])
-    sides = [model.geometry.surfaces[side] for contact in contacts for side in contact.surfaces]
-    front = triangles(_union([side for side in sides if np.isin(side, own).all()]))
-    shape: Indenter | OpenSurface
-    if closed(boundary(parts)):
+    front = _front(model, name, contacts)
+    smooth = hollow(model, name, contacts)
+    shape: Indenter | OpenSurface | SmoothSurface
+    if closed(boundary(model.parts_of({name: None}).values())) and not smooth:
         a, b, c = (model.geometry.points[front[:, i]] for i in range(3))
         towards = np.cross(b - a, c - a).sum(axis=0)
         main = int(np.abs(towards).argmax())
@@ -84,9 +111,7 @@ def rigid_body(
     else:
         used, front = np.unique(front, return_inverse=True)
         try:
-            shape = OpenSurface(model.geometry.points[used], front.reshape(-1, 3))
-            if rail is not None:
-                shape = _along(shape, rail)
+            shape = _wall(model.geometry.points[used], front.reshape(-1, 3), rail, smooth)
         except ProblemError as error:
             raise _of_part(model, name, error) from None
     if rail is None:
@@ -100,10 +125,17 @@ def rigid_body(
     return RigidBody(shape, faces, moved, friction, model.rigid[name].centre, name, sticking=sticking)
 
 
-def _along(surface: OpenSurface, axis: Array) -> OpenSurface:
-    """The same surface in a frame along ``axis (3,)``."""
-    placed = surface.placed(np.zeros(3), axis, np.eye(3)[np.abs(axis).argmin()])
-    return replace(placed, points=surface.points @ placed.frame.T)
+def _wall(points: Array, faces: Indices, rail: Array | None, smooth: bool) -> OpenSurface | SmoothSurface:
+    """A wall that is met from one side, in a frame along its rail, if it has one."""
+    axis, edge = np.eye(3)[2], np.eye(3)[0]
+    if rail is not None:
+        axis, edge = rail, np.eye(3)[np.abs(rail).argmin()]
+    frame = OpenSurface(points, faces, axis=axis, edge=edge).frame
+    if smooth:
+        edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2)
+        spacing = 0.5 * float(np.median(edges.min(axis=1)))  # no detail but the edges of facets is smoothed
+        return SmoothSurface.of(points @ frame.T, faces, spacing=spacing, axis=axis, edge=edge)
+    return OpenSurface(points @ frame.T, faces, axis=axis, edge=edge)
 
 
 def _of_part(model: FebModel, name: str, error: ProblemError) -> ProblemError:

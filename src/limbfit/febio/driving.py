@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from ..fe import History, Motion
+from .bodies import hollow
 from .reading.controls import step_times
 from .reading.geometry import boundary, closed
 from .reading.model import Contact, FebModel
@@ -101,7 +102,7 @@ def drive(model: FebModel, shaped: bool = False) -> Drive:
         (name,) = bodies
         line = straight(bodies[name])
         around = boundary(model.parts_of({name: None}).values())
-        if line is not None and (shaped or closed(around)):
+        if line is not None and (shaped or (closed(around) and not hollow(model, name, touching[name]))):
             direction, advance = line
             course = _interpolated(bodies[name], advance, name, 0)
             times = _times(model, [course, *courses.values()])

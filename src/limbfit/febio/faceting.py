@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..fe import Indenter, Motion, OpenSurface, Problem, System
+from ..fe import Indenter, Motion, OpenSurface, Problem, SmoothSurface, System
 from ..fe.contact.rigid import RigidShape
 from .moving import guided, in_space, pushed
 
@@ -120,7 +120,7 @@ def frame_mesh(bodies: Sequence[Body]) -> ToolMesh:
 def _mesh_of(shape: RigidShape) -> ToolMesh:
     if isinstance(shape, Indenter):
         return tool_mesh(shape)
-    if not isinstance(shape, OpenSurface):
+    if not isinstance(shape, OpenSurface | SmoothSurface):
         raise ProblemError(f"a rigid body that is a {type(shape).__name__} is not written for FEBio")
     used, faces = np.unique(shape.faces, return_inverse=True)
     faces = faces.reshape(-1, 3)

@@ -226,7 +226,7 @@ def test_simulated_draws_widen_the_intervals_and_are_kept(folder, tmp_path, caps
         assert missed > 0.0
     show_socket(three)
     assert "95 %: by derivatives and 3 simulated draws" in capsys.readouterr().out
-    assert "by derivatives and 3 simulated draws" in report_study(study)["file"].read_text()
+    assert "by derivatives and 3 simulated draws" in Path(report_study(study)["report"]).read_text()
 
 
 def test_samples_of_tissues_that_were_not_identified_are_refused(folder):
