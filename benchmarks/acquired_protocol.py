@@ -80,7 +80,7 @@ def planned(folder: Path, seed: int) -> Path:
     if not plan.is_dir():
         limbfit_says("phantom", str(patient), "--seed", str(seed))
         shutil.copytree(patient / "mri", plan / "mri")
-        text = (patient / "study.toml").read_text().replace("fitted = false", "fitted = true")
+        text = (patient / "study.toml").read_text().replace("fitted = true", "fitted = false")
 
         def depth(found: re.Match[str]) -> str:
             rows = np.loadtxt(patient / found[1], delimiter=",", skiprows=1, usecols=1)
@@ -188,6 +188,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("runs/acquired"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=25.0)
+    parser.add_argument("--draws", type=int, default=3, help="tissues at which the records are chosen")
     parser.add_argument("--workers", type=int, default=2)
     asked = parser.parse_args()
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -196,10 +197,12 @@ def main() -> None:
     plan = planned(asked.folder, asked.seed)
     file = plan / "study.toml"
     if "[[records]]" not in file.read_text():
-        limbfit_says("design", str(plan), "--protocol", "--minutes", f"{asked.minutes:g}")
+        words = ("--protocol", "--minutes", f"{asked.minutes:g}", "--draws", str(asked.draws))
+        limbfit_says("design", str(plan), *words)
         records = (plan / "results" / "protocol" / "records.toml").read_text()
-        file.write_text(re.sub(r"depth_mm = .*\n", "", file.read_text()) + "\n" + records)
         true_limb(asked.folder, plan)
+        text = re.sub(r"depth_mm = .*\n", "", file.read_text()).replace("fitted = false", "fitted = true")
+        file.write_text(f"{text}\n{records}")
     record(plan, true_limb(asked.folder, plan))
     limbfit_says("run", str(plan), "--workers", str(asked.workers))
     print(json.dumps(judged(asked.folder, plan), indent=1))
