@@ -147,3 +147,17 @@ def _product(system: System, u: np.ndarray) -> np.ndarray:
     """The tangent at rest times a displacement, at the unknowns."""
     upper = csr_array((tangent_at_rest(system), system.indices, system.indptr), shape=(system.unknowns,) * 2)
     return (upper + triu(upper, 1).T) @ u.ravel()[system.free]
+
+
+def test_workers_on_all_cores_keep_at_most_half_of_the_memory():
+    assert simulating.kept_nodes(64e9, 2) == 200_000
+    assert simulating.kept_nodes(8e9, 4) * 4 * 25_000 == pytest.approx(4e9)
+
+
+def test_a_process_with_little_memory_forgets_the_site_that_was_not_used_for_longest(site, monkeypatch):
+    other = replace(site, name="other")
+    simulating._prepared.clear()
+    monkeypatch.setattr(simulating, "kept_nodes", lambda memory, cores: 1)
+    for model in (site, other):
+        assert simulate(job(model, sensitivities=False)).completed
+    assert [model.name for model, _ in simulating._prepared] == ["other"]

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
+from ..execution import usable_cores
 from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
@@ -93,7 +95,9 @@ class Simulation:
         return tuple(doubt.text for doubt in self.doubts)
 
 
-_KEPT_NODES = 200_000  # of the sites that a worker keeps: four of the largest usual ones, some 5 GB in all
+# Nodes of the sites that a process keeps, four of the largest usual ones, and the bytes that each costs;
+# processes on all cores keep no more than a share of the machine's memory.
+_KEPT_NODES, _BYTES, _SHARE = 200_000, 25_000, 0.5
 # The tissue that sets a site's contact penalty, whatever law the site's own have.
 _REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}
 # To the deepest point; from the indenter's edge.  With 4 steps and 20 mm more the penalty of the demo's six
@@ -145,11 +149,15 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
             penalty = max(_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
-    while (
-        len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > _KEPT_NODES
-    ):
+    most = kept_nodes(psutil.virtual_memory().total, usable_cores())
+    while len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > most:
         _prepared.popitem(last=False)
     return known
+
+
+def kept_nodes(memory: float, cores: int) -> int:
+    """Nodes of the sites that a process keeps on a machine with so many bytes and cores."""
+    return min(_KEPT_NODES, int(_SHARE * memory / (cores * _BYTES)))
 
 
 @lru_cache(maxsize=64)
