@@ -104,7 +104,7 @@ class SocketTable(TomlTable):
     distal: Literal["clearance", "bearing"] = "clearance"
     distal_clearance_mm: Annotated[float, Field(ge=0, le=40)] = 5.0
     face_edge_mm: Annotated[float, Field(ge=2, le=8)] = 4.0
-    edge_mm: Annotated[float, Field(ge=3, le=30)] = 12.0
+    edge_mm: Annotated[float, Field(ge=3, le=30)] = 10.0
     liner: LinerTable = LinerTable()
     friction: Friction = 0.5
     donning: Literal["growth", "insertion"] = "growth"
