@@ -36,6 +36,7 @@ def touched_faces(model: FebModel, contacts: Sequence[Contact], tissue: Tissue) 
 # Facets of a hollow wall that meet at no more than this, rad, stand for a smooth one: FEBio's contact acts
 # along the skin's normal, which does not jump where a point passes from facet to facet (docs/benchmarks.md).
 SMOOTH = 0.3
+HOLLOW = 0.02  # how far facets look at each other in the mean, over the size of all
 
 
 def hollow(model: FebModel, name: str, contacts: Sequence[Contact]) -> bool:
@@ -45,7 +46,7 @@ def hollow(model: FebModel, name: str, contacts: Sequence[Contact]) -> bool:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     middles = corners.mean(axis=1)
     ahead = middles @ normals.T - (middles * normals).sum(axis=1)  # of each middle over each facet's plane
-    if not ahead.mean() > 0.05 * np.abs(ahead).max():
+    if not ahead.mean() > HOLLOW * np.ptp(middles, axis=0).max():
         return False
     edges: dict[tuple[tuple[float, ...], ...], list[int]] = {}
     for i, points in enumerate(corners):
