@@ -25,8 +25,6 @@ Array = NDArray[np.float64]
 
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
 _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
-# Of every value: the beginning of the names of what is known of it, and its unit.
-MEAN, SETTLED = ("", "kPa"), ("settling_", "mm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +124,6 @@ def _values(facts: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str
     """Every value with an interval: its row, its key there, how names of its facts begin, and its unit."""
     for held in (facts["donning"], *facts["loads"]):
         for row in held["regions"]:
-            yield row, "mean_kPa", *MEAN
+            yield row, "mean_kPa", "", "kPa"
         if "settling_mm" in held:
-            yield held, "settling_mm", *SETTLED
+            yield held, "settling_mm", "settling_", "mm"

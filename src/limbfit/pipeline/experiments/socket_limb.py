@@ -270,9 +270,7 @@ class Wearing:
     threads: int | None = None
 
 
-def wear_all(
-    jobs: Sequence[Wearing], executor: Executor, tell: Callable[[float, str], None]
-) -> list[str]:  # fmt: skip
+def wear_all(jobs: Sequence[Wearing], executor: Executor, tell: Callable[[float, str], None]) -> list[str]:
     """Do the jobs side by side; why each could not be done, in words, nothing where it was.
 
     ``tell`` is given how many are done, with parts, and words. What was kept before is not done again.
