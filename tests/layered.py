@@ -131,7 +131,8 @@ def store_blocks(
     places = []
     for i, (name, (thickness, depth, fitted)) in enumerate(blocks.items()):
         mesh = layered_block(thickness, tissues, divisions=divisions)
-        model = block_site(name, store["mesh"] / f"{name}.vtu", mesh, depth, study.solver)
+        file, element = store["mesh"] / f"{name}.vtu", study.mesh.element
+        model = block_site(name, file, mesh, depth, study.solver, element=element)
         if coarse is not None:
             (store["mesh"] / COARSE).mkdir(exist_ok=True)
             write_vtu(

@@ -152,6 +152,20 @@ def test_random_starts_leave_what_is_fixed_and_keep_what_is_tied():
     assert len(np.unique(drawn[:, 5].round(9))) == 6
 
 
+def test_starts_that_end_in_one_place_count_as_one_however_good_the_fit():
+    """Where the last step is large, it decides how small the error is."""
+    loose = CalibrationSettings(relative_tolerance=0.01)
+    data = records(0.002, seed=1)
+
+    def run(number, unknowns):
+        return calibrate(simulate, data, unknowns, loose)
+
+    found = multistart(run, PAPER, 6, seed=4)
+    costs = [start.cost for start in found.starts]
+    assert max(costs) > 1.5 * min(costs)
+    assert found.reached == 6, costs
+
+
 def test_a_start_that_fails_is_told_and_the_others_count():
     def run(number, unknowns):
         failing = Counted(forbidden=lambda p: number == 1)

@@ -92,3 +92,12 @@ def test_failed_runs_are_left_out_and_one_run_is_no_emulator():
     assert len(Emulator.fit(NAMES, points, responses).points) == 4
     with pytest.raises(CalibrationError, match="two complete"):
         Emulator.fit(NAMES, points[:1], responses[:1])
+
+
+def test_far_outside_its_runs_forces_stay_finite() -> None:
+    found = bars_emulator(6)
+    far = TRUTH * np.exp(40.0 * np.array([[1.0], [-1.0]]))
+    with np.errstate(over="raise"):
+        assert np.isfinite(found.forces(far)).all()
+        assert np.isfinite(found.forces_and_doubt(far)[0]).all()
+        assert all(np.isfinite(one.force_N).all() for one in found(far[0]))

@@ -25,7 +25,7 @@ from limbfit.study import Study, load_study
 TISSUES = ("skin", "muscle")
 TRUTH = {
     "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 2.0},
 }
 # thickness of skin and muscle, depth, whether fitted
 BLOCKS = {
@@ -100,7 +100,7 @@ def vector(found: dict) -> np.ndarray:
 def blocks(tmp_path_factory):
     """A study of blocks, calibrated on two meshes."""
     study = write_study(tmp_path_factory.mktemp("blocks"))
-    store = store_blocks(study, BLOCKS, TRUTH, 5, coarse=4)
+    store = store_blocks(study, BLOCKS, TRUTH, 6, coarse=5)
     return study, store, calibrated(study, store)
 
 

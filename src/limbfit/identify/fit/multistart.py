@@ -15,6 +15,7 @@ from .state import Calibration
 Array = NDArray[np.float64]
 
 _SAME_COST = 0.01  # relative: half a per cent of the error
+_SAME_PLACE = 0.01  # relative, of every parameter: searches that stop on their last step end so far apart
 _SAME_FIT = 1e-4  # rms force error per site, of its largest: fits closer than this are alike, however exact
 
 
@@ -22,7 +23,8 @@ _SAME_FIT = 1e-4  # rms force error per site, of its largest: fits closer than t
 class Started:
     """What came of one start: ``parameters`` (p,) None where nothing could be simulated.
 
-    ``same``: as good a fit as the best; ``apart``: the largest ratio of a parameter to the best one's.
+    ``same``: as good a fit as the best, or in its place; ``apart``: the largest ratio of a parameter to the
+    best one's.
     """
 
     start: tuple[float, ...]
@@ -45,7 +47,7 @@ class Multistart:
 
     @property
     def reached(self) -> int:
-        """Starts that ended at a fit as good as the best."""
+        """Starts that ended at a fit as good as the best, or in its place."""
         return sum(start.same for start in self.starts)
 
 
@@ -106,7 +108,7 @@ def _started(start: Array, one: Calibration | None, best: Calibration, reason: s
     allowed = _SAME_COST * best.cost + 0.5 * len(best.sites) * _SAME_FIT**2
     return Started(
         at, tuple(one.parameters.tolist()), one.cost, one.evaluations, one.converged, reason,
-        same=one.cost - best.cost <= allowed, apart=apart,
+        same=one.cost - best.cost <= allowed or apart <= 1.0 + _SAME_PLACE, apart=apart,
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ _LENGTHS = (1.0, 2.0, 4.0, 8.0)  # of the kernel, in half-widths of the points
 _NUGGETS = (1e-9, 1e-7, 1e-5)  # variance that the solver's own tolerances add, over that of the kernel
 _TRUSTED_CONDITION = 1e6
 _ROUNDING = 1e-9  # of half a width: runs and questions may both lie on a bound
+_STRONGEST = 50.0  # asinh of a force over s: far outside of its runs the trend would pass any number
 _SMALLEST_WIDTH = 0.02  # of the points, in the logarithm
 
 
@@ -120,6 +121,7 @@ class Emulator:
         at = self._to_unit(parameters)
         rows = np.vstack([_cross(at, self._unit, self.length, self._quadratic, order) for order in (0, 1)])
         found = rows @ self._weights
+        found[0] = np.clip(found[0], -_STRONGEST, _STRONGEST)
         force = self._soft * np.sinh(found[0])
         slope = self._soft * np.cosh(found[0])
         jacobian = slope[:, None] * found[1:].T / (parameters * self._width)
@@ -128,18 +130,20 @@ class Emulator:
     def forces(self, parameters: Array) -> Array:
         """Forces (m, N) of all sites, one after the other, at parameters (m, p)."""
         at = self._to_unit(np.atleast_2d(parameters))
-        rows = _cross(at, self._unit, self.length, self._quadratic, 0)
-        return self._soft * np.sinh(rows @ self._weights)
+        return self._forces_of(_cross(at, self._unit, self.length, self._quadratic, 0))
 
     def forces_and_doubt(self, parameters: Array) -> tuple[Array, Array]:
         """``forces`` (m, N), and the emulator's own expected error there: one sd (m, sites) in N."""
         at = self._to_unit(np.atleast_2d(parameters))
         rows = _cross(at, self._unit, self.length, self._quadratic, 0)
-        force = self._soft * np.sinh(rows @ self._weights)
+        force = self._forces_of(rows)
         variance = np.maximum(1.0 - np.einsum("mi,mi->m", rows @ self._inverse, rows), 0.0)
         spread = self._spread * np.hypot(force, self._soft)
         sd = np.stack([spread[:, s].mean(axis=1) for s in self._sites], axis=1)
         return force, np.sqrt(variance)[:, None] * sd
+
+    def _forces_of(self, rows: Array) -> Array:
+        return self._soft * np.sinh(np.clip(rows @ self._weights, -_STRONGEST, _STRONGEST))
 
     def error_percent(self, parameters: Array) -> Array:
         """Expected error of the emulator itself (sites,), in percent of the largest force: one sd."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...anatomy.meshing.meshing import MeshSettings
-from ...errors import RunError
+from ...errors import MeshingError, RunError
 from ...identify.fit.calibration import calibrate
 from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
@@ -173,9 +173,9 @@ class Laboratory:
         anchored = Anchored(list(found.responses), list, ())
         if self.is_apart:
             anchored = self.anchored(found.parameters)
-        if study.mesh.coarse is None:
+        if study.mesh.coarse is None and (coarser := self._coarser(meshes)):
             searched = self.search(found.parameters) if self.is_apart else anchored.responses
-            lacking = self._mesh_error(found.parameters, searched, self._coarser(meshes))
+            lacking = self._mesh_error(found.parameters, searched, coarser)
             anchored = replace(anchored, mesh_N=lacking)
             spent = self.simulated
         known = linearised(self.context, self.records, found.parameters, anchored)
@@ -214,8 +214,16 @@ class Laboratory:
         return scaled_edges(mesh_settings(self.context.study), COARSER)
 
     def _coarser(self, folder: Path) -> list[SiteRecord]:
-        """The records on coarser meshes than the study's own, which are made in ``folder``."""
-        models = meshed_models(self.context, folder, self._models, self._coarser_edges, self.title)
+        """The records on coarser meshes than the study's own, which are made in ``folder``.
+
+        None of them where one cannot be made: a line says so.
+        """
+        try:
+            models = meshed_models(self.context, folder, self._models, self._coarser_edges, self.title)
+        except MeshingError as error:
+            text = "the error of the meshes is not known, and intervals do not count it: with coarser edges"
+            self.context.tell(self.title, 0, 0, f"warning: {text}, {error}")
+            return []
         return [replace(record, model=model) for record, model in zip(self.records, models, strict=True)]
 
     def _mesh_error(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from ...anatomy.meshing.meshing import MeshSettings
+from ...errors import MeshingError
 from ...execution import meanwhile
 from ...indentation import SiteModel
 from ..shared.artefacts import file_digest
@@ -52,7 +53,8 @@ def _mesh_idly(jobs: Sequence[MeshJob]) -> None:
     if hasattr(os, "nice"):  # not on Windows
         os.nice(19)
     for job in jobs:
-        make_mesh(job)
+        with suppress(MeshingError):  # told where the mesh is wanted
+            make_mesh(job)
 
 
 def _jobs(
