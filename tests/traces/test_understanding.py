@@ -154,6 +154,24 @@ def test_a_sensor_with_an_offset_is_no_contact():
     assert found.touch_down.baseline_N == pytest.approx(0.6, abs=0.02)
 
 
+def fast(seed, clear=0.4):
+    """A weak record at 4.8 mm/s: a twentieth of its peak is but 1.5 times the noise."""
+    trace, _ = record(seed, clear=clear, depth=3.0, speed=4.8, peak=1.5, after=0.4)
+    noise = 0.04 * np.random.default_rng([seed, 1]).standard_normal(trace.time_s.size)
+    return replace(trace, force_N=trace.force_N + noise)
+
+
+def test_noise_is_no_contact():
+    for seed in range(60):
+        assert kinds(understand(fast(seed))) in ([], ["start"]), seed
+
+
+def test_contact_is_seen_in_noise():
+    for seed in range(10):
+        with pytest.raises(TraceError, match="begins in contact"):
+            understand(cut(fast(seed), 1.9))
+
+
 # --- what `limbfit check` says
 
 

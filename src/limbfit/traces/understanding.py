@@ -33,7 +33,9 @@ _DRIFT_SD = 5.0
 _MOST_DRIFT = 0.3  # of the peak force: more is no sensor to correct
 _PRELOAD_SHARE = 0.05  # of the peak force
 _START_FORCE_SHARE = 0.25  # of the peak force, where there are too few samples for a slope
-_START_SHARE = 0.03  # of the travel
+_START_SHARES = (0.03, 0.06, 0.12, 0.25)  # of the travel
+_BY_CHANCE = 4.0  # standard deviations that the first and the least of all bins may be apart
+_SLOPE_SD = 2.0  # standard deviations
 _START_SLOPE = 0.25  # of the mean slope of the way in
 _LEAST_START = 8  # samples
 _RISE_SHARE = 0.5  # of the largest force: the rise in which a stated force meets the skin
@@ -206,12 +208,14 @@ def _rise(trace: Trace) -> float:
 
 def _check_start(trace: Trace, line: BrokenLine) -> None:
     """Refuse a record whose force is there from the first sample on, and rises at once."""
-    _, force, _ = bins(trace.time_s, trace.force_N, _BINS)
+    _, force, count = bins(trace.time_s, trace.force_N, _BINS)
     peak, first, least = float(force.max()), float(force[0]), float(force.min())
     # Once released, the sensor says what its zero is; else it is taken to be zeroed.
     released = np.isfinite(_release_s(line))
-    preload = max(first, first - least if released else 0.0)
-    if preload < _PRELOAD_SHARE * peak or not _rises_at_once(trace, line):
+    noise = noise_level(trace.force_N)
+    by_chance = _BY_CHANCE * noise / float(np.sqrt(count.min()))
+    preload = max(first, first - least if released else 0.0) - by_chance
+    if preload < _PRELOAD_SHARE * peak or not _rises_at_once(trace, line, noise):
         return
     zeroed = f", and {least:.3g} N when it is released" if released else ""
     raise TraceError(
@@ -221,15 +225,24 @@ def _check_start(trace: Trace, line: BrokenLine) -> None:
     )
 
 
-def _rises_at_once(trace: Trace, line: BrokenLine) -> bool:
-    """Whether the force rises over the first bit of travel about as it does on the whole way in."""
+def _rises_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
+    """Whether the force rises over the first bit of travel about as it does on the whole way in.
+
+    The bit is longer where ``noise`` (N, of a sample) would hide that.
+    """
     load = (trace.time_s >= line.start_s) & (trace.time_s <= line.peak_s)
     travel, force = line(trace.time_s[load]), trace.force_N[load]
-    bit = travel < travel[0] + _START_SHARE * (travel[-1] - travel[0])
-    if bit.sum() < _LEAST_START:
-        return bool(force[0] > _START_FORCE_SHARE * force.max())
-    start = float(np.polynomial.polynomial.polyfit(travel[bit], force[bit], 1)[1])
-    return bool(start > _START_SLOPE * (force[-1] - force[0]) / (travel[-1] - travel[0]))
+    way = travel[-1] - travel[0]
+    least = _START_SLOPE * (force[-1] - force[0]) / way
+    for share in _START_SHARES:
+        bit = travel < travel[0] + share * way
+        if bit.sum() < _LEAST_START:
+            continue
+        slope = float(np.polynomial.polynomial.polyfit(travel[bit], force[bit], 1)[1])
+        doubt = _SLOPE_SD * noise / float(np.linalg.norm(travel[bit] - travel[bit].mean()))
+        if doubt < least or share == _START_SHARES[-1]:
+            return slope - doubt > least
+    return bool(force[0] > _START_FORCE_SHARE * force.max())
 
 
 def _start_remark(touch: TouchDown, stated_s: float | None) -> list[Remark]:
