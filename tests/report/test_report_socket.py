@@ -42,6 +42,13 @@ def test_the_table_of_intervals_names_parameters_and_what_the_liner_changes():
     ]
 
 
+def test_a_simulated_change_of_friction_has_a_column_of_its_own():
+    rougher = {**REGION, "change_kPa": {**REGION["change_kPa"], "friction": 1.25}}
+    (table,) = interval_blocks({"regions": [rougher]}, "stance")
+    assert table.head[-1] == "Change, friction 10 % larger"
+    assert table.rows[0].cells[-1].text == "1.2 kPa"
+
+
 def test_without_identified_tissues_there_is_no_such_table():
     unknown = {**REGION, "interval_kPa": None, "interval_from": None, "change_kPa": None}
     assert interval_blocks({"regions": [unknown]}, "donning") == ()

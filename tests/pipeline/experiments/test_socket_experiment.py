@@ -224,6 +224,9 @@ def test_simulated_draws_widen_the_intervals_and_are_kept(folder, tmp_path, caps
         missed = 2 * NORMAL_95 * other["missed_kPa"][1]
         assert wide == pytest.approx(np.hypot(narrow, missed), rel=1e-2)
         assert missed > 0.0
+        assert "friction" not in one["change_kPa"]
+        assert 0.0 < abs(other["change_kPa"]["friction"]) < 0.1 * other["mean_kPa"]
+    assert three["loads"][0]["settling_change_mm"]["friction"] < 0.0  # more friction holds the limb
     show_socket(three)
     assert "95 %: by derivatives and 3 simulated draws" in capsys.readouterr().out
     assert "by derivatives and 3 simulated draws" in Path(report_study(study)["report"]).read_text()

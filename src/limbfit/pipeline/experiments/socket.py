@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Begun, Kept
 from ..shared.socket_shape import socket_of
-from .socket_intervals import drawn, widen
+from .socket_intervals import CHANGE_PERCENT, FRICTION, drawn, tell_change, widen
 from .socket_limb import Covariance, SocketLimb, Wearing, wear_all, worn
 
 NAME = "socket"
@@ -39,7 +40,8 @@ def run_socket(
     Parameters
     ----------
     covariance_log : (p, p) that of the parameters' logarithms, where they were identified.
-    samples : draws from it that are simulated too; the intervals then count what derivatives miss.
+    samples : draws from it that are simulated too, and more friction; the intervals then count what
+        derivatives miss.
     """
     limb = SocketLimb.of(context, NAME)
     socket = socket_of(context.study, limb.anatomy, limb.outer.skin)
@@ -79,7 +81,8 @@ def _sampled(
 ) -> dict[str, Any]:
     """Simulate parameters whose logarithms differ by ``steps (k,)``, and widen the intervals by the misses.
 
-    Told are how many came to their end, and why others did not.
+    More friction is simulated beside them, where there is some, and what it changes stored. Told are how many
+    draws came to their end, and why others did not.
     """
     limb, mesh, socket = donned
     kept, tissues = Kept(folder, also=[context.store[NAME]]), context.study.tissues
@@ -88,18 +91,34 @@ def _sampled(
         moved = to_parameters(to_vector(content["parameters"], tissues) * np.exp(step), tissues)
         key = limb.key(folder, moved, socket)
         jobs.append(Wearing(f"draw {number + 1}", limb, mesh, limb.materials(moved), socket, kept, key))
+    rougher = _rougher(limb)
+    if rougher is not None:
+        key = rougher.key(folder, content["parameters"], socket)
+        laws = limb.materials(content["parameters"])
+        jobs.append(Wearing(FRICTION, rougher, mesh, laws, socket, kept, key))
     reasons = wear_all(jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words))
     names = [f"{tissue}.{key}" for tissue, key in flat_names(tissues)]
     found = [
         (dict(zip(names, step, strict=True)), worn(job)[0])
-        for step, job, reason in zip(steps, jobs, reasons, strict=True)
+        for step, job, reason in zip(steps, jobs, reasons, strict=False)
         if not reason
     ]
+    if rougher is not None and not reasons[-1]:
+        tell_change(content, worn(jobs[-1])[0], FRICTION)
     if len(found) < 2:  # one says nothing of a spread
         found = []
     else:
         widen(content, found)
     return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
+
+
+def _rougher(limb: SocketLimb) -> SocketLimb | None:
+    """The same with a larger coefficient of friction; None where contact has none."""
+    table = limb.study.socket
+    if isinstance(table.friction, str) or table.friction == 0.0:
+        return None
+    more = table.model_copy(update={"friction": table.friction * (1.0 + CHANGE_PERCENT / 100.0)})
+    return replace(limb, study=limb.study.model_copy(update={"socket": more}))
 
 
 def _shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from ...study import Study
 Array = NDArray[np.float64]
 
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
+FRICTION = "friction"  # one that has no derivatives
 _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
 
 
@@ -118,6 +119,12 @@ def widen(facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], M
         half = float(np.hypot(high - value, NORMAL_95 * sd))
         row[f"{name}interval_{unit}"] = [max(value + mean - half, 0.0), value + mean + half]
         row[f"{name}missed_{unit}"] = [mean, sd]
+
+
+def tell_change(facts: Mapping[str, Any], other: Mapping[str, Any], of: str) -> None:
+    """Store how every value with an interval changes to that of ``other`` facts, beside its other changes."""
+    for (row, key, name, unit), (there, *_) in zip(_values(facts), _values(other), strict=True):
+        row[f"{name}change_{unit}"][of] = there[key] - row[key]
 
 
 def _values(facts: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str, str]]:

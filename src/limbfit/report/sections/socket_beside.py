@@ -9,7 +9,11 @@ from ..formats import NOTHING, fixed, heading, numeric, symbol
 from ..page import Block, Cell, Prose, Row, Table
 from ..store import Json
 
-STIFFNESS = "liner.c_kPa"
+# What counts as known, and how its change is headed.
+KNOWN = {
+    "liner.c_kPa": f"Change, liner {symbol('c')} 10 % larger",
+    "friction": "Change, friction 10 % larger",
+}
 PAPERS = (
     "Measured pressures depend on sensor, socket and activity: see the cited papers, the review by Al-Fakih "
     "et al. (Sensors 2016, 16:1119), and for thresholds of pain by region Lee et al. (Arch Phys Med Rehabil "
@@ -32,30 +36,30 @@ def parameter(name: str) -> str:
 
 
 def interval_blocks(held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
-    """How much of each interval goes with every identified parameter, and what a stiffer liner changes."""
+    """How much of each interval goes with every identified parameter; what liner and friction change."""
     rows = [(row["region"], "kPa", "", row["mean_kPa"], row) for row in held["regions"]]
     if "settling_mm" in held:
         rows.append(("settling", "mm", "settling_", held["settling_mm"], held))
     if rows[0][-1]["interval_from"] is None:
         return ()
     names = sorted(rows[0][-1]["interval_from"])
-    lined = STIFFNESS in rows[0][-1]["change_kPa"]
+    told = [name for name in KNOWN if name in rows[0][-1]["change_kPa"]]
     head = ["", "Value", "95 %, half", *(f"{parameter(name)} (%)" for name in names)]
-    if lined:
-        head.append(f"Change, liner {symbol('c')} 10 % larger")
+    head += [KNOWN[name] for name in told]
     lines = []
     for name, unit, begin, value, row in rows:
         low, high = row[f"{begin}interval_{unit}"]
         decimals = 2 if unit == "mm" else 1
         cells = [f"{fixed(value)} {unit}", f"{fixed(max(value - low, high - value), 2)} {unit}"]
         cells += [fixed(row[f"{begin}interval_from"][one], 0) for one in names]
-        if lined:
-            cells.append(f"{fixed(row[f'{begin}change_{unit}'][STIFFNESS], decimals)} {unit}")
+        changes = row[f"{begin}change_{unit}"]
+        cells += [f"{fixed(changes[one], decimals)} {unit}" for one in told]
         lines.append(Row((heading(name), *map(numeric, cells))))
     caption = (
         f"What the intervals of means and settling come from, {title}: the share of the variance that would "
         "go if a parameter were known, to first order. Parameters are correlated, so that shares do not add "
-        "up to 100 %. The liner counts as known; the last column says what it changes."
+        "up to 100 %. Liner and friction count as known; the last columns say what they change (friction "
+        "with --samples)."
     )
     return (Table("socket-intervals", caption, tuple(head), tuple(lines)),)
 
