@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 Grouping = tuple[int, ...]
 
 FIXED = -1
+_EDGE = 1e-3  # nearer to a bound, in logarithms, is at it
 
 
 def shared(names: Sequence[str]) -> Grouping:
@@ -109,6 +110,11 @@ class Unknowns:
     def from_start(self, start: Array) -> Unknowns:
         """The same, started elsewhere."""
         return replace(self, start=np.clip(start, self.lower, self.upper))
+
+    def at_bound(self, parameters: Array) -> NDArray[np.bool_]:
+        """Which of the parameters (p,) lie at one of their bounds."""
+        low, high = np.log(parameters / self.lower), np.log(self.upper / parameters)
+        return np.asarray(np.minimum(low, high) < _EDGE)
 
     def prior_rows(self) -> tuple[Array, Array]:
         """``(A, b)``: ``A @ log(parameters) - b`` is how many standard deviations off each prior is."""

@@ -37,7 +37,6 @@ NORMAL_95 = 1.959964  # half of a 95 % interval, in standard deviations of a nor
 _DETERMINED_FACTOR, _WEAK_FACTOR = 1.25, 2.0
 # Whatever the width: an interval that is hardly narrower than the bounds comes from the bounds.
 _PRIOR_SHARE = 0.5
-_EDGE = 1e-3  # this close to a bound, in the logarithm, is on it
 _MOST_FREEDOM = 1e6
 
 
@@ -243,7 +242,7 @@ def _told(
         correlation=covariance / np.outer(sd, sd),
         intervals_95=np.stack([low, high], axis=1),
         verdicts=tuple(verdicts),
-        at_bound=tuple(_at_bound(parameters, unknowns)),
+        at_bound=tuple(map(bool, unknowns.at_bound(parameters))),
         combinations=_combinations(linear, space, unknowns.names, prior),
         residual_model=model,
         degrees_of_freedom=np.array(
@@ -252,12 +251,6 @@ def _told(
         prior_share=share,
         wider_without=wider,
     )
-
-
-def _at_bound(parameters: Array, unknowns: Unknowns) -> list[bool]:
-    near_low = np.log(parameters / unknowns.lower) < _EDGE
-    near_high = np.log(unknowns.upper / parameters) < _EDGE
-    return [bool(edge) for edge in near_low | near_high]
 
 
 def verdict_of(factor: float, share_of_prior: float) -> str:
