@@ -1,0 +1,66 @@
+"""A search that ended at a bound goes on from inside: what goes on, and what is told of both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bars import NAMES, PAPER, TRUTH, Counted, records
+
+from limbfit.identify import FIXED, Calibration, calibrate, separate, two_stages
+from limbfit.identify.fit.inside import gone_on, inside
+
+GAMMA = NAMES.index("skin.gamma")
+LOW = replace(PAPER, upper=np.where(np.arange(8) == GAMMA, 1.5, PAPER.upper))  # below the truth of 2
+
+
+@pytest.fixture(scope="module")
+def bounded() -> Calibration:
+    found = calibrate(Counted(), records(), LOW)
+    assert found.parameters[GAMMA] == pytest.approx(1.5)
+    return found
+
+
+def test_what_ended_at_a_bound_goes_back_to_its_start(bounded):
+    names, again = inside(bounded, LOW, separate(NAMES))
+    assert names == ["skin.gamma"]
+    others = np.arange(8) != GAMMA
+    assert again.start[GAMMA] == PAPER.start[GAMMA]
+    assert again.start[others] == pytest.approx(bounded.parameters[others])
+
+
+def test_nothing_goes_on_where_nothing_ended_at_a_bound_or_could_move(bounded):
+    assert inside(calibrate(Counted(), records(), PAPER), PAPER, separate(NAMES)) is None
+    fixed = tuple(FIXED if i == GAMMA else i for i in range(8))
+    assert inside(bounded, LOW, fixed) is None
+    assert inside(bounded, LOW.from_start(LOW.upper), separate(NAMES)) is None
+
+
+def test_no_smaller_error_leaves_the_answer(bounded):
+    """There is one optimum: it is reached again."""
+    names, again = inside(bounded, LOW, separate(NAMES))
+    second = calibrate(Counted(), records(), again, stages=(separate(NAMES),))
+    found = gone_on(bounded, second, names)
+    assert np.array_equal(found.parameters, bounded.parameters)
+    assert found.history == bounded.history
+    assert found.evaluations == bounded.evaluations + second.evaluations
+    assert found.reason.endswith(
+        "with skin.gamma at a bound; searched again from inside, without a smaller error"
+    )
+
+
+def test_a_smaller_error_is_the_answer_and_its_way_follows_the_first(bounded):
+    """The second search within wider bounds stands for one that leaves a worse optimum."""
+    second = calibrate(Counted(), records(), PAPER.from_start(bounded.parameters), stages=(separate(NAMES),))
+    found = gone_on(bounded, second, ["skin.gamma"])
+    assert found.parameters == pytest.approx(TRUTH, rel=0.02)
+    assert found.cost == second.cost < bounded.cost
+    assert [stage.grouping for stage in found.stages] == list(two_stages(NAMES))
+    assert [one.stage for one in found.history] == sorted(one.stage for one in found.history)
+    assert found.history[-1].parameters == second.history[-1].parameters
+    assert found.history[-1].evaluations == found.evaluations
+    last = found.stages[-1]
+    assert last.evaluations == bounded.stages[-1].evaluations + second.evaluations
+    assert last.iterations == sum(one.stage == 1 for one in found.history) - 1
+    assert "went on from inside" in last.reason
