@@ -32,7 +32,7 @@ from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import true_parameters
-from limbfit.pipeline.experiments.socket_intervals import CHANGE_PERCENT, drawn
+from limbfit.pipeline.experiments.socket_intervals import drawn, first_order
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, quiet
 from limbfit.pipeline.shared.socket_shape import socket_of
@@ -83,8 +83,8 @@ class Bench:
     def foreseen(self, centre: dict[str, Any], name: str, step: np.ndarray) -> float:
         """A value of a draw, by the derivatives at the centre."""
         keys = [f"{tissue}.{key}" for tissue, key in flat_names(self.study.tissues)]
-        slopes = np.array([centre["change"][name][key] for key in keys]) / np.log1p(CHANGE_PERCENT / 100.0)
-        return float(centre["values"][name] + slopes @ step)
+        row = {"change_kPa": centre["change"][name]}
+        return float(centre["values"][name]) + first_order(row, "", "kPa", dict(zip(keys, step, strict=True)))
 
 
 def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
