@@ -9,7 +9,7 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, Counted, records
 
 from limbfit.identify import FIXED, Calibration, calibrate, separate, two_stages
-from limbfit.identify.fit.inside import gone_on, inside
+from limbfit.identify.fit.inside import go_on, gone_on, inside
 
 GAMMA = NAMES.index("skin.gamma")
 LOW = replace(PAPER, upper=np.where(np.arange(8) == GAMMA, 1.5, PAPER.upper))  # below the truth of 2
@@ -64,3 +64,14 @@ def test_a_smaller_error_is_the_answer_and_its_way_follows_the_first(bounded):
     assert last.evaluations == bounded.stages[-1].evaluations + second.evaluations
     assert last.iterations == sum(one.stage == 1 for one in found.history) - 1
     assert "went on from inside" in last.reason
+
+
+def test_a_second_search_that_fails_leaves_the_answer_and_is_told(bounded):
+    def search(unknowns, stages):
+        return calibrate(Counted(forbidden=lambda p: True), records(), unknowns, stages=stages), ()
+
+    said = []
+    first = bounded, ()
+    assert go_on(first, LOW, two_stages(NAMES), search, said.append) is first
+    assert said[0] == "skin.gamma at a bound: searched again from inside"
+    assert said[1].startswith("warning: skin.gamma at a bound: searched again from inside, which fails: ")

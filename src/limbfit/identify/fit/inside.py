@@ -2,14 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from ...errors import CalibrationError
+from .fidelity import Round
 from .parameters import FIXED, Grouping, Unknowns
 from .state import Calibration
 
+Search = Callable[[Unknowns, Sequence[Grouping]], tuple[Calibration, tuple[Round, ...]]]
 BETTER = 0.01  # relative fall of the squared error: less is the same optimum
+
+
+def go_on(
+    first: tuple[Calibration, tuple[Round, ...]],
+    start: Unknowns,
+    stages: Sequence[Grouping],
+    search: Search,
+    tell: Callable[[str], object],
+) -> tuple[Calibration, tuple[Round, ...]]:
+    """A calibration from ``start``, with its corrections, as it is once its last stage went on from inside.
+
+    ``search`` is what it was found by, ``tell`` is given words. A second search that fails changes nothing.
+    """
+    found, rounds = first
+    beyond = inside(found, start, stages[-1])
+    if beyond is None:
+        return first
+    names, again = beyond
+    words = f"{', '.join(names)} at a bound: searched again from inside"
+    tell(words)
+    try:
+        second, further = search(again, stages[-1:])
+    except CalibrationError as error:
+        tell(f"warning: {words}, which fails: {error}")
+        return first
+    further = tuple(replace(one, stage=len(stages) - 1) for one in further)
+    return gone_on(found, second, names), (*rounds, *further)
 
 
 def inside(found: Calibration, unknowns: Unknowns, grouping: Grouping) -> tuple[list[str], Unknowns] | None:

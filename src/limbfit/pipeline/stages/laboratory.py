@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from ...errors import MeshingError, RunError
 from ...identify.fit.calibration import calibrate
 from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
-from ...identify.fit.inside import gone_on, inside
+from ...identify.fit.inside import go_on
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
@@ -296,15 +297,10 @@ class Laboratory:
 
         Where the last stage ends at a bound, it is searched again from inside.
         """
-        found, rounds = self._identify(start, stages)
-        beyond = inside(found, start, stages[-1])
-        if beyond is None or found.settings.stopping == "paper":
-            return found, rounds
-        names, again = beyond
-        self.context.tell(self.title, 0, 0, f"{', '.join(names)} at a bound: searched again from inside")
-        other, further = self._identify(again, stages[-1:])
-        last = len(stages) - 1
-        return gone_on(found, other, names), (*rounds, *(replace(one, stage=last) for one in further))
+        first = self._identify(start, stages)
+        if self.context.study.calibration.stopping == "paper":
+            return first
+        return go_on(first, start, stages, self._identify, partial(self.context.tell, self.title, 0, 0))
 
     def _identify(self, start: Unknowns, stages: Sequence[Grouping]) -> tuple[Calibration, tuple[Round, ...]]:
         study, table = self.context.study, self.context.study.calibration
