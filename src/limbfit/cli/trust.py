@@ -98,17 +98,15 @@ def design(
     """
     checked = limbfit.load_study(study)
     used = parse_parameters(parameters, checked)
+    chosen = parse_list(depths, "--depths", "give millimetres, such as 3,5,7")
     with listening() as listener:
         if protocol:
-            depth = parse_list(depths, "--depths", "give one depth in mm, such as 6")
-            if len(depth) > 1:
-                raise InputError("a protocol has one depth", place="--depths", remedy="give one, such as 6")
             found = limbfit.plan_protocol(
                 checked,
                 minutes=minutes,
                 speeds_mm_s=parse_list(speeds, "--speeds", "give mm/s, such as 0.96,4.8"),
                 holds_s=parse_list(holds, "--holds", "give seconds, such as 0,30", least=0.0),
-                depth_mm=depth[0] if depth else None,
+                depths_mm=chosen,
                 determine=determine.split(",") if determine else (),
                 criterion=criterion,
                 draws=draws,
@@ -121,7 +119,7 @@ def design(
             found = limbfit.design_study(
                 checked,
                 sites=sites,
-                depths_mm=parse_list(depths, "--depths", "give millimetres, such as 3,5,7"),
+                depths_mm=chosen,
                 parameters=used,
                 listener=listener,
             )

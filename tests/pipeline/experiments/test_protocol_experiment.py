@@ -25,7 +25,7 @@ def found(pristine: Path):
     one, _, _ = file.read_text().rpartition("[[sites]]")
     file.write_text(one + COARSE + BALL)
     study = limbfit.load_study(pristine)
-    return study, limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0, 10), draws=1)
+    return study, limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
 
 
 def test_the_session_keeps_its_time_and_tells_more_than_plain_ramps(found) -> None:
@@ -42,11 +42,22 @@ def test_the_session_keeps_its_time_and_tells_more_than_plain_ramps(found) -> No
         assert designed["cost"] <= rows[name]["cost"] + 1e-9
 
 
+def test_several_depths_are_chosen_from(found) -> None:
+    study, _ = found
+    more = limbfit.plan_protocol(
+        study, minutes=6, depths_mm=(2.0, 3.0), speeds_mm_s=(0.96,), holds_s=(0,), draws=1
+    )
+    assert sorted({row["depth_mm"] for row in more["candidates"]}) == [2.0, 3.0]
+    rows = {row["design"]: row for row in more["protocols"]}
+    assert rows[DESIGNED]["cost"] <= rows["at one depth"]["cost"] + 1e-9
+    assert rows[PLAIN]["records"] == 1  # the deepest alone
+
+
 def test_what_is_to_be_determined_is_determined_better(found) -> None:
     study, content = found
     name = "muscle.tau_s"
     own = limbfit.plan_protocol(
-        study, minutes=6, depth_mm=3.0, holds_s=(0, 10), draws=1, determine=(name,), criterion="A"
+        study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1, determine=(name,), criterion="A"
     )
     best, every = own["protocols"][0], content["protocols"][0]
     assert best["design"] == every["design"] == DESIGNED
@@ -56,7 +67,7 @@ def test_what_is_to_be_determined_is_determined_better(found) -> None:
 
 def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
     study, _ = found
-    content = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0, 10), draws=1)
+    content = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
     text = (Path(content["folder"]) / "records.toml").read_text()
     tables = tomllib.loads(text)["records"]
     assert len(tables) == len(content["records"])
@@ -73,7 +84,9 @@ def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
 @pytest.mark.slow
 def test_ultrasound_tells_more_in_the_same_time(found) -> None:
     study, content = found
-    seen = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0,), draws=1, ultrasound_sd_mm=0.1)
+    seen = limbfit.plan_protocol(
+        study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, ultrasound_sd_mm=0.1
+    )
     rows = {row["design"]: row for row in seen["protocols"]}
     assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
     plain = {row["design"]: row for row in content["protocols"]}[PLAIN]
@@ -95,7 +108,7 @@ def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:
 
 def test_what_cannot_be_planned_is_one_line(found) -> None:
     study, _ = found
-    same = {"depth_mm": 3.0, "holds_s": (0, 10), "draws": 1}
+    same = {"depths_mm": (3.0,), "holds_s": (0, 10), "draws": 1}
     with pytest.raises(InputError, match="no record fits into 1 min"):
         limbfit.plan_protocol(study, minutes=1, **same)
     with pytest.raises(InputError, match=r"no parameter is named 'bone\.c_kPa'"):
@@ -106,7 +119,7 @@ def test_what_cannot_be_planned_is_one_line(found) -> None:
 
 def test_it_is_in_the_report(found) -> None:
     study, _ = found
-    content = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0, 10), draws=1)
+    content = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
     text = Path(limbfit.report_study(study)["report"]).read_text()
     assert "Which records to make" in text
     assert content["verdict"].split(";")[0] in text
@@ -115,7 +128,9 @@ def test_it_is_in_the_report(found) -> None:
 @pytest.mark.slow
 def test_cameras_tell_more_in_the_same_time(found) -> None:
     study, content = found
-    seen = limbfit.plan_protocol(study, minutes=6, depth_mm=3.0, holds_s=(0,), draws=1, surface_sd_mm=0.05)
+    seen = limbfit.plan_protocol(
+        study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, surface_sd_mm=0.05
+    )
     rows = {row["design"]: row for row in seen["protocols"]}
     assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
     plain = {row["design"]: row for row in content["protocols"]}[PLAIN]

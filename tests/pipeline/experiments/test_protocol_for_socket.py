@@ -20,7 +20,7 @@ force_N = [0.0, 0.0, 150.0]
 duration_s = 1.0
 hold_s = 1.0
 """
-SESSION = {"minutes": 6, "depth_mm": 1.5, "holds_s": (0, 10), "draws": 1}
+SESSION = {"minutes": 6, "depths_mm": (1.5,), "holds_s": (0, 10), "draws": 1}
 
 
 @pytest.fixture(scope="module")

@@ -118,7 +118,7 @@ _OWN: tuple[Experiment, ...] = (
         record_keys=_RECORD,
         options={
             **{"minutes": 25.0, "setup_s": 60.0, "rest_s": 30.0, "speeds_mm_s": [], "holds_s": []},
-            **{"depth_mm": None, "determine": [], "criterion": "D", "draws": 3, "seed": 0},
+            **{"depths_mm": [], "determine": [], "criterion": "D", "draws": 3, "seed": 0},
             **{"ultrasound_sd_mm": None, "surface_sd_mm": None, "pressures": {}},
             **{"parameters": {}, "parameters_from": "", "noise": {}},
         },

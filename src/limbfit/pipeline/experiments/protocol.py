@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ def run_protocol(
     rest_s: float,
     speeds_mm_s: Sequence[float],
     holds_s: Sequence[float],
-    depth_mm: float | None,
+    depths_mm: Sequence[float],
     determine: Sequence[str],
     criterion: str,
     draws: int,
@@ -93,7 +94,7 @@ def run_protocol(
     tissues = drawn(known, study.vector(parameters), draws, seed)
     seen = {"ultrasound_sd_mm": ultrasound_sd_mm, "surface_sd_mm": surface_sd_mm}
     noises = Noises.of(NoiseModel(**noise), **seen)
-    planned, left_out = _planned(context, speeds_mm_s, holds_s, depth_mm, noises)
+    planned, left_out = _planned(context, speeds_mm_s, holds_s, depths_mm, noises)
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
@@ -168,10 +169,10 @@ def _planned(
     context: Context,
     speeds_mm_s: Sequence[float],
     holds_s: Sequence[float],
-    depth_mm: float | None,
+    depths_mm: Sequence[float],
     noises: Noises,
 ) -> tuple[list[Planned], list[str]]:
-    """Every site with every indenter, speed and hold, as deep as it was recorded, planned or asked for."""
+    """Every site with every indenter, speed and hold, as deep as asked for, else as recorded or planned."""
     study, found, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"])
     deepest: dict[str, float] = {}
@@ -179,22 +180,22 @@ def _planned(
         own = model_of(context, one)
         deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
     for site in study.sites:
-        wanted = depth_mm or deepest[site.name]
+        wanted = depths_mm or (deepest[site.name],)
         for name in study.all_indenters:
-            model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, wanted), searched=True)
+            model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True)
             if noises.layers is not None:
                 model = replace(model, layers=layers_under(model))
             if noises.skin is not None:
                 model = replace(model, skin_points=skin_beside(model))
             thickness = tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
-            depth = min(wanted, DEEPEST_SHARE * thickness)
-            if depth < wanted:
+            most = DEEPEST_SHARE * thickness
+            if most < max(wanted):
                 half = f"half of the tissue's {thickness:.1f} mm"
-                left_out.append(f"site {site.name}: no deeper than {depth:.1f} mm, {half}")
-            for speed in speeds_mm_s:
-                for hold in holds_s:
-                    planned = _press(model, depth, speed, hold)
-                    found.append(Planned(site.name, name, depth, speed, hold, planned))
+                left_out.append(f"site {site.name}: no deeper than {most:.1f} mm, {half}")
+            depths = dict.fromkeys(min(depth, most) for depth in wanted)
+            for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
+                planned = _press(model, depth, speed, hold)
+                found.append(Planned(site.name, name, depth, speed, hold, planned))
     return found, list(dict.fromkeys(left_out))
 
 
@@ -272,14 +273,23 @@ def _told_by(job: SimulationJob, simulation: Simulation, noises: Noises) -> tupl
 def _plans(
     found: Sequence[Planned], options: Sequence[Option], budget: Budget, wanted: Wanted
 ) -> dict[str, tuple[int, ...]]:
-    """The designed protocol, one slow ramp at every site, and the best without each ingredient."""
+    """The designed protocol, one slow and deep ramp at every site, and the best without each ingredient."""
     slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
-    plain = [one.speed_mm_s == slow and not one.hold_s and one.indenter == tool for one in found]
+    places = [(one.site, one.indenter) for one in found]
+    most = {
+        place: max(one.depth_mm for one in found if (one.site, one.indenter) == place) for place in places
+    }
+    deep = [one.depth_mm == most[place] for one, place in zip(found, places, strict=True)]
+    plain = [
+        one.speed_mm_s == slow and not one.hold_s and one.indenter == tool and deepest
+        for one, deepest in zip(found, deep, strict=True)
+    ]
     kinds: Mapping[str, Sequence[bool]] = {
         DESIGNED: [True] * len(found),
         "without holds": [not one.hold_s for one in found],
         "at one speed": [one.speed_mm_s == slow for one in found],
         "with one indenter": [one.indenter == tool for one in found],
+        "at one depth": deep,
     }
     plans: dict[str, tuple[int, ...]] = {}
     for name, allowed in kinds.items():

@@ -70,7 +70,7 @@ def plan_protocol(
     rest_s: float = 30.0,
     speeds_mm_s: Sequence[float] = (),
     holds_s: Sequence[float] = (0.0, 30.0),
-    depth_mm: float | None = None,
+    depths_mm: Sequence[float] = (),
     determine: Sequence[str] = (),
     criterion: Criterion | None = None,
     draws: int = 3,
@@ -88,7 +88,7 @@ def plan_protocol(
     setup_s, rest_s : for each site with an indenter, and for the tissue to come back after each record.
     speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, within its limit.
     holds_s : at the deepest point, to choose from; 0: none.
-    depth_mm : of all records; by default as deep as each site was recorded or is planned.
+    depths_mm : to choose from; none: as deep as each site was recorded or is planned.
     determine : parameters such as ``muscle.c_kPa``; by default all. ``socket``: the mean pressures of the
         regions under every load of ``results/socket``, which needs identified parameters.
     criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances; by
@@ -130,7 +130,7 @@ def plan_protocol(
         speeds_mm_s=[float(v) for v in speeds_mm_s]
         or [slow, min(_FASTER * slow, study.acquire.speed_limit_mm_s)],
         holds_s=[float(hold) for hold in holds_s],
-        depth_mm=depth_mm,
+        depths_mm=[float(depth) for depth in depths_mm],
         determine=[] if pressures else list(determine),
         criterion=criterion or ("A" if pressures else "D"),
         pressures=pressures,
