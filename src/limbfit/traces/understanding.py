@@ -234,15 +234,15 @@ def _rises_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
     travel, force = line(trace.time_s[load]), trace.force_N[load]
     way = travel[-1] - travel[0]
     least = _START_SLOPE * (force[-1] - force[0]) / way
+    if (travel < travel[0] + _START_SHARES[0] * way).sum() < _LEAST_START:
+        return bool(force[0] > _START_FORCE_SHARE * force.max())
     for share in _START_SHARES:
         bit = travel < travel[0] + share * way
-        if bit.sum() < _LEAST_START:
-            continue
         slope = float(np.polynomial.polynomial.polyfit(travel[bit], force[bit], 1)[1])
         doubt = _SLOPE_SD * noise / float(np.linalg.norm(travel[bit] - travel[bit].mean()))
-        if doubt < least or share == _START_SHARES[-1]:
-            return slope - doubt > least
-    return bool(force[0] > _START_FORCE_SHARE * force.max())
+        if doubt < least:
+            break
+    return slope - doubt > least
 
 
 def _start_remark(touch: TouchDown, stated_s: float | None) -> list[Remark]:
