@@ -53,6 +53,7 @@ class Bench:
         self.study = study
         self.covariance = np.array(found["uncertainty"]["covariance_log"])
         self.centre = to_vector(found["stages"][-1]["parameters"], study.tissues)
+        self.off = np.log(to_vector(found["uncertainty"]["most_probable"], study.tissues) / self.centre)
         self.limb = SocketLimb.of(context, "intervals")
         self.socket: Socket = socket_of(study, self.limb.anatomy, self.limb.outer.skin)
         self.mesh: Mesh = self.limb.mesh(context, "intervals", folder, self.socket)[0]
@@ -66,7 +67,8 @@ class Bench:
         limb, started = replace(self.limb, study=study), time.process_time()
         laws = limb.materials(to_parameters(parameters, study.tissues))
         found = limb.don(self.mesh, laws, self.socket, lambda *_: None, known)
-        load = limb.facts(found, self.socket, self.covariance.tolist() if known else None)["loads"][-1]
+        around = (self.covariance, np.zeros_like(self.centre)) if known else None
+        load = limb.facts(found, self.socket, around)["loads"][-1]
         row = {"values": {one["region"]: one["mean_kPa"] for one in load["regions"]}}
         row["values"][SETTLING] = load["settling_mm"]
         row["cpu_s"] = round(time.process_time() - started, 1)
@@ -96,6 +98,7 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
         sample, sd = np.array([draw["values"][name] for draw in draws.values()]), centre["sd"][name]
         linear = np.array([bench.foreseen(centre, name, step) for step in steps])
         first, percent = next(iter(centre["from"][name].items()))
+        probable = bench.foreseen(centre, name, bench.off)
         true = rows["truth"]["values"][name] if "truth" in rows else None
         found.append(
             {
@@ -111,10 +114,16 @@ def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
                 "mostly_from": f"{first} {percent:.0f} %",
                 "liner_c": centre["change"][name].get("liner.c_kPa"),
                 "friction": rows["friction"]["values"][name] - value if "friction" in rows else None,
-                **({"truth": true, "inside": bool(abs(true - value) <= NORMAL_95 * sd)} if true else {}),
+                **({} if true is None else {"truth": true, "inside": _covers(value, probable, sd, true)}),
             }
         )
     return found
+
+
+def _covers(value: float, probable: float, sd: float, true: float) -> bool:
+    """Whether the interval around the simulated and the most probable value holds the true one."""
+    low, high = sorted((value, probable))
+    return bool(low - NORMAL_95 * sd <= true <= high + NORMAL_95 * sd)
 
 
 def _within_widened(sample: np.ndarray, linear: np.ndarray, value: float, sd: float) -> int | None:

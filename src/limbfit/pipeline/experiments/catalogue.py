@@ -129,7 +129,8 @@ _OWN: tuple[Experiment, ...] = (
         needs=("surfaces",),
         tables=("socket", "geometry", "mesh", "material"),
         apart=("socket.design",),
-        options={"parameters": {}, "parameters_from": "", "covariance_log": None, "samples": 0},
+        options={"parameters": {}, "parameters_from": "", "covariance_log": None}
+        | {"most_probable": None, "samples": 0},
     ),
     Experiment(
         "socket_design",

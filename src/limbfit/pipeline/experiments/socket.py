@@ -21,7 +21,7 @@ from ..shared.context import Context
 from ..shared.kept import Begun, Kept
 from ..shared.socket_shape import socket_of
 from .socket_intervals import CHANGE_PERCENT, FRICTION, drawn, tell_change, widen
-from .socket_limb import Covariance, SocketLimb, Wearing, wear_all, worn
+from .socket_limb import SocketLimb, Wearing, wear_all, worn
 
 NAME = "socket"
 
@@ -32,7 +32,8 @@ def run_socket(
     *,
     parameters: Parameters,
     parameters_from: str,
-    covariance_log: Covariance,
+    covariance_log: Sequence[Sequence[float]] | None,
+    most_probable: Parameters | None,
     samples: int,
 ) -> dict[str, Any]:
     """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues.
@@ -40,6 +41,7 @@ def run_socket(
     Parameters
     ----------
     covariance_log : (p, p) that of the parameters' logarithms, where they were identified.
+    most_probable : parameters that intervals cover too; none: those that are simulated.
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
     """
@@ -51,10 +53,14 @@ def run_socket(
     def told(time: float, end: float, words: str) -> None:
         context.tell(NAME, time, end, words)
 
-    known = covariance_log is not None
-    begun = Begun(Kept(folder), limb.key(folder, parameters, socket, known))
-    found = limb.don(mesh, limb.materials(parameters), socket, told, known, begun=begun)
-    content = limb.facts(found, socket, covariance_log) | {
+    covariance = None if covariance_log is None else np.array(covariance_log)
+    begun = Begun(Kept(folder), limb.key(folder, parameters, socket, covariance is not None))
+    found = limb.don(mesh, limb.materials(parameters), socket, told, covariance is not None, begun=begun)
+    known = None
+    if covariance is not None:
+        at, probable = (context.study.vector(one) for one in (parameters, most_probable or parameters))
+        known = covariance, np.log(probable / at)
+    content = limb.facts(found, socket, known) | {
         "parameters": parameters,
         "parameters_from": parameters_from,
         "socket": _shape(limb, socket),
@@ -62,8 +68,8 @@ def run_socket(
         "published": published(limb.faces(mesh, socket)),
         "samples": None,
     }
-    if covariance_log is not None and samples:
-        steps = [drawn(np.array(covariance_log), number) for number in range(samples)]
+    if covariance is not None and samples:
+        steps = [drawn(covariance, number) for number in range(samples)]
         content["samples"] = _sampled(context, folder, (limb, mesh, socket), content, steps)
     write_json(folder / "socket.json", content)
     _write_fields(folder, mesh, found)

@@ -2,7 +2,8 @@
 
 To first order a value with the slopes g by the logarithms of the parameters, whose covariance is C, has the
 variance g'Cg.  The share of a parameter i is what of it would go if that one were known: (C g)_i^2 / C_ii,
-the squared correlation of the two.  Parameters are correlated, so that shares do not add up to one.
+the squared correlation of the two.  Parameters are correlated, so that shares do not add up to one.  The
+simulated parameters fit best, others are most probable: intervals cover both, as those of parameters do.
 
 Contact and large strain are not of first order.  Where parameters drawn from C were simulated too, the mean
 of what g misses of them is added to the value, and its variance to that of the value.
@@ -37,24 +38,26 @@ class Spread:
     names : of its parameters by tissue and key, such as ``skin.c_kPa``; a liner's too.
     identified : (k,) numbers of those that were identified.
     covariance : (k, k) of their logarithms.
+    off : (k,) how far the logarithms of the most probable ones are from those that are simulated.
     """
 
     names: Sequence[str]
     identified: Sequence[int]
     covariance: Array
+    off: Array
 
     @classmethod
-    def of(cls, study: Study, names: Sequence[tuple[str, str]], covariance: Array) -> Spread:
+    def of(cls, study: Study, names: Sequence[tuple[str, str]], covariance: Array, off: Array) -> Spread:
         """For a simulation whose parameters have ``names``, tissue and name, of `Problem.parameter_names`.
 
-        ``covariance`` is that of all of the study's parameters, tissue by tissue.
+        ``covariance`` and ``off`` are those of all of the study's parameters, tissue by tissue.
         """
         laws = dict.fromkeys(study.tissues, study.law)
         own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
         known = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
         order = [list(names).index(name) for name in own if name in names]
         keyed = [f"{region}.{_key(laws.get(region, LAWS[OGDEN]), name)}" for region, name in names]
-        return cls(keyed, order, covariance[np.ix_(known, known)])
+        return cls(keyed, order, covariance[np.ix_(known, known)], off[known])
 
     def told(self, value: float, slopes: Array) -> tuple[list[float], dict[str, float], dict[str, float]]:
         """What is known of a positive value by its slopes (p,) by the logarithms of all parameters.
@@ -74,7 +77,8 @@ class Spread:
         found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-shares)}
         by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
-        return [max(value - half, 0.0), value + half], found, changes
+        ends = sorted((value, value + float(own @ self.off)))
+        return [max(ends[0] - half, 0.0), ends[1] + half], found, changes
 
 
 def _key(law: TissueLaw, name: str) -> str:
@@ -110,14 +114,14 @@ def widen(facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], M
     """
     others = [list(_values(found)) for _, found in draws]
     for i, (row, key, name, unit) in enumerate(_values(facts)):
-        value, (_, high) = row[key], row[f"{name}interval_{unit}"]
+        value, (low, high) = row[key], row[f"{name}interval_{unit}"]
         missed = [
             other[i][0][key] - value - first_order(row, name, unit, step)
             for (step, _), other in zip(draws, others, strict=True)
         ]
         mean, sd = float(np.mean(missed)), float(np.std(missed, ddof=1))
-        half = float(np.hypot(high - value, NORMAL_95 * sd))
-        row[f"{name}interval_{unit}"] = [max(value + mean - half, 0.0), value + mean + half]
+        below, above = (float(np.hypot(end - value, NORMAL_95 * sd)) for end in (low, high))
+        row[f"{name}interval_{unit}"] = [max(value + mean - below, 0.0), value + mean + above]
         row[f"{name}missed_{unit}"] = [mean, sd]
 
 

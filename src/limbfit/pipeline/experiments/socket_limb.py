@@ -51,7 +51,6 @@ from .socket_intervals import Spread, spread_facts
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Covariance = Sequence[Sequence[float]] | None
 
 LINER, MESH = "liner", "limb.vtu"
 BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
@@ -212,12 +211,12 @@ class SocketLimb:
             raise RunError(_stopped(found, fit))
         return found
 
-    def facts(self, found: Donned, socket: Socket, covariance_log: Covariance = None) -> dict[str, Any]:
-        """What is stored of a simulation, with intervals where a covariance (p, p) is given."""
+    def facts(
+        self, found: Donned, socket: Socket, known: tuple[Array, Array] | None = None
+    ) -> dict[str, Any]:
+        """What is stored of a simulation, with intervals where covariance (p, p) and ``off`` (p,) are."""
         fit = self.fit(socket)
-        spread = None
-        if covariance_log is not None:
-            spread = Spread.of(self.study, found.result.parameter_names, np.array(covariance_log))
+        spread = None if known is None else Spread.of(self.study, found.result.parameter_names, *known)
         mesh = found.result.problem.mesh
         faces = self.faces(mesh, socket)
         held = {

@@ -51,10 +51,10 @@ def fit_socket(
         Where the simulation does not come to its end.
     """
     used, origin = (parameters, "given") if parameters else known_tissues(study, literature)
-    covariance = None
+    known: dict[str, Any] = {}
     if origin == IDENTIFIED:
         calibration = Store(study.results).read("calibrate", "calibration.json")
-        covariance = calibration["uncertainty"]["covariance_log"]
+        known = {key: calibration["uncertainty"][key] for key in ("covariance_log", "most_probable")}
     elif samples:
         what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
         raise InputError(what, place="--samples", remedy="identify them (limbfit run)")
@@ -64,8 +64,8 @@ def fit_socket(
         listener=listener,
         parameters=used,
         parameters_from=origin,
-        covariance_log=covariance,
         samples=samples,
+        **known,
     )
 
 
