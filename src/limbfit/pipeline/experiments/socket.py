@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...anatomy.surfaces.surfaces import write_surface
 from ...donning import Donned
-from ...indentation import Parameters, flat_names, to_parameters, to_vector
+from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
 from ...socket.published import published
@@ -90,27 +90,28 @@ def _sampled(
     More friction is simulated beside them, where there is some, and what it changes stored. Told are how many
     draws came to their end, and why others did not.
     """
-    limb, mesh, socket = donned
-    kept, tissues = Kept(folder, also=[context.store[NAME]]), context.study.tissues
-    jobs = []
-    for number, step in enumerate(steps):
-        moved = to_parameters(to_vector(content["parameters"], tissues) * np.exp(step), tissues)
-        key = limb.key(folder, moved, socket)
-        jobs.append(Wearing(f"draw {number + 1}", limb, mesh, limb.materials(moved), socket, kept, key))
+    (limb, mesh, socket), study = donned, context.study
+    kept = Kept(folder, also=[context.store[NAME]])
+
+    def job(name: str, on: SocketLimb, parameters: Parameters) -> Wearing:
+        key = on.key(folder, parameters, socket)
+        return Wearing(name, on, mesh, on.materials(parameters), socket, kept, key)
+
+    simulated, at = content["parameters"], study.vector(content["parameters"])
+    draws = [job(f"draw {n}", limb, study.by_tissue(at * np.exp(step))) for n, step in enumerate(steps, 1)]
     rougher = _rougher(limb)
-    if rougher is not None:
-        key = rougher.key(folder, content["parameters"], socket)
-        laws = limb.materials(content["parameters"])
-        jobs.append(Wearing(FRICTION, rougher, mesh, laws, socket, kept, key))
+    more = [] if rougher is None else [job(FRICTION, rougher, simulated)]
+    jobs = [*draws, *more]
     reasons = wear_all(jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words))
-    names = [f"{tissue}.{key}" for tissue, key in flat_names(tissues)]
+    ended = [None if reason else worn(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
+    for other in filter(None, ended[len(draws) :]):
+        tell_change(content, other, FRICTION)
+    names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     found = [
-        (dict(zip(names, step, strict=True)), worn(job)[0])
-        for step, job, reason in zip(steps, jobs, reasons, strict=False)
-        if not reason
+        (dict(zip(names, step, strict=True)), facts)
+        for step, facts in zip(steps, ended[: len(draws)], strict=True)
+        if facts is not None
     ]
-    if rougher is not None and not reasons[-1]:
-        tell_change(content, worn(jobs[-1])[0], FRICTION)
     if len(found) < 2:  # one says nothing of a spread
         found = []
     else:
