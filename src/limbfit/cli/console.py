@@ -47,7 +47,8 @@ def tell_stored(found: dict[str, Any], show: Callable[[dict[str, Any]], None], a
         print_json(found)
         return
     show(found)
-    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+    shown = f"report: {found['report']}" if "report" in found else "limbfit report shows it"
+    STDOUT.print(f"stored in {found['folder']}; {shown}", soft_wrap=True)
 
 
 @contextmanager

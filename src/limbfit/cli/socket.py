@@ -43,7 +43,7 @@ def fit(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Put a socket on the limb and load it: pressure and shear by region, settling, balance."""
+    """Put a socket on the limb and load it: pressure and shear by region, settling, the report."""
     _check(parameters, literature)
     checked = limbfit.load_study(study)
     with listening() as listener:
@@ -54,6 +54,7 @@ def fit(
             samples=samples or 0,
             listener=listener,
         )
+        found["report"] = limbfit.report_study(checked, listener=listener)["report"]
     tell_stored(found, show_socket, as_json)
 
 
