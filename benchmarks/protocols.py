@@ -127,7 +127,7 @@ def told_of(
             raise SystemExit(f"{take.name} could not be simulated: {one.reason}")
         information = information_of(SiteResponse(one.force_N, one.jacobian), truth, force)
         if take.seen:
-            for lost, slopes in zip(one.observed_mm, one.observed_jacobian, strict=True):
+            for lost, slopes in zip(one.observed, one.observed_jacobian, strict=True):
                 information = information + information_of(SiteResponse(lost, slopes), truth, layers)
         place = take.site, "ball" if take.ball else "punch"
         found[take] = Option(place, take.knots[0][-1] + REST_S, information[None])

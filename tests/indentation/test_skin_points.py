@@ -98,9 +98,9 @@ def test_moves_follow_the_parameters(tmp_path: Path) -> None:
     vector, times = to_vector(TRUTH, TISSUES), tuple(np.linspace(0.2, 5.5, 12))
     found = simulate(SimulationJob(model, TISSUES, tuple(vector), times))
     assert found.completed
-    assert found.observed_mm.shape == (1 + 9, 12)
+    assert found.observed.shape == (1 + 9, 12)
     assert found.observed_jacobian is not None
-    moves = found.observed_mm[1:].reshape(3, 3, 12)
+    moves = found.observed[1:].reshape(3, 3, 12)
     assert np.abs(moves).max() > 0.3
     peak = int(np.argmax(found.force_N))
     assert (moves[:2, 2, peak] < 0.0).all()  # beside the indenter the skin goes down with it
@@ -109,7 +109,7 @@ def test_moves_follow_the_parameters(tmp_path: Path) -> None:
         ends = [
             simulate(SimulationJob(model, TISSUES, tuple(vector + s), times, False)) for s in (step, -step)
         ]
-        slope = (ends[0].observed_mm - ends[1].observed_mm) / (2e-3 * vector[i])
+        slope = (ends[0].observed - ends[1].observed) / (2e-3 * vector[i])
         own = found.observed_jacobian[:, :, i]
         assert own[1:] == pytest.approx(slope[1:], abs=1e-3 * np.abs(slope[1:]).max())
 

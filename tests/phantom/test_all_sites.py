@@ -11,6 +11,7 @@ from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import _ramp, _triple, true_parameters
 from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, TruthMeshJob, site_force, site_mesh
 from limbfit.phantom.geometry import make_limb
+from limbfit.phantom.record import Seen
 from limbfit.phantom.sites import true_sites
 from limbfit.phantom.surfaces import true_anatomy
 
@@ -50,10 +51,13 @@ def test_a_site_shows_what_is_asked_for_and_no_more(phantom):
     mesh = site_mesh(TruthMeshJob("05", folder, at, axis, settings, 45.0))
     steps = replace(made.steps(site.thickness), load_steps=4, unload_steps=3)
     job = ForceJob("05", mesh, at, axis, _ramp(site), steps, true_parameters(0))
-    plain, found = site_force(job), site_force(replace(job, ultrasound=True, surface=True))
+    plain, found = site_force(job), site_force(replace(job, seen=Seen(True, True, True)))
     assert found.force == pytest.approx(plain.force, abs=1e-6 * plain.force.max())
     assert (plain.layers, len(plain.skin_points)) == ({}, 0)
-    assert set(found.layers) == {"skin", "muscle"}
+    assert set(found.layers) == set(found.speeds) == {"skin", "muscle"}
+    for tissue, speed in found.speeds.items():
+        known = job.parameters[tissue]
+        assert speed[0] == pytest.approx(np.sqrt(known["c_kPa"] * (1.0 + known["gamma"])), rel=1e-6)
     for thickness, lost in found.layers.values():
         assert 0.0 < lost.max() < thickness
     peak = int(np.argmax(found.force))

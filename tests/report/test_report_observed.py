@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stored_results import write_results
 
-from limbfit.report.drawing.observed_figures import layer_figure, surface_figure
+from limbfit.report.drawing.observed_figures import layer_figure, surface_figure, wave_figure
 from limbfit.report.sections.sections import fit, prediction
 from limbfit.report.site_tables import observed_table
 from limbfit.report.store import load_store
@@ -21,9 +21,10 @@ SURFACE = {
     "compared": "4 points, 96 values",
     "left_out": {"under the indenter": 3},
     "components": ["x", "y", "z"],
-    "largest_mm": 1.236,
-    "noise_mm": 0.021,
-    "sd_mm": 0.05,
+    "unit": "mm",
+    "largest": 1.236,
+    "noise": 0.021,
+    "sd": 0.05,
     "error_percent": 2.25,
 }
 LAYER = {
@@ -31,22 +32,35 @@ LAYER = {
     "what": "muscle",
     "name": "TI-5+muscle",
     "compared": "81 times",
-    "largest_mm": 3.5,
-    "noise_mm": 0.03,
-    "sd_mm": 0.1,
+    "unit": "mm",
+    "largest": 3.5,
+    "noise": 0.03,
+    "sd": 0.1,
     "thickness_mm": 20.0,
     "error_percent": None,
+}
+WAVE = {
+    "kind": "shear waves",
+    "what": "skin-waves",
+    "name": "TI-5+skin-waves",
+    "compared": "9 times",
+    "unit": "m/s",
+    "largest": 5.31,
+    "noise": 0.12,
+    "sd": 0.1,
+    "bias": 0.1,
+    "error_percent": 1.5,
 }
 
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """A study with a surface at a fitted site, and ultrasound at a held-out one that was not simulated."""
+    """A study with a surface at a fitted site, ultrasound and shear waves at a held-out one."""
     folder = write_results(tmp_path / "results")
     file = folder / "predict" / "predict.json"
     content = json.loads(file.read_text())
     for row in content["sites"]:
-        row["observed"] = {"PT-1": [SURFACE], "TI-5": [LAYER]}.get(row["site"], [])
+        row["observed"] = {"PT-1": [SURFACE], "TI-5": [LAYER, WAVE]}.get(row["site"], [])
     file.write_text(json.dumps(content))
     moves = np.linspace(-1.2, 0.4, 96)
     columns = {
@@ -61,6 +75,9 @@ def results(tmp_path: Path) -> Path:
     times = np.linspace(0.0, 9.0, 81)
     layer = {"time_s": times, "compression_measured_mm": times / 3.0}
     _write(folder / "predict" / "TI-5+muscle.csv", layer)
+    speed = 4.9 + 0.05 * times[::10]
+    wave = {"time_s": times[::10], "speed_measured_m_s": speed, "speed_simulated_m_s": speed + 0.02}
+    _write(folder / "predict" / "TI-5+skin-waves.csv", wave)
     return folder
 
 
@@ -72,8 +89,13 @@ def _write(file: Path, columns: dict[str, np.ndarray]) -> None:
 def test_each_kind_is_drawn_where_it_belongs(results: Path) -> None:
     store = load_store(results)
     surface, layer = surface_figure(store, fitted=True), layer_figure(store, fitted=False)
+    wave = wave_figure(store, fitted=False)
     assert surface is not None
     assert layer is not None
+    assert wave is not None
+    assert wave.name == "waves-held-out"
+    assert "Speed (m/s)" in wave.markup
+    assert wave in prediction(store).blocks
     assert surface.name == "surface-fitted"
     assert "PT-1: 2.2 %" in surface.markup
     assert "TI-5, muscle" in layer.markup
@@ -88,10 +110,12 @@ def test_each_has_a_row_with_what_was_left_out(results: Path) -> None:
     assert table is not None
     told = [[cell.text for cell in row.cells] for row in table.rows]
     assert told[0] == [
-        "PT-1", "surface", "fitted", "4 points, 96 values", "3 under the indenter", "1.24", "0.021", "2.2",
+        "PT-1", "surface", "fitted", "4 points, 96 values", "3 under the indenter",
+        "1.24", "0.021", "mm", "2.2",
     ]  # fmt: skip
     assert told[1][1:5] == ["muscle", "held out", "81 times", "\u2013"]
-    assert [row.marked for row in table.rows] == [True, False]
+    assert told[2][5:] == ["5.31", "0.120", "m/s", "1.5"]
+    assert [row.marked for row in table.rows] == [True, False, False]
 
 
 def test_a_study_of_forces_alone_shows_nothing_of_it(tmp_path: Path) -> None:

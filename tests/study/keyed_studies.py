@@ -17,7 +17,7 @@ from limbfit.pipeline.shared.keys import Keys
 from limbfit.pipeline.verbs.run import keys
 from limbfit.study import Study, load_study
 
-SEEN = {"ultrasound": "3.csv", "surface": "3.csv"}
+SEEN = {"ultrasound": "3.csv", "surface": "3.csv", "shear_waves": "3.csv"}
 # Studies in which each key acts: the second is for those that an image, layers or markers rule out.
 IMAGED: dict[str, Any] = {
     "study": {"name": "one"},
@@ -115,11 +115,17 @@ ACTS: dict[str, tuple[str, Any]] = {
     "sites.0.surface": ("traces", "2.csv"),
     "sites.0.surface_sd_mm": ("traces", 0.2),
     "sites.0.surface_frame": ("traces", "site"),
+    "sites.0.shear_waves": ("traces", "2.csv"),
+    "sites.0.shear_waves_sd_m_s": ("traces", 0.2),
+    "sites.0.shear_waves_bias_m_s": ("traces", 0.2),
     "records.0.ultrasound": ("traces", "1.csv"),
     "records.0.ultrasound_sd_mm": ("traces", 0.2),
     "records.0.surface": ("traces", "1.csv"),
     "records.0.surface_sd_mm": ("traces", 0.2),
     "records.0.surface_frame": ("traces", "site"),
+    "records.0.shear_waves": ("traces", "1.csv"),
+    "records.0.shear_waves_sd_m_s": ("traces", 0.2),
+    "records.0.shear_waves_bias_m_s": ("traces", 0.2),
     "traces.time_s": ("traces", "t"),
     "traces.displacement_mm": ("traces", "d"),
     "traces.force_N": ("traces", "F"),

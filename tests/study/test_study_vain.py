@@ -163,6 +163,8 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),
     (GIVEN, {"sites.0.surface_sd_mm": 0.2}, "sites.surface_sd_mm"),
     (GIVEN, {"sites.0.surface_frame": "site"}, "sites.surface_frame"),
+    (GIVEN, {"sites.0.shear_waves_sd_m_s": 0.2}, "sites.shear_waves_sd_m_s"),
+    (GIVEN, {"sites.0.shear_waves_bias_m_s": 0.2}, "sites.shear_waves_bias_m_s"),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
     (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),

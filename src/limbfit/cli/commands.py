@@ -72,6 +72,9 @@ def phantom(
     surface: Annotated[
         bool, typer.Option("--surface", help="also how the skin around the indenter moves")
     ] = False,
+    shear_waves: Annotated[
+        bool, typer.Option("--shear-waves", help="also how fast shear waves are under the indenter")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
@@ -84,6 +87,7 @@ def phantom(
             socket=socket,
             ultrasound=ultrasound,
             surface=surface,
+            shear_waves=shear_waves,
             tendon=tendon,
             listener=listener,
         )

@@ -89,6 +89,13 @@ def design(
         float | None,
         typer.Option(help="with --protocol: cameras read the skin with this deviation, mm", min=1e-3),
     ] = None,
+    shear_waves: Annotated[
+        float | None,
+        typer.Option(
+            help="with --protocol: elastography reads shear-wave speeds with this deviation, m/s",
+            min=1e-3,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.
@@ -112,6 +119,7 @@ def design(
                 draws=draws,
                 ultrasound_sd_mm=ultrasound,
                 surface_sd_mm=surface,
+                shear_waves_sd_m_s=shear_waves,
                 parameters=used,
                 listener=listener,
             )

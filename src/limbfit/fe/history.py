@@ -14,7 +14,7 @@ from .kernel.response import elastic_response, elastic_stress
 from .lanes import LANES, workspace
 from .materials import prony_factors
 from .motion import Drives
-from .system import Increment, System
+from .system import Increment, Points, System
 
 Array = NDArray[np.float64]
 
@@ -37,8 +37,8 @@ class Memory:
     duration: float = np.inf
 
     @classmethod
-    def rest(cls, system: System, laws: Laws) -> Memory:
-        shape = (*system.weights.shape, 6)
+    def rest(cls, points: Points, laws: Laws) -> Memory:
+        shape = (*points.weights.shape, 6)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
 
     def turned(self) -> Memory:
@@ -46,13 +46,13 @@ class Memory:
         return Memory(self.elastic, self.prony)
 
     def increment(
-        self, system: System, laws: Laws, time: float, dt: float, displacement: float, penalty: float,
+        self, points: Points, laws: Laws, time: float, dt: float, displacement: float, penalty: float,
         drives: Drives,
     ) -> Increment:  # fmt: skip
         """The step of ``dt`` s that ends at ``time``."""
         decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
         gamma = laws.prony[..., 0]
-        of = system.regions
+        of = points.regions
         K = ((gamma * (back - ramp)).sum(axis=1))[of][:, None, None] * self.elastic
         if self.before is not None:
             K -= ((gamma * back).sum(axis=1))[of][:, None, None] * self.before
@@ -61,10 +61,10 @@ class Memory:
         scale = 1.0 + (gamma * ramp).sum(axis=1)
         return Increment(time, displacement, scale, K, penalty, drives)
 
-    def advanced(self, system: System, laws: Laws, elastic: Array, dt: float) -> Memory:
+    def advanced(self, points: Points, laws: Laws, elastic: Array, dt: float) -> Memory:
         """The memory at the end of a step of ``dt`` s that ended with the elastic stress ``elastic``."""
         decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
-        of = system.regions
+        of = points.regions
         prony = np.empty_like(self.prony)
         for l in range(len(prony)):
             prony[l] = decay[of, l][:, None, None] * self.prony[l]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,18 @@ class Evaluation:
         if self.data is None:
             raise ValueError("the tangent was not evaluated")
         return self.data
+
+
+class Points(Protocol):
+    """Points with a history of their own: the quadrature points of a `System`, or places elsewhere."""
+
+    @property
+    def weights(self) -> Array:
+        """(m, q) of q points in each of m elements, mm^3."""
+
+    @property
+    def regions(self) -> NDArray[np.int32]:
+        """(m,) of the elements."""
 
 
 class System:

@@ -4,7 +4,15 @@ from ..laws import Parameters, flat_names, to_parameters, to_vector
 from .clamps import clamped, clamping_pins
 from .fibres import Direction, fibre_field
 from .neighbourhood import Extension, neighbourhood
-from .observing import OFF_SKIN_MM, is_under, layers_under, observed, points_around, skin_beside
+from .observing import (
+    OFF_SKIN_MM,
+    is_under,
+    layers_under,
+    observed,
+    points_around,
+    skin_beside,
+    waves_under,
+)
 from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
 from .sites import (
     Array,
@@ -16,6 +24,7 @@ from .sites import (
     steps_of,
 )
 from .skin_points import nearest_points, skin_points
+from .waves import WavePlace
 
 __all__ = [
     "OFF_SKIN_MM",
@@ -26,6 +35,7 @@ __all__ = [
     "Simulation",
     "SimulationJob",
     "SiteModel",
+    "WavePlace",
     "build_problem",
     "clamped",
     "clamping_pins",
@@ -49,4 +59,5 @@ __all__ = [
     "steps_of",
     "to_parameters",
     "to_vector",
+    "waves_under",
 ]

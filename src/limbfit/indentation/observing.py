@@ -1,11 +1,13 @@
-"""What is seen of a limb beside the force: layers that become thinner, points of the skin that move.
+"""What is seen of a limb beside the force: layers that become thinner, skin that moves, waves.
 
 Ultrasound through the indenter sees the interfaces between tissues on its axis, cameras see the skin around
 it. Both are followed as material points (`mesh.gauges`, `skin_points`). Their displacement is that of
-the steps, and so are its derivatives, exact as those of the force are.
+the steps, and so are its derivatives, exact as those of the force are. Speeds follow from both (`waves`).
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from ..mesh import Gauge, Mesh, gauges_along, read_vtu
 from ..study import Vector
 from .sites import SiteModel, read_indenter
 from .skin_points import skin_points
+from .waves import WavePlace, wave_places, wave_speeds
 
 Array = NDArray[np.float64]
 OFF_SKIN_MM = 5.0  # farther from the skin than that is no point of it
@@ -94,6 +97,20 @@ def layers_under(model: SiteModel) -> tuple[str, ...]:
     return tuple(one.region for one in found)
 
 
+def waves_under(
+    model: SiteModel, mesh: Mesh, wanted: Sequence[tuple[str, float | None]] | None = None
+) -> tuple[WavePlace, ...]:
+    """Places of shear waves under a site's indenter, which run along its edge; see `wave_places`.
+
+    None ``wanted``: the middle of every tissue.
+    """
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
+    position, axis = np.array(model.position), np.asarray(indenter.frame[2])
+    if wanted is None:
+        wanted = [(one.region, None) for one in gauges_along(mesh, position, axis)]
+    return wave_places(mesh, position, axis, indenter.frame[0], wanted)
+
+
 def skin_beside(model: SiteModel) -> tuple[Vector, ...]:
     """`points_around` a site's indenter on its stored mesh."""
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
@@ -101,32 +118,49 @@ def skin_beside(model: SiteModel) -> tuple[Vector, ...]:
 
 
 def observed(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:
-    """What the model's gauges read at times (n,) s from touch-down, mm, counted from there: (g, n).
+    """What is seen at times (n,) s from touch-down, in the order of `Simulation.observed`: (g, n).
 
-    And its derivatives (g, n, p) with respect to the solver's parameters, where the states have some. The
-    result must hold all of its states (``store="all"``). Tissue that the indenter has left comes back by and
-    by, so readings go on where the force has ended.
+    Lengths, mm, count from touch-down. And derivatives (g, n, p) with respect to the solver's parameters,
+    where the states have some. The result must hold all of its states (``store="all"``). Tissue that the
+    indenter has left comes back by and by, so readings go on where the force has ended.
     """
     states = result.states
     gauges = gauges_of(model, result.problem.mesh)
-    steps = slice(len(states) + 1)
+    if not states:
+        return np.zeros((model.gauges, len(times_s))), None
+    values, slopes = _at_states(result, model.waves, [gauge.read for gauge in gauges])
+    since_touch = np.arange(len(values)) < len(gauges)
     at = np.clip(np.append(model.waits_s, times_s), result.times[0], result.times[-1])
 
-    def between(values: list[Array]) -> Array:
-        """Values (g, ...) of the states at the wanted times less those at touch-down, (g, n, ...)."""
-        column = np.array([np.zeros_like(values[0]), *values])
-        kinks = result.problem.history.kinks
-        everywhere = np.ones(len(column))
-        found = np.moveaxis(interpolate(result.times[steps], everywhere, kinks, column, at), 0, 1)
-        return found[:, 1:] - found[:, :1]
+    def between(of_states: Array) -> Array:
+        """What is (g, s, ...) in the states at the wanted times, (g, n, ...); lengths since touch-down."""
+        kinks, steps = result.problem.history.kinks, result.times[: of_states.shape[1]]
+        column = np.moveaxis(of_states, 1, 0)
+        found = np.moveaxis(interpolate(steps, np.ones(len(steps)), kinks, column, at), 0, 1)
+        found[since_touch] -= found[since_touch, :1]
+        return np.asarray(found[:, 1:])
 
-    def read(field: Array) -> Array:
-        """What all gauges say of a nodal field (nodes, 3, ...)."""
-        return np.array([gauge.read(field) for gauge in gauges])
+    return between(values), None if slopes is None else between(slopes)
 
-    if not states:
-        return np.zeros((len(gauges), len(times_s))), None
-    moved = between([read(state.u) for state in states])
-    if states[0].sensitivity is None:
-        return moved, None
-    return moved, between([read(np.asarray(state.sensitivity)) for state in states])
+
+def _at_states(
+    result: Result, waves: Sequence[WavePlace], reads: Sequence[Callable[[Array], Array]]
+) -> tuple[Array, Array | None]:
+    """What gauges ``read`` and how fast waves are, at rest and in every state, and derivatives."""
+    states, values, slopes = result.states, [], []
+    if reads:
+        values.append(_since_rest([[read(state.u) for state in states] for read in reads]))
+        if states[0].sensitivity is not None:
+            fields = [np.asarray(state.sensitivity) for state in states]
+            slopes.append(_since_rest([[read(field) for field in fields] for read in reads]))
+    if waves:
+        speeds, of_speeds = wave_speeds(result, waves)
+        values.append(speeds)
+        slopes += [] if of_speeds is None else [of_speeds]
+    return np.concatenate(values), np.concatenate(slopes) if slopes else None
+
+
+def _since_rest(rows: Sequence[Sequence[Array]]) -> Array:
+    """What is (g, s, ...) in the states, with nothing at rest before: (g, s + 1, ...)."""
+    found = np.array(rows)
+    return np.concatenate([np.zeros_like(found[:, :1]), found], axis=1)

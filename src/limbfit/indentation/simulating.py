@@ -73,9 +73,9 @@ class Simulation:
     Where a force drives the indenter, ``force_N`` is what answers to it: the displacement, mm.
 
     Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
-    ``observed_mm`` (g, n) is what else is seen, in rows: the thickness that each of the model's layers has
-    lost, then the moves of each of its points of the skin along the model's axes. ``observed_jacobian``
-    (g, n, p) are its derivatives.
+    ``observed`` (g, n) is what else is seen, in rows: the thickness that each of the model's layers has lost,
+    then the moves of each of its points of the skin along the model's axes, mm, and the speeds of its shear
+    waves, m/s. ``observed_jacobian`` (g, n, p) are its derivatives.
     """
 
     site: str
@@ -86,7 +86,7 @@ class Simulation:
     penetration_mm: float
     facts: dict[str, Any]
     doubts: tuple[Doubt, ...] = ()
-    observed_mm: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    observed: Array = field(default_factory=lambda: np.zeros((0, 0)))
     observed_jacobian: Array | None = None
 
     @property
@@ -272,7 +272,7 @@ def simulate(job: SimulationJob) -> Simulation:
         penetration_mm=float(result.penetration.max(initial=0.0)),
         facts=dict(result.statistics),
         doubts=result.doubts,
-        observed_mm=seen,
+        observed=seen,
         observed_jacobian=None if slopes is None else _in_user_units(result, job, slopes),
     )
 

@@ -37,6 +37,7 @@ from .clamps import clamped
 from .fibres import Direction, fibre_field
 from .neighbourhood import held_cut, neighbourhood
 from .prestretch import prestretch_field
+from .waves import WavePlace
 
 Array = NDArray[np.float64]
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
@@ -78,6 +79,7 @@ class SiteModel:
     layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
     skin_points: tuple[Vector, ...] = ()  # points of the skin at rest, LPS mm, whose moves are, too
     skin_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # of moves
+    waves: tuple[WavePlace, ...] = ()  # where the speeds of shear waves are
     clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
     along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally, across which the clamps are
     course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
@@ -91,7 +93,7 @@ class SiteModel:
     @property
     def gauges(self) -> int:
         """How many numbers are wanted of every moment beside the force."""
-        return len(self.layers) + len(self.skin_axes) * len(self.skin_points)
+        return len(self.layers) + len(self.skin_axes) * len(self.skin_points) + len(self.waves)
 
     @property
     def waits_s(self) -> float:

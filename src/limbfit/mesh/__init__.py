@@ -2,6 +2,7 @@
 
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
 from .gauges import Gauge, LayerGauge, gauges_along
+from .locating import locate
 from .measures import MeshQuality, dihedral_angles, quality
 from .volume import (
     Mesh,
@@ -28,6 +29,7 @@ __all__ = [
     "check",
     "dihedral_angles",
     "gauges_along",
+    "locate",
     "node_jacobians",
     "quality",
     "read_grid",

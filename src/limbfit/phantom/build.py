@@ -31,7 +31,7 @@ from .forces import DISCRETISATIONS, ForceJob, TrueForce, TruthMeshJob, site_for
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
-from .record import Ramp, record, write_surface, write_ultrasound
+from .record import Ramp, Seen, record, write_surface, write_ultrasound, write_waves
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
 from .socket import STUDY as SOCKET_STUDY
 from .socket import write_socket
@@ -83,6 +83,7 @@ def make_phantom(
     socket: bool = False,
     ultrasound: bool = False,
     surface: bool = False,
+    shear_waves: bool = False,
     tendon: bool = False,
     mapping: Mapping = map,
     progress: Listener | None = None,
@@ -99,6 +100,7 @@ def make_phantom(
     socket : also a rectified socket for the limb with a liner, as a file that the study names.
     ultrasound : beside each record what ultrasound through the indenter saw, to 0.1 mm at 20 Hz.
     surface : beside each record how the skin around the indenter moved, to 0.05 mm at 5 Hz.
+    shear_waves : beside each record the speeds of shear waves under the indenter, to 0.1 m/s at 1 Hz.
     tendon : also a patellar tendon, a stiffer region of the muscle, in a label map that the study names.
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
@@ -119,16 +121,15 @@ def make_phantom(
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
     limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon)
+    seen = Seen(ultrasound, surface, shear_waves)
     parameters = true_parameters(seed, fat, tendon)
     everywhere = true_sites(limb, seed)
     indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
     with _appearing(folder) as work:
         _write_images(work, limb, everywhere, detail, seed, tell)
         truth = _truth(limb, everywhere, detail, seed, parameters)
-        truth["sites"] = _write_traces(
-            work, limb, indented, detail, seed, parameters, mapping, tell, ultrasound, surface
-        )
-        text = study_text(indented, detail, seed, limb, ultrasound, surface)
+        truth["sites"] = _write_traces(work, limb, indented, detail, seed, parameters, mapping, tell, seen)
+        text = study_text(indented, detail, seed, limb, seen)
         if socket:
             truth["socket"] = write_socket(work, limb)
             text += SOCKET_STUDY
@@ -184,8 +185,7 @@ def _write_traces(
     parameters: Parameters,
     mapping: Mapping,
     tell: Listener,
-    ultrasound: bool,
-    surface: bool,
+    seen: Seen,
 ) -> list[dict[str, Any]]:
     """Simulate and record every site; what is true of each, for ``truth.json``."""
     truth, traces = work / "truth", work / "traces"
@@ -200,7 +200,7 @@ def _write_traces(
     tell("meshes", 0, len(wanted))
     for (name, at, axis), site, mesh in zip(places, indented, mapping(site_mesh, wanted), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters, ultrasound, surface))
+        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters, seen))
         tell("meshes", len(jobs), len(wanted))
     tell("forces", 0, len(jobs))
     told = []
@@ -231,6 +231,16 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
             found.skin_points,
             lambda t: interp1d(found.times, found.skin_moves)(np.minimum(t, found.times[-1])),
             np.random.default_rng([seed, 12, int(site.name)]),
+        )
+    if found.speeds:
+        write_waves(
+            traces / f"site-{site.name}-waves.csv",
+            made,
+            {
+                tissue: lambda t, speed=speed: np.interp(t, found.times, speed)  # type: ignore[misc]
+                for tissue, speed in found.speeds.items()
+            },
+            np.random.default_rng([seed, 13, int(site.name)]),
         )
     return {
         **_site_facts(site),

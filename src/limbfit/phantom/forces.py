@@ -27,10 +27,11 @@ from ..indentation import (
     observed,
     points_around,
     read_indenter,
+    waves_under,
 )
 from ..mesh import Mesh, gauges_along
 from ..study import IndenterTable
-from .record import Ramp
+from .record import NOTHING, Ramp, Seen
 from .sites import INDENTER_EDGE_MM, INDENTER_MM
 
 ELEMENT = "tet10g8p0"
@@ -101,8 +102,7 @@ class ForceJob:
     ramp: Ramp
     steps: StepControl
     parameters: Parameters
-    ultrasound: bool = False
-    surface: bool = False
+    seen: Seen = NOTHING
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class TrueForce:
 
     ``layers``: of each tissue on the axis its thickness at rest, mm, and its compression (n,) mm, where
     ultrasound was wanted. ``skin_points`` (k, 3) mm around the indenter and their ``skin_moves`` (k, 3, n),
-    mm, where cameras were.
+    mm, where cameras were. ``speeds`` (n,) m/s of shear waves in each tissue on the axis.
     """
 
     site: str
@@ -121,6 +121,7 @@ class TrueForce:
     layers: dict[str, tuple[float, NDArray[np.float64]]] = field(default_factory=dict)
     skin_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     skin_moves: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 0)))
+    speeds: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 @lru_cache(maxsize=1)
@@ -158,7 +159,7 @@ def site_force(job: ForceJob) -> TrueForce:
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
     problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
-    result = solve(problem, steps=job.steps, store="all" if job.ultrasound or job.surface else "peak")
+    result = solve(problem, steps=job.steps, store="all" if any(job.seen) else "peak")
     if not result.completed:
         raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
     times = np.linspace(0.0, knots_s[-1], 401)
@@ -170,16 +171,20 @@ def site_force(job: ForceJob) -> TrueForce:
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
     found = TrueForce(job.site, times, result.force_at(times), facts)
-    if not (job.ultrasound or job.surface):
+    if not any(job.seen):
         return found
-    gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.ultrasound else ()
+    gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.seen.ultrasound else ()
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    around = points_around(job.mesh, indenter) if job.surface else np.zeros((0, 3))
+    around = points_around(job.mesh, indenter) if job.seen.surface else np.zeros((0, 3))
+    waves = waves_under(model, job.mesh) if job.seen.shear_waves else ()
     layers = tuple(gauge.region for gauge in gauges)
-    seen, _ = observed(result, replace(model, layers=layers, skin_points=tuple(map(tuple, around))), times)
+    model = replace(model, layers=layers, skin_points=tuple(map(tuple, around)), waves=waves)
+    values, _ = observed(result, model, times)
+    of_layers, of_skin, of_waves = np.split(values, [len(layers), len(values) - len(waves)])
     return replace(
         found,
-        layers={one.region: (one.thickness_mm, row) for one, row in zip(gauges, seen)},
+        layers={one.region: (one.thickness_mm, row) for one, row in zip(gauges, of_layers)},
         skin_points=around,
-        skin_moves=seen[len(layers) :].reshape(len(around), 3, len(times)),
+        skin_moves=of_skin.reshape(len(around), 3, len(times)),
+        speeds={one.tissue: row for one, row in zip(waves, of_waves)},
     )

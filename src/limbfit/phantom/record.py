@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,20 @@ CLEARANCE_MM = (0.3, 0.6)
 FORCE_NOISE_N = (0.03, 0.05)
 ULTRASOUND_HZ, ULTRASOUND_NOISE_MM = 20.0, 0.1
 SURFACE_HZ, SURFACE_NOISE_MM = 5.0, 0.05
+WAVES_HZ, WAVES_NOISE_M_S, WAVES_BIAS_M_S = 1.0, 0.1, 0.1
 DISPLACEMENT_NOISE_MM = 0.005
 HEADER = "time_s,displacement_mm,force_N"
+
+
+class Seen(NamedTuple):
+    """What is seen of an indentation beside its force."""
+
+    ultrasound: bool = False
+    surface: bool = False
+    shear_waves: bool = False
+
+
+NOTHING = Seen()
 
 
 @dataclass(frozen=True)
@@ -140,3 +153,27 @@ def write_surface(
     frames = [np.column_stack([np.full(len(points), t), points, moved[..., i]]) for i, t in enumerate(time)]
     header = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
     np.savetxt(path, np.concatenate(frames), fmt="%.3f", delimiter=",", header=header, comments="")
+
+
+def write_waves(
+    path: Path,
+    made: RobotRecord,
+    speeds: Mapping[str, Callable[[Array], Array]],
+    random: np.random.Generator,
+) -> None:
+    """Write what elastography through the indenter read of a record: speeds of shear waves, m/s, at 1 Hz.
+
+    All of a tissue's readings are off together, and each by itself.
+
+    Parameters
+    ----------
+    speeds : by tissue the speed, m/s, at times (n,) from touch-down.
+    """
+    time = np.arange(0.0, made.time[-1], 1 / WAVES_HZ)
+    since = np.maximum(time - made.touch_s, 0.0)
+    columns = [time]
+    for speed in speeds.values():
+        off = WAVES_BIAS_M_S * random.standard_normal() + WAVES_NOISE_M_S * random.standard_normal(time.size)
+        columns.append(speed(since) + off)
+    header = ",".join(["time_s", *(f"{tissue}_m_s" for tissue in speeds)])
+    np.savetxt(path, np.column_stack(columns), fmt="%.3f", delimiter=",", header=header, comments="")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from ..anatomy.meshing.layers import LayerSpec
 from .geometry import TENDON, Limb
 from .labels import FILE, TENDON_LABEL
+from .record import NOTHING, Seen
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 _HEAD = """\
@@ -76,6 +77,9 @@ near = [{x:.1f}, {y:.1f}, {z:.1f}]
 _ULTRASOUND = """\
 ultrasound = "traces/site-{name}-layers.csv"   # thickness of the tissues under the indenter meanwhile
 """
+_WAVES = """\
+shear_waves = "traces/site-{name}-waves.csv"   # how fast shear waves were under the indenter meanwhile
+"""
 _SURFACE = """\
 surface = "traces/site-{name}-surface.csv"     # how the skin around the indenter moved meanwhile
 """
@@ -86,8 +90,7 @@ def study_text(
     detail: str,
     seed: int,
     limb: Limb,
-    ultrasound: bool = False,
-    surface: bool = False,
+    seen: Seen = NOTHING,
 ) -> str:
     """The content of ``study.toml`` for some sites of a limb."""
     head = _HEAD.format(
@@ -107,10 +110,8 @@ def study_text(
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
-        if ultrasound:
-            parts.append(_ULTRASOUND.format(name=site.name))
-        if surface:
-            parts.append(_SURFACE.format(name=site.name))
+        for one, line in zip(seen, (_ULTRASOUND, _SURFACE, _WAVES), strict=True):
+            parts += [line.format(name=site.name)] if one else []
     return "".join(parts)
 
 

@@ -109,10 +109,11 @@ def observed_table(store: Results) -> Table | None:
     if not rows:
         return None
     caption = (
-        "What was seen beside the force: compression of tissues by ultrasound through the indenter, "
-        "displacement of the skin around it. Errors are mean absolute ones in percent of the largest value."
+        "What was seen beside the force: compression of tissues by ultrasound through the indenter (mm), "
+        "displacement of the skin around it (mm), speeds of shear waves under it (m/s). Errors are mean "
+        "absolute ones in percent of the largest value."
     )
-    head = ("Record", "Seen", "Use", "Compared", "Left out", "Largest (mm)", "Noise (mm)", "Error (%)")
+    head = ("Record", "Seen", "Use", "Compared", "Left out", "Largest", "Noise", "Unit", "Error (%)")
     return Table("observed", caption, head, rows)
 
 
@@ -125,8 +126,9 @@ def _observed_row(row: Json, one: Json) -> Row:
             Cell("fitted" if row.get("fitted") else "held out"),
             Cell(str(one["compared"])),
             Cell(left_out or NOTHING),
-            numeric(fixed(one["largest_mm"], 2)),
-            numeric(fixed(one["noise_mm"], 3)),
+            numeric(fixed(one["largest"], 2)),
+            numeric(fixed(one["noise"], 3)),
+            Cell(str(one["unit"])),
             numeric(fixed(one["error_percent"])),
         ),
         marked=bool(row.get("fitted")),

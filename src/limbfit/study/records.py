@@ -12,7 +12,7 @@ from .tables import Positive, TomlTable, Vector
 
 Control = Literal["displacement", "force"]
 Frame = Literal["limb", "site"]
-RECORDED = ("trace", "ultrasound", "surface")  # files of a record
+RECORDED = ("trace", "ultrasound", "surface", "shear_waves")  # files of a record
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
@@ -24,7 +24,9 @@ class _Stated(TomlTable):
     stated to the machine, and drives the model; the other is compared. ``ultrasound`` is a file of what
     ultrasound through the indenter saw meanwhile: the thickness of tissues, read to ``ultrasound_sd_mm``.
     ``surface`` is one of how the skin around the indenter moved, to ``surface_sd_mm``; positions and
-    displacements in ``surface_frame``: that of the limb, or of the site's indenter.
+    displacements in ``surface_frame``: that of the limb, or of the site's indenter. ``shear_waves`` is one of
+    the speeds of shear waves under the indenter, each read to ``shear_waves_sd_m_s``, and all of a place off
+    together by ``shear_waves_bias_m_s``.
     """
 
     name: str = Field(pattern=_NAME)
@@ -38,6 +40,9 @@ class _Stated(TomlTable):
     surface: Path | None = None
     surface_sd_mm: Positive = 0.05
     surface_frame: Frame = "limb"
+    shear_waves: Path | None = None
+    shear_waves_sd_m_s: Positive = 0.1
+    shear_waves_bias_m_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
 
     @model_validator(mode="after")
     def _in_order(self) -> _Stated:
@@ -69,7 +74,7 @@ class Site(_Stated):
     def _one_place(self) -> Site:
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
-        for key in ("touch_down_s", "peak_s", "ultrasound", "surface"):
+        for key in ("touch_down_s", "peak_s", "ultrasound", "surface", "shear_waves"):
             if self.trace is None and getattr(self, key) is not None:
                 raise ValueError(f"{key} belongs to a record, and the site has no trace")
         return self
@@ -120,16 +125,20 @@ class Record:
     surface: Path | None = None
     surface_sd_mm: float = 0.05
     surface_frame: Frame = "limb"
+    shear_waves: Path | None = None
+    shear_waves_sd_m_s: float = 0.1
+    shear_waves_bias_m_s: float = 0.1
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What was recorded: the trace, and what ultrasound and cameras saw meanwhile."""
+        """What was recorded: the trace, and what was seen meanwhile."""
         return tuple(file for key in RECORDED if (file := getattr(self, key)) is not None)
 
     @property
     def observed(self) -> str:
         """What there is beside the force, in a word; empty where there is nothing."""
-        return "ultrasound" if self.ultrasound else "surface displacement" if self.surface else ""
+        kinds = {"ultrasound": "ultrasound", "surface": "surface displacement", "shear_waves": "shear waves"}
+        return next((word for key, word in kinds.items() if getattr(self, key) is not None), "")
 
     @property
     def forced(self) -> bool:
@@ -185,6 +194,9 @@ def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...
                 surface=one.surface,
                 surface_sd_mm=one.surface_sd_mm,
                 surface_frame=one.surface_frame,
+                shear_waves=one.shear_waves,
+                shear_waves_sd_m_s=one.shear_waves_sd_m_s,
+                shear_waves_bias_m_s=one.shear_waves_bias_m_s,
             )
             if isinstance(one, RecordTable):
                 depth, speed, hold = one.depth_mm, one.speed_mm_s, one.hold_s

@@ -48,6 +48,7 @@ def _is_one_file(study: Study) -> bool:
 
 
 _OWN_LABELS = "the study's own labels win over the automatic segmentation"
+_NO_WAVES = "the site has no shear waves"
 _NO_BONES = "[surfaces] has no bones"
 _ONE_LENGTH = "edge_far_mm is no longer than edge_near_mm, so edges have one length"
 _AUTOMATIC = ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
@@ -227,6 +228,10 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
     VainOfSite("ultrasound_sd_mm", lambda s, site: site.ultrasound is None, "the site has no ultrasound"),
     VainOfSite("surface_sd_mm", lambda s, site: site.surface is None, "the site has no surface"),
     VainOfSite("surface_frame", lambda s, site: site.surface is None, "the site has no surface"),
+    VainOfSite("shear_waves_sd_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES),
+    VainOfSite(
+        "shear_waves_bias_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES
+    ),
     VainOfSite(
         "indenter",
         lambda s, site: site.trace is None and bool(s.records_at(site)),
@@ -237,7 +242,9 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
         "edge",
         lambda s, site: (
             all(SHAPES[one.shape].is_round for one in s.indenters_at(site))
-            and not any(one.surface and one.surface_frame == "site" for one in s.records_at(site))
+            and not any(
+                one.shear_waves or (one.surface and one.surface_frame == "site") for one in s.records_at(site)
+            )
         ),
         "the indenter is round",
     ),

@@ -6,8 +6,8 @@ or refuses it, ``find_touch_down`` tells where the skin was met, and ``regularis
 there: piecewise straight for the displacement, a cubic smoothing spline for the force, each phase by itself
 so that the peak is not smoothed away (paper, section 2.1 and figure 3). Under a stated force it is the other
 way round (``regularise_creep``). Where ultrasound looked through the indenter, ``thinnings`` tell how the
-tissues under it gave way; where cameras looked beside it, ``read_surface_motion`` tells how the skin there
-moved.
+tissues under it gave way, and ``read_wave_speeds`` how fast shear waves ran in them; where cameras looked
+beside it, ``read_surface_motion`` tells how the skin there moved.
 
 Units: s, mm, N; force positive when pushing, displacement positive into the limb.
 """
@@ -20,6 +20,7 @@ from .regularise import Regularised, regularise
 from .surface import SurfaceMeans, SurfaceMotion, in_contact, read_surface_motion
 from .touchdown import TouchDown, find_touch_down, touch_down_at
 from .understanding import Remark, Understood, understand
+from .waves import WaveMeans, WaveSpeeds, read_wave_speeds
 
 __all__ = [
     "COLUMNS",
@@ -33,12 +34,15 @@ __all__ = [
     "TouchDown",
     "Trace",
     "Understood",
+    "WaveMeans",
+    "WaveSpeeds",
     "check_trace",
     "find_touch_down",
     "in_contact",
     "read_layers",
     "read_surface_motion",
     "read_trace",
+    "read_wave_speeds",
     "regularise",
     "regularise_creep",
     "thinnings",

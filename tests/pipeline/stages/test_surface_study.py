@@ -94,7 +94,7 @@ def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
         found = simulate(job)
         made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
         made.write(study.path(Path("a.csv")))
-        moves = interp1d(times, found.observed_mm.reshape(len(points), 3, -1))
+        moves = interp1d(times, found.observed.reshape(len(points), 3, -1))
         if study.recorded[0].surface_frame == "site":
             points = points @ FRAME.T
             write_surface(

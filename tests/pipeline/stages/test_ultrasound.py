@@ -75,18 +75,18 @@ def test_compressions_follow_the_parameters(tmp_path: Path) -> None:
     tissues, vector = layered.TISSUES, to_vector(layered.TRUTH, layered.TISSUES)
     times = tuple(np.linspace(0.2, 3.5, 12))
     found = simulate(SimulationJob(model, tissues, tuple(vector), times))
-    assert found.observed_mm.shape == (3, 12)
+    assert found.observed.shape == (3, 12)
     assert found.observed_jacobian is not None
     depth = np.interp(times, model.knots_s, model.knots_mm)
     loading = np.array(times) < 2.0
-    assert found.observed_mm.sum(axis=0)[loading] == pytest.approx(depth[loading], rel=0.08)
-    assert (found.observed_mm[0] > 0.0).any()
+    assert found.observed.sum(axis=0)[loading] == pytest.approx(depth[loading], rel=0.08)
+    assert (found.observed[0] > 0.0).any()
     for i in (0, 4, 9):  # the skin's and the fat's modulus, the muscle's exponent
         step = 1e-3 * vector[i] * np.eye(len(vector))[i]
         ends = [
             simulate(SimulationJob(model, tissues, tuple(vector + s), times, False)) for s in (step, -step)
         ]
-        slope = (ends[0].observed_mm - ends[1].observed_mm) / (2e-3 * vector[i])
+        slope = (ends[0].observed - ends[1].observed) / (2e-3 * vector[i])
         assert found.observed_jacobian[:, :, i] == pytest.approx(slope, abs=5e-3 * np.abs(slope).max())
 
 
@@ -180,7 +180,7 @@ def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
         made.write(study.path(Path("a.csv")))
         layers = {
             tissue: (thick, lambda t, lost=lost: np.interp(t, times, lost))
-            for tissue, thick, lost in zip(study.tissues, BLOCK, found.observed_mm, strict=True)
+            for tissue, thick, lost in zip(study.tissues, BLOCK, found.observed, strict=True)
         }
         write_ultrasound(folder / "a-layers.csv", made, layers, random)
 

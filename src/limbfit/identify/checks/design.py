@@ -36,12 +36,13 @@ class NoiseModel:
     """What a record's force scatters about the model by.
 
     ``sensor_N`` is white; ``misfit`` (a fraction of the largest force) is the model's own error, which drifts
-    along the trace: ``correlation`` is that of neighbouring points.
+    along the trace: ``correlation`` is that of neighbouring points. By ``bias_N`` all of it is off together.
     """
 
     sensor_N: float
     misfit: float = 0.0
     correlation: float = 0.9
+    bias_N: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.sensor_N >= 0 and self.misfit >= 0 and 0 <= self.correlation < 1):
@@ -54,7 +55,7 @@ class NoiseModel:
         n = len(force_N)
         drift = (self.misfit * float(np.abs(force_N).max())) ** 2 * self.correlation ** np.arange(n)
         drift[0] += self.sensor_N**2
-        return np.asarray(drift, dtype=np.float64)
+        return np.asarray(drift + self.bias_N**2, dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -30,49 +30,77 @@ _LARGEST_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), ho
 
 @dataclass(frozen=True)
 class Noises:
-    """Of a record's force, of the compressions that ultrasound sees and of the moves that cameras see.
-
-    None where there is none.
+    """Of a record's force, of the compressions that ultrasound sees, of the moves that cameras see and of the
+    speeds of shear waves; None where there is none.
     """
 
     force: NoiseModel
-    layers: NoiseModel | None
-    skin: NoiseModel | None
+    layers: NoiseModel | None = None
+    skin: NoiseModel | None = None
+    waves: NoiseModel | None = None
 
     @classmethod
-    def of(cls, force: NoiseModel, ultrasound_sd_mm: float | None, surface_sd_mm: float | None) -> Noises:
-        """One reading at each point of comparison; the model errs by the same share as of the force."""
-        found = [
-            None if sd is None else replace(force, sensor_N=sd) for sd in (ultrasound_sd_mm, surface_sd_mm)
-        ]
-        return cls(force, *found)
+    def of(
+        cls,
+        force: NoiseModel,
+        ultrasound_sd_mm: float | None = None,
+        surface_sd_mm: float | None = None,
+        shear_waves_sd_m_s: float | None = None,
+    ) -> Noises:
+        """One reading at each point of comparison; the model errs by the same share as of the force.
+
+        Speeds of a place are off together by as much as each is by itself.
+        """
+        layers, skin, waves = (
+            None if sd is None else replace(force, sensor_N=sd)
+            for sd in (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s)
+        )
+        return cls(force, layers, skin, None if waves is None else replace(waves, bias_N=waves.sensor_N))
 
     @property
     def sees_more(self) -> bool:
         """Whether there is anything beside the force."""
-        return self.layers is not None or self.skin is not None
+        return any(one is not None for one in (self.layers, self.skin, self.waves))
 
     def of_force(self, force: SiteResponse, parameters: Array) -> Array:
         """Information (p, p) of a record's force."""
         return information_of(force, parameters, self.force)
 
     def of_all(
-        self, force: SiteResponse, values: Array, slopes: Array, points_mm: Array, parameters: Array
+        self,
+        force: SiteResponse,
+        values: Array,
+        slopes: Array,
+        parts: tuple[int, Array, float],
+        parameters: Array,
     ) -> Array:
-        """Information (p, p) of a record with ``values`` (g, n) mm beside its force, ``slopes`` (g, n, p).
+        """Information (p, p) of a record with ``values`` (g, n) beside its force, ``slopes`` (g, n, p).
 
-        Values are those of layers, then of three components of each of ``points_mm`` (k, 3) on the skin.
+        ``parts``: how many of the values are of layers; then come three components of each of the points
+        (k, 3) mm on the skin; then speeds, of which there are so many readings.
         """
-        found, layers = self.of_force(force, parameters), len(values) - 3 * len(points_mm)
+        layers, points_mm, readings = parts
+        found, waves = self.of_force(force, parameters), layers + 3 * len(points_mm)
         if self.layers is not None:
-            for lost, of_layer in zip(values[:layers], slopes[:layers], strict=True):
-                found = found + information_of(SiteResponse(lost, of_layer), parameters, self.layers)
+            found = found + _of_each(values[:layers], slopes[:layers], parameters, self.layers)
         if self.skin is not None and len(points_mm):
             components = np.tile(range(3), len(points_mm))
             alike = alike_on_skin(np.repeat(points_mm, 3, axis=0), components)
-            skin = values[layers:], slopes[layers:]
+            skin = values[layers:waves], slopes[layers:waves]
             found = found + information_of_field(*skin, alike, parameters, self.skin)
+        if self.waves is not None:
+            fewer = np.sqrt(max(values.shape[1] / readings, 1.0))  # than points of comparison
+            noise = replace(self.waves, sensor_N=fewer * self.waves.sensor_N)
+            found = found + _of_each(values[waves:], slopes[waves:], parameters, noise)
         return found
+
+
+def _of_each(values: Array, slopes: Array, parameters: Array, noise: NoiseModel) -> Array:
+    """Information (p, p) of several curves (g, n)."""
+    found = np.zeros((len(parameters), len(parameters)))
+    for value, slope in zip(values, slopes, strict=True):
+        found += information_of(SiteResponse(value, slope), parameters, noise)
+    return found
 
 
 @dataclass(frozen=True)

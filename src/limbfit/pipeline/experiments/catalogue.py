@@ -21,6 +21,7 @@ from ...study import Study
 from ..shared.artefacts import read_json
 from ..shared.context import Context
 from ..shared.keys import Keys, Stage
+from ..shared.planned import SEEN
 from ..shared.store import Store
 from .crossvalidation import run_crossvalidate
 from .cube import COMPRESSION_PERCENT, run_cube
@@ -119,7 +120,7 @@ _OWN: tuple[Experiment, ...] = (
         options={
             **{"minutes": 25.0, "setup_s": 60.0, "rest_s": 30.0, "speeds_mm_s": [], "holds_s": []},
             **{"depths_mm": [], "determine": [], "criterion": "D", "draws": 3, "seed": 0},
-            **{"ultrasound_sd_mm": None, "surface_sd_mm": None, "pressures": {}},
+            **{"seen": dict.fromkeys(SEEN), "pressures": {}},
             **{"parameters": {}, "parameters_from": "", "noise": {}},
         },
     ),

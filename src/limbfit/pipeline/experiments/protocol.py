@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 from numpy.typing import NDArray
 
 from ...anatomy.sites.under import tissue_under
@@ -20,10 +19,19 @@ from ...identify.checks.design import prior_information as bounds_information
 from ...identify.checks.protocol import Budget, Noises, Option, Wanted, drawn, factors_95, plan, seconds_of
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, layers_under, skin_beside
+from ...indentation import (
+    Parameters,
+    Simulation,
+    SimulationJob,
+    layers_under,
+    skin_beside,
+    waves_under,
+)
+from ...mesh import read_vtu
 from ...study import Site
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
+from ..shared.planned import Planned, press, write_records
 from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
 from ..stages.laboratory import unknowns
 from .design import DEEPEST_SHARE
@@ -31,33 +39,8 @@ from .design import DEEPEST_SHARE
 Array = NDArray[np.float64]
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
+READING_S = 1.0
 DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A record that could be made: the indenter pressed in at one rate, held, and taken back at that rate."""
-
-    site: str
-    indenter: str | None
-    depth_mm: float
-    speed_mm_s: float
-    hold_s: float
-    model: SiteModel
-
-    @property
-    def tool(self) -> str:
-        return self.indenter or "indenter"
-
-    @property
-    def seconds(self) -> float:
-        """From the first touch to the last."""
-        return 2.0 * self.depth_mm / self.speed_mm_s + self.hold_s
-
-    @property
-    def told(self) -> str:
-        held = f", held for {self.hold_s:g} s" if self.hold_s else ""
-        return f"site {self.site}, {self.tool}, {self.depth_mm:.1f} mm at {self.speed_mm_s:g} mm/s{held}"
 
 
 def run_protocol(
@@ -77,22 +60,19 @@ def run_protocol(
     parameters: Parameters,
     parameters_from: str,
     noise: dict[str, float],
-    ultrasound_sd_mm: float | None,
-    surface_sd_mm: float | None,
+    seen: Mapping[str, float | None],
     pressures: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
     """Simulate every possible record at every draw, with derivatives, and choose within the time.
 
-    ``ultrasound_sd_mm``: how well ultrasound through the indenter reads a thickness, ``surface_sd_mm``: how
-    well cameras read the moves of the skin around it; None: there is none. ``pressures``: derivatives (p,) of
-    their logarithms by those of the parameters; none: parameters count.
+    ``seen``: how well what is read (`SEEN`); None: there is none. ``pressures``: derivatives (p,) of their
+    logarithms by those of the parameters; none: parameters count.
     """
     study = context.study
     known = unknowns(study)
     which = _named(known, determine)
     rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
     tissues = drawn(known, study.vector(parameters), draws, seed)
-    seen = {"ultrasound_sd_mm": ultrasound_sd_mm, "surface_sd_mm": surface_sd_mm}
     noises = Noises.of(NoiseModel(**noise), **seen)
     planned, left_out = _planned(context, speeds_mm_s, holds_s, depths_mm, noises)
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
@@ -125,7 +105,7 @@ def run_protocol(
     }
     write_json(folder / "protocol.json", content)
     _write_tables(folder, content)
-    _write_records(folder / "records.toml", content["records"], seen)
+    write_records(folder / "records.toml", content["records"], seen)
     return {}
 
 
@@ -187,6 +167,8 @@ def _planned(
                 model = replace(model, layers=layers_under(model))
             if noises.skin is not None:
                 model = replace(model, skin_points=skin_beside(model))
+            if noises.waves is not None:
+                model = replace(model, waves=waves_under(model, read_vtu(model.mesh)))
             thickness = tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
             most = DEEPEST_SHARE * thickness
             if most < max(wanted):
@@ -194,22 +176,13 @@ def _planned(
                 left_out.append(f"site {site.name}: no deeper than {most:.1f} mm, {half}")
             depths = dict.fromkeys(min(depth, most) for depth in wanted)
             for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
-                planned = _press(model, depth, speed, hold)
+                planned = press(model, depth, speed, hold)
                 found.append(Planned(site.name, name, depth, speed, hold, planned))
     return found, list(dict.fromkeys(left_out))
 
 
 def _with_tool(site: Site, name: str | None) -> Site:
     return site.model_copy(update={"indenter": name})
-
-
-def _press(model: SiteModel, depth: float, speed: float, hold: float) -> SiteModel:
-    """In to ``depth`` mm at ``speed`` mm/s, held for ``hold`` s, and out."""
-    ramp = depth / speed
-    knots = [(0.0, 0.0), (ramp, depth)] + ([(ramp + hold, depth)] if hold else [])
-    knots.append((knots[-1][0] + ramp, 0.0))
-    times, depths = zip(*knots)
-    return replace(model, knots_s=times, knots_mm=depths)
 
 
 def _options(
@@ -266,8 +239,9 @@ def _told_by(job: SimulationJob, simulation: Simulation, noises: Noises) -> tupl
     if not noises.sees_more:
         return (alone := noises.of_force(force, parameters)), alone
     assert simulation.observed_jacobian is not None
-    beside = simulation.observed_mm, simulation.observed_jacobian
-    return noises.of_all(force, *beside, points, parameters), noises.of_force(force, parameters)
+    beside = simulation.observed, simulation.observed_jacobian
+    parts = len(job.model.layers), points, job.model.knots_s[-1] / READING_S
+    return noises.of_all(force, *beside, parts, parameters), noises.of_force(force, parameters)
 
 
 def _plans(
@@ -374,24 +348,3 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
         for row in content["protocols"]
     ]
     write_table(folder / "protocols.csv", heads, rows)
-
-
-def _write_records(file: Path, records: Sequence[Mapping[str, Any]], seen: Mapping[str, Any]) -> None:
-    """The tables ``[[records]]`` of a study that makes them."""
-    tables, number = tomlkit.aot(), dict.fromkeys((row["site"] for row in records), 0)
-    for row in records:
-        number[row["site"]] += 1
-        table = tomlkit.table()
-        name = f"{number[row['site']]}"
-        table.update({"site": row["site"], "name": name, "trace": f"records/{row['site']}-{name}.csv"})
-        if row["indenter"] != "indenter":
-            table["indenter"] = row["indenter"]
-        for key, end in (("ultrasound", "layers"), ("surface", "surface")):
-            if seen[f"{key}_sd_mm"] is not None:
-                table[key] = f"records/{row['site']}-{name}-{end}.csv"
-                table[f"{key}_sd_mm"] = seen[f"{key}_sd_mm"]
-        table.update({key: round(row[key], 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
-        tables.append(table)
-    document = tomlkit.document()
-    document["records"] = tables
-    file.write_text(tomlkit.dumps(document), encoding="utf-8")

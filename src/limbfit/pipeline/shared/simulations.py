@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ProblemError
+from ...errors import ProblemError, TraceError
 from ...execution import Executor
 from ...extensions import extensions_digest
 from ...fe import Doubt
@@ -20,9 +20,11 @@ from ...indentation import (
     Simulation,
     SimulationJob,
     SiteModel,
+    WavePlace,
     clamping_pins,
     read_indenter,
     simulate,
+    waves_under,
 )
 from ...mesh import read_vtu
 from ...study import Indentation, Record, Site, Study, Vector
@@ -100,8 +102,8 @@ class SimulationCache:
             arrays = {"force_N": simulation.force_N}
             if simulation.jacobian is not None:
                 arrays["jacobian"] = simulation.jacobian
-            if simulation.observed_mm.size:
-                arrays["observed_mm"] = simulation.observed_mm
+            if simulation.observed.size:
+                arrays["observed"] = simulation.observed
             if simulation.observed_jacobian is not None:
                 arrays["observed_jacobian"] = simulation.observed_jacobian
             facts = {
@@ -121,7 +123,7 @@ def _lost(job: SimulationJob, reason: str) -> Simulation:
     slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
     facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
     nothing = np.zeros((job.model.gauges, n))
-    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, observed_mm=nothing)
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, observed=nothing)
 
 
 def _load(file: Path) -> Simulation:
@@ -133,7 +135,7 @@ def _load(file: Path) -> Simulation:
             force_N=stored["force_N"],
             jacobian=jacobian,
             doubts=doubts,
-            observed_mm=stored.get("observed_mm", np.zeros((0, 0))),
+            observed=stored.get("observed", np.zeros((0, 0))),
             observed_jacobian=stored.get("observed_jacobian"),
             **facts,
         )
@@ -274,7 +276,30 @@ def recorded_model(context: Context, record: Record, searched: bool = False) -> 
     layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
     model = site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
     points = surface_points(context, record)
-    return model if points is None else replace(model, skin_points=points.points, skin_axes=points.axes)
+    if points is not None:
+        model = replace(model, skin_points=points.points, skin_axes=points.axes)
+    waves = facts.get("waves", [])
+    return replace(model, waves=_wave_places(context, record, model, waves)) if waves else model
+
+
+def _wave_places(
+    context: Context, record: Record, model: SiteModel, waves: Sequence[Mapping[str, Any]]
+) -> tuple[WavePlace, ...]:
+    """Where the shear waves of a record are, in the site's own mesh.
+
+    Raises
+    ------
+    TraceError
+        Where the limb has no such place, with the record's file.
+    """
+    assert record.shear_waves is not None
+    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
+    try:
+        return waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
+    except ProblemError as error:
+        file = context.study.path(record.shear_waves)
+        what = f"site {record.site.name}: {error.what}"
+        raise TraceError(what, file=file, place="header", remedy=error.remedy) from None
 
 
 def surface_points(context: Context, record: Record) -> ChosenPoints | None:

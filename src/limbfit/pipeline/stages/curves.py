@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,10 +19,13 @@ from ...traces import (
     Thinning,
     TouchDown,
     Trace,
+    WaveMeans,
+    WaveSpeeds,
     in_contact,
     read_layers,
     read_surface_motion,
     read_trace,
+    read_wave_speeds,
     regularise,
     regularise_creep,
     thinnings,
@@ -32,10 +35,18 @@ from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
 from ..shared.simulations import CURVE_POINTS
 from ..shared.surface_points import write_motion
-from .files import LAYERS, SMOOTHING
+from .files import LAYERS, SMOOTHING, WAVES
 
 END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does not hold the tissue
 SEEN = 3.0  # standard deviations that the skin must move by to be compared
+
+
+class Beside(NamedTuple):
+    """What was seen beside a record's force: layers, the skin, shear waves at places under the indenter."""
+
+    layers: tuple[Thinning, ...] = ()
+    motion: SurfaceMotion | None = None
+    waves: tuple[tuple[WaveSpeeds, WaveMeans], ...] = ()
 
 
 def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
@@ -104,8 +115,8 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
         )
         np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
         seen = read_observed(context.study, record, trace, told["touch_down_s"], smooth)
-        told |= observed_facts(record, *seen)
-        store_observed(folder, record, *seen)
+        told |= observed_facts(record, seen)
+        store_observed(folder, record, seen)
         for what in not_compared(told):
             words = f"site {record.name}, {what} hardly gives way, and is not compared"
             context.tell("traces", i, len(recorded), words)
@@ -115,8 +126,8 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
 
 def read_observed(
     study: Study, record: Record, trace: Trace, touch_down_s: float, smooth: Regularised
-) -> tuple[tuple[Thinning, ...], SurfaceMotion | None]:
-    """What was seen while the record's force is 5 % of its largest or more: layers, and the skin.
+) -> Beside:
+    """What was seen while the record's force is 5 % of its largest or more.
 
     Raises
     ------
@@ -125,19 +136,46 @@ def read_observed(
     """
     pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
     end_s = touch_down_s + float(pressed[-1])
-    layers: tuple[Thinning, ...] = ()
-    motion = None
+    found = Beside()
     if record.ultrasound is not None:
-        layers = _read_thinnings(study, record, touch_down_s, end_s)
+        found = found._replace(layers=_read_thinnings(study, record, touch_down_s, end_s))
+    if record.shear_waves is not None:
+        found = found._replace(waves=_read_waves(study, record, touch_down_s, end_s))
     if record.surface is not None:
         file = study.path(record.surface)
         whole = read_surface_motion(file, study.traces.time_s)
         times = float(trace.time_s[0]), float(trace.time_s[-1])
         try:
-            motion = in_contact(whole, times, touch_down_s, end_s)
+            found = found._replace(motion=in_contact(whole, times, touch_down_s, end_s))
         except TraceError as error:
             raise TraceError(error.what, file=file, place=study.traces.time_s, remedy=error.remedy) from None
-    return layers, motion
+    return found
+
+
+def _read_waves(
+    study: Study, record: Record, touch_down_s: float, end_s: float
+) -> tuple[tuple[WaveSpeeds, WaveMeans], ...]:
+    assert record.shear_waves is not None
+    file = study.path(record.shear_waves)
+    found = read_wave_speeds(file, study.traces.time_s)
+    _check_tissues(study, file, "m_s", [one.tissue for one in found])
+    try:
+        return tuple((one, one.means(touch_down_s, end_s)) for one in found)
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+
+
+def _check_tissues(study: Study, file: Path, unit: str, named: Sequence[str]) -> None:
+    """Whether the model has the tissues that the columns of a file name."""
+    for tissue in named:
+        if tissue not in study.tissues:
+            known = ", ".join(f"{one}_{unit}" for one in study.tissues)
+            raise TraceError(
+                f"the model has no tissue {tissue!r}",
+                file=file,
+                place="header",
+                remedy=f"name columns among {known}",
+            )
 
 
 def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: float) -> tuple[Thinning, ...]:
@@ -148,24 +186,14 @@ def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: fl
         found = thinnings(layers, touch_down_s, end_s, record.ultrasound_sd_mm)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-    for one in found:
-        if one.tissue not in study.tissues:
-            known = ", ".join(f"{tissue}_mm" for tissue in study.tissues)
-            raise TraceError(
-                f"the model has no tissue {one.tissue!r}",
-                file=file,
-                place="header",
-                remedy=f"name columns among {known}",
-            )
+    _check_tissues(study, file, "mm", [one.tissue for one in found])
     return found
 
 
-def observed_facts(
-    record: Record, layers: Sequence[Thinning], motion: SurfaceMotion | None
-) -> dict[str, Any]:
-    """What ``traces.json`` says of them."""
+def observed_facts(record: Record, seen: Beside) -> dict[str, Any]:
+    """What ``traces.json`` says of it."""
     facts: dict[str, Any] = {}
-    if layers:
+    if seen.layers:
         facts["layers"] = {
             one.tissue: {
                 "thickness_mm": one.thickness_mm,
@@ -174,9 +202,9 @@ def observed_facts(
                 "sd_mm": one.sd_mm,
                 "compared": one.is_seen,
             }
-            for one in layers
+            for one in seen.layers
         }
-    if motion is not None:
+    if (motion := seen.motion) is not None:
         frames, points, _ = motion.moved_mm.shape
         facts["surface"] = {
             "points": points,
@@ -185,6 +213,18 @@ def observed_facts(
             "sd_mm": record.surface_sd_mm,
             "compared": motion.largest_mm > SEEN * record.surface_sd_mm,
         }
+    if seen.waves:
+        facts["waves"] = [
+            {
+                "name": place.name,
+                "tissue": place.tissue,
+                "depth_mm": place.depth_mm,
+                "readings": int(means.samples.sum()),
+                "from_m_s": float(means.speed_m_s.min()),
+                "to_m_s": float(means.speed_m_s.max()),
+            }
+            for place, means in seen.waves
+        ]
     return facts
 
 
@@ -195,13 +235,17 @@ def not_compared(facts: dict[str, Any]) -> tuple[str, ...]:
     return (*layers, *(["surface: the skin"] if still else []))
 
 
-def store_observed(
-    folder: Path, record: Record, layers: Sequence[Thinning], motion: SurfaceMotion | None
-) -> None:
-    """Write the curves of a record's tissues, and the moves of its surface."""
-    if layers:
+def store_observed(folder: Path, record: Record, seen: Beside) -> None:
+    """Write the curves of a record's tissues, the moves of its surface and the speeds of its shear waves."""
+    if layers := seen.layers:
         columns = {f"{one.tissue}_mm": one.compression_mm for one in layers}
         file = folder / LAYERS.format(record.name)
         write_curves(file, time_s=layers[0].time_s, samples=layers[0].samples, **columns)
-    if motion is not None:
-        write_motion(folder, record, motion)
+    if seen.motion is not None:
+        write_motion(folder, record, seen.motion)
+    if seen.waves:
+        means = [one for _, one in seen.waves]
+        number = np.repeat(np.arange(len(means)), [len(one.time_s) for one in means])
+        keys = ("time_s", "speed_m_s", "samples")
+        columns = {key: np.concatenate([getattr(one, key) for one in means]) for key in keys}
+        write_curves(folder / WAVES.format(record.name), place=number.astype(np.float64), **columns)

@@ -13,6 +13,7 @@ from ..shared.hand_labels import hand_labels
 THICKNESS = "fat-depth.vtp"
 MARKED_SKIN = "skin-markers.stl"
 SMOOTHING = "{}-smoothing.npy"  # of a record, as a matrix
+WAVES = "{}-waves.csv"  # of a record: how fast shear waves were
 LAYERS = "{}-layers.csv"  # of a record: how its tissues gave way
 
 

@@ -209,22 +209,23 @@ def _observed(
         if near is not None:
             searched = one.respond(near)
             ours = CoarseToFine([searched], [whole])([searched])[0]
-        seen, what = one.seen, one.seen.quantity
-        columns = seen.columns | {f"{what}_measured_mm": one.compared}
+        seen, what, unit = one.seen, one.seen.quantity, one.seen.ending
+        columns = seen.columns | {f"{what}_measured_{unit}": one.compared}
         if whole.completed:
-            columns[f"{what}_simulated_mm"] = whole.force_N
+            columns[f"{what}_simulated_{unit}"] = whole.force_N
         if ours.completed:
             peak = largest(ours.force_N)
             half = known.half_width_95(ours.jacobian, best, peak, one.name, one.unit)
-            columns |= {f"{what}_low_mm": ours.force_N - half, f"{what}_high_mm": ours.force_N + half}
+            columns |= {f"{what}_low_{unit}": ours.force_N - half, f"{what}_high_{unit}": ours.force_N + half}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
             {
                 "kind": seen.kind,
                 "what": seen.what,
                 "name": one.name,
-                "largest_mm": largest(one.compared),
-                "noise_mm": seen.noise_mm,
+                "unit": seen.unit,
+                "largest": largest(one.compared),
+                "noise": seen.noise_sd,
                 **seen.facts,
                 "error_percent": error_percent(whole.force_N, one.compared) if whole.completed else None,
             }

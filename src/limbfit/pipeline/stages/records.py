@@ -15,13 +15,13 @@ from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.uncertainty.noise import depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Site
-from ...traces import SurfaceMotion, Thinning
+from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ..shared.artefacts import read_curves
 from ..shared.context import Context
 from ..shared.simulations import recorded_model, surface_points
 from ..shared.surface_points import ChosenPoints, read_motion
-from .files import LAYERS, SMOOTHING
-from .observed import Observed, SeenLayer, SeenSurface
+from .files import LAYERS, SMOOTHING, WAVES
+from .observed import Observed, SeenLayer, SeenSurface, SeenWave
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class SiteRecord:
     @property
     def unit(self) -> str:
         """Of what is compared."""
-        return self.record.unit if self.seen is None else "mm"
+        return self.record.unit if self.seen is None else self.seen.unit
 
     @property
     def site(self) -> Site:
@@ -82,7 +82,7 @@ class SiteRecord:
     def compared(self) -> Array:
         """What is compared: force (n,) N; displacement, mm, under a stated force; what is seen beside."""
         if self.seen is not None:
-            return self.seen.value_mm
+            return self.seen.value
         return self.displacement_mm if self.record.forced else self.force_N
 
     def respond(self, simulation: Simulation) -> SiteResponse:
@@ -179,6 +179,12 @@ def _load_observed(
     if points is not None:
         motion = read_motion(folder, record)
         found.append(_seen_surface(record, points, motion, len(tissues), times_s))
+    first = len(tissues) + (0 if points is None else 3 * len(points.points))
+    if places := facts.get("waves", []):
+        curves = read_curves(folder / WAVES.format(record.name))
+        for number, place in enumerate(places):
+            own = {name: values[curves["place"] == number] for name, values in curves.items()}
+            found.append(_seen_wave(record, place["name"], own, first + number, times_s))
     return tuple(found)
 
 
@@ -202,7 +208,7 @@ def _seen_layer(
         np.full(n, number),
         _interpolating(times_s, thinning.time_s),
         thinning.covariance,
-        {"sd_mm": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
+        {"sd": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
     )
 
 
@@ -214,7 +220,7 @@ def _seen_surface(
     if record.surface_frame == "site":
         words = ("along the edge", "across it", "along the axis")
     facts = {
-        "sd_mm": sd,
+        "sd": sd,
         "left_out": dict(points.left_out),
         "components": list(words),
         "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
@@ -229,6 +235,20 @@ def _seen_surface(
         facts,
         np.array(points.points)[means.point],
         means.component,
+    )
+
+
+def _seen_wave(record: Record, name: str, curves: dict[str, Array], gauge: int, times_s: Array) -> SeenWave:
+    means, n = WaveMeans(curves["time_s"], curves["speed_m_s"], curves["samples"]), len(curves["time_s"])
+    sd, bias = record.shear_waves_sd_m_s, record.shear_waves_bias_m_s
+    return SeenWave(
+        f"{name}-waves",
+        means.speed_m_s,
+        means.time_s,
+        np.full(n, gauge),
+        _interpolating(times_s, means.time_s),
+        means.covariance(sd, bias),
+        {"sd": sd, "bias": bias, "compared": f"{n} times"},
     )
 
 

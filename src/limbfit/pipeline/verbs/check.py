@@ -17,7 +17,7 @@ from ..shared.simulations import pins_met
 from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
 from ..shared.store import Store
 from ..shared.surface_points import chosen_points
-from ..stages.curves import read_observed, read_record
+from ..stages.curves import Beside, read_observed, read_record
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
@@ -51,7 +51,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     listener(Progress("check", 1, 2, "records"))
     read = {record.name: read_record(study, record) for record in study.recorded}
     records = {name: record for name, (_, _, record) in read.items()}
-    motions = {record.name: _motion(study, record, read[record.name]) for record in study.recorded}
+    seen = {record.name: _beside(study, record, read[record.name]) for record in study.recorded}
     for name, record in records.items():
         facts.append(
             f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
@@ -69,7 +69,9 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
     placed, anatomy = _places(study, given)
+    motions = {name: one.motion for name, one in seen.items()}
     facts += _surface_motion_facts(study, motions, placed, anatomy)
+    facts += [told for name, one in seen.items() for told in _wave_facts(name, one)]
     if records and not placed:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
@@ -89,12 +91,18 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     }
 
 
-def _motion(
-    study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]
-) -> SurfaceMotion | None:
-    """What cameras saw beside a record; what ultrasound saw is read and checked, too."""
+def _beside(study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]) -> Beside:
+    """What was seen beside a record."""
     trace, smooth, facts = read
-    return read_observed(study, record, trace, facts["touch_down_s"], smooth)[1]
+    return read_observed(study, record, trace, facts["touch_down_s"], smooth)
+
+
+def _wave_facts(name: str, seen: Beside) -> Iterator[str]:
+    """How fast shear waves are."""
+    for place, means in seen.waves:
+        speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
+        readings = int(means.samples.sum())
+        yield f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings"
 
 
 def _surface_motion_facts(

@@ -14,6 +14,7 @@ from ...study import Study
 from ..experiments.socket import NAME as SOCKET
 from ..experiments.socket_intervals import CHANGE_PERCENT
 from ..shared.context import Listener, quiet
+from ..shared.planned import SEEN
 from ..shared.store import Store
 from .run import run_experiment, study_status
 from .simulate import IDENTIFIED, known_parameters
@@ -77,6 +78,7 @@ def plan_protocol(
     seed: int = 0,
     ultrasound_sd_mm: float | None = None,
     surface_sd_mm: float | None = None,
+    shear_waves_sd_m_s: float | None = None,
     parameters: Parameters | None = None,
     listener: Listener = quiet,
 ) -> dict[str, Any]:
@@ -97,6 +99,8 @@ def plan_protocol(
     ultrasound_sd_mm : how well ultrasound through the indenter reads the thickness of a tissue; None: there
         is none.
     surface_sd_mm : how well cameras read the displacement of the skin around the indenter; None: likewise.
+    shear_waves_sd_m_s : how well elastography reads the speed of shear waves in each tissue under the
+        indenter, once a second; as much all speeds of a tissue may be off together. None: likewise.
     parameters : per tissue; by default the identified ones, or the study's start.
 
     Returns
@@ -139,8 +143,7 @@ def plan_protocol(
         parameters=used,
         parameters_from=origin,
         noise=_noise_of(study, origin),
-        ultrasound_sd_mm=ultrasound_sd_mm,
-        surface_sd_mm=surface_sd_mm,
+        seen=dict(zip(SEEN, (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s), strict=True)),
     )
 
 

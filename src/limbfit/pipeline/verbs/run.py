@@ -35,15 +35,19 @@ from ..stages.surfaces import run_surfaces
 from .journal import journal
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
-_SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame")
+_WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
+_SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame", *_WAVES)
 _RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)
 _UNSEEN: dict[str, Any] = {
     **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter", "ultrasound", "surface")),
+    "shear_waves": None,
     "region": "",
     "control": "displacement",
     "ultrasound_sd_mm": 0.1,
     "surface_sd_mm": 0.05,
     "surface_frame": "limb",
+    "shear_waves_sd_m_s": 0.1,
+    "shear_waves_bias_m_s": 0.1,
 }
 _NAMED = ("site", "name")
 # How pins press; the mesh depends on how wide they are alone.

@@ -1,8 +1,9 @@
-"""What was seen beside the force, and its prediction: layers under the indenter, the skin around it."""
+"""What was seen beside the force, and its prediction: layers and shear waves under the indenter, the skin."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,7 +20,37 @@ Curves = dict[str, NDArray[np.float64]]
 
 def layer_figure(store: Results, fitted: bool) -> Figure | None:
     """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    rows = list(_seen(store, fitted, "ultrasound"))
+    drawn = _against_time(store, fitted, "ultrasound", ("compression", "mm"), "layers")
+    if drawn is None:
+        return None
+    name, drawing, told = drawn
+    caption = (
+        f"Compression of the tissues on the indenter's axis at the {_word(fitted)} "
+        "sites, as ultrasound saw it and as predicted; errors are means over the record, in percent of the "
+        "largest compression."
+    )
+    return Figure(name, svg(drawing, name, f"Measured and predicted compression: {told}"), caption)
+
+
+def wave_figure(store: Results, fitted: bool) -> Figure | None:
+    """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
+    drawn = _against_time(store, fitted, "shear waves", ("speed", "m_s"), "waves")
+    if drawn is None:
+        return None
+    name, drawing, told = drawn
+    caption = (
+        f"Speed of shear waves under the indenter at the {_word(fitted)} sites, read and predicted: that "
+        "of small, sudden shear on the strain that the indenter makes; errors are means in percent of the "
+        "largest speed."
+    )
+    return Figure(name, svg(drawing, name, f"Measured and predicted speed of shear waves: {told}"), caption)
+
+
+def _against_time(
+    store: Results, fitted: bool, kind: str, quantity: tuple[str, str], stem: str
+) -> tuple[str, Any, str] | None:
+    """Name, drawing and words of what was seen of a kind; ``quantity`` and unit are in the curves' heads."""
+    rows, (what, unit) = list(_seen(store, fitted, kind)), quantity
     if not rows:
         return None
     drawing, axes = panels(len(rows), 3, 2.1)
@@ -27,26 +58,20 @@ def layer_figure(store: Results, fitted: bool) -> Figure | None:
         for i, (ax, (row, layer, whole)) in enumerate(zip(axes, rows, strict=True)):
             curves = thin(whole)
             x = curves["time_s"]
-            ax.plot(x, curves["compression_measured_mm"], ".", ms=4, color=MEASURED, label="ultrasound")
-            if "compression_simulated_mm" in curves:
-                ax.plot(x, curves["compression_simulated_mm"], color=SIMULATED, label=store.materials)
-            if "compression_low_mm" in curves:
-                low, high = curves["compression_low_mm"], curves["compression_high_mm"]
+            ax.plot(x, curves[f"{what}_measured_{unit}"], ".", ms=4, color=MEASURED, label="ultrasound")
+            if f"{what}_simulated_{unit}" in curves:
+                ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
+            if f"{what}_low_{unit}" in curves:
+                low, high = curves[f"{what}_low_{unit}"], curves[f"{what}_high_{unit}"]
                 ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
             ax.set_title(f"{row['record']}, {layer['what']}: {fixed(layer['error_percent'])} %")
             if i + 3 >= len(rows):
                 ax.set_xlabel("Time (s)")
             if i % 3 == 0:
-                ax.set_ylabel("Compression (mm)")
+                ax.set_ylabel(f"{what.capitalize()} ({unit.replace('_', '/')})")
         legend_above(drawing, axes[0])
-    name = "layers-fitted" if fitted else "layers-held-out"
     told = ", ".join(f"{row['record']} {layer['what']}" for row, layer, _ in rows)
-    caption = (
-        f"Compression of the tissues on the indenter's axis at the {_word(fitted)} "
-        "sites, as ultrasound saw it and as predicted; errors are means over the record, in percent of the "
-        "largest compression."
-    )
-    return Figure(name, svg(drawing, name, f"Measured and predicted compression: {told}"), caption)
+    return f"{stem}-{_word(fitted)}", drawing, told
 
 
 def surface_figure(store: Results, fitted: bool) -> Figure | None:

@@ -8,8 +8,9 @@ from ..store import Json, Results
 from .design import expected_figure, factor
 
 SEEN = {
-    "ultrasound_sd_mm": "Ultrasound through the indenter reads every tissue's thickness",
-    "surface_sd_mm": "Cameras read the displacement of the skin around the indenter",
+    "ultrasound_sd_mm": "Ultrasound through the indenter reads every tissue's thickness to {:g} mm",
+    "surface_sd_mm": "Cameras read the displacement of the skin around the indenter to {:g} mm",
+    "shear_waves_sd_m_s": "Elastography reads the speed of shear waves in every tissue to {:g} m/s",
 }
 
 
@@ -27,7 +28,7 @@ def protocol_section(store: Results, content: Json) -> Section:
         f"{content['parameters_from']}. Every site with another indenter takes {content['setup_s']:g} s to "
         f"prepare, every record {content['rest_s']:g} s of rest. In short: {content['verdict']}."
     )
-    seen = [f"{said} to {content[key]:g} mm" for key, said in SEEN.items() if content.get(key) is not None]
+    seen = [said.format(content[key]) for key, said in SEEN.items() if content.get(key) is not None]
     if seen:
         told = ", ".join(seen)
         words = Prose(f"{words.text} {told}, but for the plain ramps and the protocol by force alone.")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from .. import site_tables, tables
 from ..drawing import figures, pictures
 from ..drawing.interactive import convergence_curves, explorer, record_curves
-from ..drawing.observed_figures import layer_figure, surface_figure
+from ..drawing.observed_figures import layer_figure, surface_figure, wave_figure
 from ..drawing.slices import slices_figure
 from ..formats import fixed
 from ..page import Block, Bullets, Figure, Note, Page, Prose, Section, Table
@@ -129,6 +129,7 @@ def fit(store: Results) -> Section:
     blocks = _blocks(
         figures.force_figure(store, rows, "time_s", "forces-fitted", 2),
         layer_figure(store, fitted=True),
+        wave_figure(store, fitted=True),
         surface_figure(store, fitted=True),
         pictures.field_figure(store, store.fitted[:4], "predict", "field"),
         otherwise="No simulated forces of fitted sites are stored yet.",
@@ -145,6 +146,7 @@ def prediction(store: Results) -> Section:
         figures.force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
         layer_figure(store, fitted=False),
+        wave_figure(store, fitted=False),
         surface_figure(store, fitted=False),
         site_tables.observed_table(store),
         otherwise="No predictions are stored yet.",

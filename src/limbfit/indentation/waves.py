@@ -1,0 +1,217 @@
+"""How fast shear waves are at places of a limb that is being indented: ultrasound elastography.
+
+A pulse moves tissue along the beam, and the wave that it sets off runs across it. It is a small, sudden
+motion on top of the present strain (Ogden, Non-linear elastic deformations, 1984, 6.4): with motion ``a`` across the way ``n``
+
+    rho v^2 = (1/J) [(1 + sum_l g_l) g : dSe/dE : g + N . (Se + sum_l g_l H_l) N],   A = F^T a,  N = F^T n,
+
+and ``g`` the symmetric part of ``A N``. Relaxation has no time in it, and the pressure drops out, since the
+motion is across the way. At rest it is the instantaneous modulus. Real tissue also has relaxation that is
+quicker than an indentation shows: the model's speed knows no more of it than its shortest time.
+
+Speeds follow from the displacements and their derivatives. Derivatives of speeds are differences of the
+closed form above along both, within 1e-6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ProblemError
+from ..fe import Material, Result
+from ..fe.history import Memory
+from ..fe.kernel.laws import Laws
+from ..fe.kernel.places import Places, elastic_at
+from ..mesh import Mesh, gauges_along, locate
+from ..study import Vector
+
+Array = NDArray[np.float64]
+
+DENSITY = 1000.0  # kg/m^3, as elastography takes it for all soft tissue
+REGION_MM = 1.0  # a speed is the mean over a region of so much around its place, and in the tissue alone
+OFF_TISSUE_MM = 3.0  # farther from a tissue than that a place is not in it
+_STEP = 1e-4  # of a parameter
+_LEAST = 1e-12  # MPa: a tissue that carries no wave
+
+
+@dataclass(frozen=True)
+class WavePlace:
+    """Where a shear wave's speed is wanted: a material point of ``tissue``, its place at rest, LPS mm.
+
+    ``motion`` and ``way``: unit vectors along which the tissue moves and the wave runs, across each other.
+    """
+
+    tissue: str
+    point: Vector
+    motion: Vector
+    way: Vector
+
+
+def wave_places(
+    mesh: Mesh, position: Array, axis: Array, way: Array, wanted: Sequence[tuple[str, float | None]]
+) -> tuple[WavePlace, ...]:
+    """Places under the middle of an indenter: of each tissue so deep below the skin, mm, or its own middle.
+
+    ``axis`` is the indenter's, along which the tissue moves; waves run along ``way``.
+
+    Raises
+    ------
+    ProblemError
+        For a tissue that is not there, or not so deep.
+    """
+    found, top, spans = [], 0.0, {}
+    for gauge in gauges_along(mesh, position, axis):
+        spans[gauge.region] = (top, top + gauge.thickness_mm)
+        top += gauge.thickness_mm
+    for tissue, depth in wanted:
+        if tissue not in spans:
+            raise ProblemError(
+                f"no {tissue} lies under the indenter's axis, only {', '.join(spans)}",
+                remedy="take its column out of the record's file of shear waves",
+            )
+        first, last = spans[tissue]
+        if depth is not None and not first <= depth <= last:
+            raise ProblemError(
+                f"{tissue} lies {first:.1f} to {last:.1f} mm deep, and not at {depth:g} mm",
+                remedy="name the column after the tissue that is there, or leave the depth out",
+            )
+        point = position + (0.5 * (first + last) if depth is None else depth) * axis
+        found.append(WavePlace(tissue, _vector(point), _vector(axis), _vector(way)))
+    return tuple(found)
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class _Regions:
+    """The points of several places: of number ``place`` (m,) each; ``A`` and ``N`` see `WavePlace`."""
+
+    points: Places
+    nodes: NDArray[np.int64]
+    place: NDArray[np.int64]
+    motion: Array
+    way: Array
+
+    @classmethod
+    def of(cls, result: Result, places: Sequence[WavePlace]) -> _Regions:
+        mesh, system = result.problem.mesh, result.system
+        cells, local = zip(*(_located(mesh, place) for place in places), strict=True)
+        number = np.repeat(np.arange(len(places)), [len(own) for own in cells])
+        points = Places.at(
+            mesh,
+            result.problem.formulation,
+            np.concatenate(cells),
+            np.concatenate(local),
+            system.fibres,
+            system.prestretch,
+        )
+        nodes, renumbered = np.unique(points.cells, return_inverse=True)
+        points = replace(points, cells=renumbered.reshape(points.cells.shape).astype(np.int32))
+        motion, way = (np.array([getattr(one, name) for one in places])[number] for name in ("motion", "way"))
+        return cls(points, nodes.astype(np.int64), number, motion, way)
+
+    def mean(self, values: Array) -> Array:
+        """Means (k,) of values (m,) over the points of each place."""
+        return np.bincount(self.place, values) / np.bincount(self.place)
+
+    def speeds(self, laws: Laws, steps: Sequence[Array], seconds: Array, turned: NDArray[np.bool_]) -> Array:
+        """Speeds (k, s) m/s after the ``steps``: displacements (n, 3) of the nodes, mm, since rest.
+
+        ``seconds`` (s,) each step took; after those that are ``turned`` the next has no smooth past.
+        """
+        memory, gamma = Memory.rest(self.points, laws), laws.prony[..., 0]
+        of, found = self.points.regions, []
+        for u, dt, turn in zip(steps, seconds, turned, strict=True):
+            stress, moduli, F = elastic_at(self.points, laws, u)
+            if dt > 0.0:
+                memory = memory.advanced(self.points, laws, stress[:, None], dt)
+                memory = memory.turned() if turn else memory
+            for l, prony in enumerate(memory.prony):
+                stress = stress + gamma[of, l, None] * prony[:, 0]
+            A, N = (np.einsum("mij,mi->mj", F, along) for along in (self.motion, self.way))
+            g = _contracting(A, N)
+            stiffness = (1.0 + gamma.sum(axis=1))[of] * np.einsum("mr,mrs,ms->m", g, moduli, g)
+            tension = np.einsum("mr,mr->m", _contracting(N, N), stress)
+            found.append(self.mean((stiffness + tension) / np.linalg.det(F)))
+        return 1e3 * np.sqrt(np.maximum(np.array(found).T, _LEAST) / DENSITY)
+
+
+def _contracting(a: Array, b: Array) -> Array:
+    """Six numbers (m, 6) whose product with those of a symmetric tensor T is ``a . T b``."""
+    off = [a[:, i] * b[:, j] + a[:, j] * b[:, i] for i, j in ((0, 1), (1, 2), (2, 0))]
+    return np.column_stack([a * b, *off])
+
+
+def _located(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
+    """Cells and local coordinates of the points of a place's region that are in its tissue."""
+    region = mesh.region_names.index(place.tissue)
+    motion, way = np.array(place.motion), np.array(place.way)
+    axes = np.stack([motion, way, np.cross(motion, way)])
+    points = np.array(place.point) + REGION_MM * np.concatenate([np.zeros((1, 3)), axes, -axes])
+    cells, local, off = locate(mesh, points, region)
+    if off[0] > OFF_TISSUE_MM:
+        where = ", ".join(f"{value:.1f}" for value in place.point)
+        raise ProblemError(
+            f"the place ({where}) is {off[0]:.1f} mm off the simulated {place.tissue}",
+            remedy="take it out of the record's file of shear waves, or mesh the site finer",
+        )
+    kept = off < 0.1 * REGION_MM
+    kept[0] = True
+    return cells[kept], local[kept]
+
+
+def wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Array, Array | None]:
+    """Speeds of shear waves at places (k,) at rest and in every state of a simulation, m/s: (k, s + 1).
+
+    And their derivatives (k, s + 1, p) with respect to the solver's parameters, where the states have some.
+    The result must hold all of its states (``store="all"``).
+    """
+    problem, states = result.problem, result.states
+    regions = _Regions.of(result, places)
+    times = np.array([0.0, *(state.time for state in states)])
+    seconds, turned = np.diff(times, prepend=0.0), _turned(result, times)
+
+    def after(materials: Mapping[str, Material], by: int = 0, step: float = 0.0) -> Array:
+        """The speeds where parameter number ``by`` is larger by ``step``."""
+        laws = Laws.build([materials[name] for name in problem.mesh.region_names])
+        moved = [np.zeros((len(regions.nodes), 3))]
+        for state in states:
+            u = state.u[regions.nodes]
+            if step:
+                assert state.sensitivity is not None
+                u = u + step * state.sensitivity[regions.nodes, :, by].astype(np.float64)
+            moved.append(u)
+        return regions.speeds(laws, moved, seconds, turned)
+
+    speeds = after(problem.materials)
+    if not states or states[0].sensitivity is None:
+        return speeds, None
+    slopes = []
+    for p, ((region, name), value) in enumerate(
+        zip(problem.parameter_names, problem.parameters, strict=True)
+    ):
+        step = _STEP * (abs(value) or 1.0)
+        own = problem.materials[region]
+        less, more = (
+            after({**problem.materials, region: own.with_parameters({name: value + change})}, p, change)
+            for change in (-step, step)
+        )
+        slopes.append((more - less) / (2.0 * step))
+    return speeds, np.stack(slopes, axis=-1)
+
+
+def _turned(result: Result, times: Array) -> NDArray[np.bool_]:
+    """At which times (s,) of its states the solver let the stress go on otherwise than before (`Memory`)."""
+    kinks = np.concatenate([result.problem.history.kinks, result.problem.turns])
+    at_kinks = np.isclose(times[:, None], kinks, rtol=1e-9, atol=0.0).any(axis=1)
+    pushing = result.force[: len(times)] > 0.0
+    met = np.diff(pushing.astype(int), prepend=0) != 0
+    touched = np.r_[0.0, times[:-1]] > result.problem.touch_down_s * (1.0 + 1e-9)
+    return np.asarray(at_kinks | (met & touched))
