@@ -1,7 +1,8 @@
 """How fast shear waves are at places of a limb that is being indented: ultrasound elastography.
 
 A pulse moves tissue along the beam, and the wave that it sets off runs across it. It is a small, sudden
-motion on top of the present strain (Ogden, Non-linear elastic deformations, 1984, 6.4): with motion ``a`` across the way ``n``
+motion on top of the present strain (Ogden, Non-linear elastic deformations, 1984, 6.4): with motion ``a``
+across the way ``n``
 
     rho v^2 = (1/J) [(1 + sum_l g_l) g : dSe/dE : g + N . (Se + sum_l g_l H_l) N],   A = F^T a,  N = F^T n,
 

@@ -229,9 +229,7 @@ VAIN_OF_SITE: tuple[VainOfSite, ...] = (
     VainOfSite("surface_sd_mm", lambda s, site: site.surface is None, "the site has no surface"),
     VainOfSite("surface_frame", lambda s, site: site.surface is None, "the site has no surface"),
     VainOfSite("shear_waves_sd_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES),
-    VainOfSite(
-        "shear_waves_bias_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES
-    ),
+    VainOfSite("shear_waves_bias_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES),
     VainOfSite(
         "indenter",
         lambda s, site: site.trace is None and bool(s.records_at(site)),

@@ -15,7 +15,7 @@ from limbfit.identify.checks.protocol import drawn
 from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, UNSEEN
 from limbfit.pipeline.stages.laboratory import unknowns
 
-BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n'
+BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n[acquire]\nforce_limit_N = 45.0\n'
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +42,21 @@ def test_the_session_keeps_its_time_and_tells_more_than_plain_ramps(found) -> No
         assert designed["cost"] <= rows[name]["cost"] + 1e-9
 
 
-def test_several_depths_are_chosen_from(found) -> None:
+def test_records_also_go_twice_as_deep_where_tissue_allows(found) -> None:
+    """No depth is stated: the site's own, at which a plain ramp is, and the deeper one that tells more."""
     study, _ = found
-    more = limbfit.plan_protocol(
-        study, minutes=6, depths_mm=(2.0, 3.0), speeds_mm_s=(0.96,), holds_s=(0,), draws=1
-    )
-    assert sorted({row["depth_mm"] for row in more["candidates"]}) == [2.0, 3.0]
+    more = limbfit.plan_protocol(study, minutes=6, speeds_mm_s=(0.96,), holds_s=(0,), draws=1)
+    usual, deeper = sorted({row["depth_mm"] for row in more["candidates"]})
+    assert usual == pytest.approx(5.0, abs=0.1)
+    assert deeper == pytest.approx(2.0 * usual)
     rows = {row["design"]: row for row in more["protocols"]}
+    assert deeper in {row["depth_mm"] for row in more["records"]}
     assert rows[DESIGNED]["cost"] <= rows["at one depth"]["cost"] + 1e-9
-    assert rows[PLAIN]["records"] == 1  # the deepest alone
+    assert rows[PLAIN]["records"] == 1
+    (plain,) = (
+        row for row in more["candidates"] if (row["indenter"], row["depth_mm"]) == ("indenter", usual)
+    )
+    assert rows[PLAIN]["minutes"] == pytest.approx(1.0 + plain["seconds"] / 60.0)
 
 
 def test_what_is_to_be_determined_is_determined_better(found) -> None:
@@ -138,3 +144,15 @@ def test_cameras_tell_more_in_the_same_time(found) -> None:
     (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
     assert (record["surface"], record["surface_sd_mm"]) == ("records/1-1-surface.csv", 0.05)
     assert "ultrasound" not in record
+
+
+@pytest.mark.slow
+def test_elastography_tells_more_in_the_same_time(found) -> None:
+    study, _ = found
+    seen = limbfit.plan_protocol(
+        study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, shear_waves_sd_m_s=0.1
+    )
+    rows = {row["design"]: row for row in seen["protocols"]}
+    assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
+    (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
+    assert (record["shear_waves"], record["shear_waves_sd_m_s"]) == ("records/1-1-waves.csv", 0.1)

@@ -38,6 +38,7 @@ from .design import DEEPEST_SHARE
 
 Array = NDArray[np.float64]
 
+DEEPER = 2.0  # times as deep as a site was recorded or is planned, where no depth is asked for
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
 READING_S = 1.0
 DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
@@ -152,7 +153,8 @@ def _planned(
     depths_mm: Sequence[float],
     noises: Noises,
 ) -> tuple[list[Planned], list[str]]:
-    """Every site with every indenter, speed and hold, as deep as asked for, else as recorded or planned."""
+    """Every site with every indenter, speed and hold, as deep as asked for, else as it was recorded or is
+    planned, and twice as deep; nowhere deeper than its tissue allows."""
     study, found, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"])
     deepest: dict[str, float] = {}
@@ -160,7 +162,8 @@ def _planned(
         own = model_of(context, one)
         deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
     for site in study.sites:
-        wanted = depths_mm or (deepest[site.name],)
+        own = deepest[site.name]
+        wanted = depths_mm or (own, DEEPER * own)
         for name in study.all_indenters:
             model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True)
             if noises.layers is not None:
@@ -175,9 +178,10 @@ def _planned(
                 half = f"half of the tissue's {thickness:.1f} mm"
                 left_out.append(f"site {site.name}: no deeper than {most:.1f} mm, {half}")
             depths = dict.fromkeys(min(depth, most) for depth in wanted)
+            usual = min(depths, key=lambda depth: abs(depth - own))
             for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
                 planned = press(model, depth, speed, hold)
-                found.append(Planned(site.name, name, depth, speed, hold, planned))
+                found.append(Planned(site.name, name, depth, speed, hold, planned, depth == usual))
     return found, list(dict.fromkeys(left_out))
 
 
@@ -247,7 +251,8 @@ def _told_by(job: SimulationJob, simulation: Simulation, noises: Noises) -> tupl
 def _plans(
     found: Sequence[Planned], options: Sequence[Option], budget: Budget, wanted: Wanted
 ) -> dict[str, tuple[int, ...]]:
-    """The designed protocol, one slow and deep ramp at every site, and the best without each ingredient."""
+    """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
+    ingredient."""
     slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
     places = [(one.site, one.indenter) for one in found]
     most = {
@@ -255,8 +260,7 @@ def _plans(
     }
     deep = [one.depth_mm == most[place] for one, place in zip(found, places, strict=True)]
     plain = [
-        one.speed_mm_s == slow and not one.hold_s and one.indenter == tool and deepest
-        for one, deepest in zip(found, deep, strict=True)
+        one.speed_mm_s == slow and not one.hold_s and one.indenter == tool and one.usual for one in found
     ]
     kinds: Mapping[str, Sequence[bool]] = {
         DESIGNED: [True] * len(found),

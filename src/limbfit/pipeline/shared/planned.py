@@ -21,7 +21,10 @@ SEEN = {
 
 @dataclass(frozen=True)
 class Planned:
-    """A record that could be made: the indenter pressed in at one rate, held, and taken back at that rate."""
+    """A record that could be made: the indenter pressed in at one rate, held, and taken back at that rate.
+
+    ``usual``: as deep as the site was recorded or is planned, or nearest to that.
+    """
 
     site: str
     indenter: str | None
@@ -29,6 +32,7 @@ class Planned:
     speed_mm_s: float
     hold_s: float
     model: SiteModel
+    usual: bool
 
     @property
     def tool(self) -> str:
