@@ -2,13 +2,13 @@
 
     python benchmarks/protocols.py [--folder runs/protocols] [--only paper designed] [--seeds 0] [--json FILE]
 
-The limb is the stump of `identification_cases`: its true records come from other meshes (edges of 3 mm
-instead of the study's), finer surfaces, another element and more steps than the study has, with 0.05 N of
-noise, and 0.1 mm of noise in what ultrasound sees at 20 Hz. Four sites are fitted, two are held out with one
-ramp each. Judged are how many of the eight parameters are determined (95 % interval of at most -20 to +25 %),
-how many intervals hold the true value, the error at the held-out sites, and the patient's time: each record,
-30 s of rest after it, 60 s to prepare a site with an indenter. What is done is kept in the folder; a run that
-was stopped goes on.
+The limb is the stump of `identification_cases`: its true records come from other meshes (edges of 1.8 mm),
+finer surfaces, another element and more steps than the study has, with 0.05 N of noise; ultrasound, cameras
+and elastography read as `limbfit phantom` has them. Four sites are fitted, two are held out with one ramp
+each. Judged are how many of the eight parameters are determined (95 % interval of at most -20 to +25 %), how
+many intervals hold the true value, the error at the held-out sites, and the patient's time: each record, 30 s
+of rest after it, 60 s to prepare a site with an indenter. What is done is kept in the folder; a run that was
+stopped goes on.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from limbfit.identify.checks.design import NoiseModel, information_of, prior_inf
 from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import to_vector
-from limbfit.phantom.record import ULTRASOUND_NOISE_MM
+from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, Seen
 from limbfit.pipeline.experiments.protocol import DETERMINED
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
@@ -41,12 +41,14 @@ from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.study import Study
 
+DEPTHS = (3.0, 6.0, 9.0)
 FAST, HOLD_S = 4.8, 30.0
 REST_S, SETUP_S, MINUTES = 30.0, 60.0, 25.0
 # Of linear theory: noise of a compared force, and the model's own error, which drifts along a record.
 EXPECTED_N, EXPECTED_CORRELATION, MISFITS = 0.015, 0.95, (0.02, 0.01, 0.005, 0.002)
 FITTED = tuple(spot.name for spot in SPOTS if spot.fitted)
 HELD_OUT = tuple(Take(spot.name) for spot in SPOTS if not spot.fitted)
+ULTRASOUND = Seen(ultrasound=True)
 RAMPS = tuple(Take(site) for site in FITTED)
 INGREDIENTS: dict[str, tuple[Take, ...]] = {
     "paper": RAMPS,
@@ -54,8 +56,11 @@ INGREDIENTS: dict[str, tuple[Take, ...]] = {
     "hold": tuple(replace(one, hold_s=HOLD_S) for one in RAMPS),
     "speed": (*RAMPS, *(replace(one, speed=FAST) for one in RAMPS)),
     "indenter": (*RAMPS, *(replace(one, ball=True) for one in RAMPS)),
-    "ultrasound": tuple(replace(one, seen=True) for one in RAMPS),
+    "ultrasound": tuple(replace(one, seen=ULTRASOUND) for one in RAMPS),
+    "surface": tuple(replace(one, seen=Seen(surface=True)) for one in RAMPS),
+    "shear waves": tuple(replace(one, seen=Seen(shear_waves=True)) for one in RAMPS),
 }
+FITTED_ALONE = ("prior", "surface", "shear waves")  # linear theory is not asked of them
 DESIGNED = ("designed", "designed without ultrasound", "designed with prior")
 SHORT, SHORT_MINUTES = "8 minutes", 8.0  # the best at the true tissue
 CASES = (*INGREDIENTS, *DESIGNED, SHORT)
@@ -87,6 +92,7 @@ def designed(folder: Path, limb: Limb, edge_mm: float | None, ultrasound: bool) 
         minutes=MINUTES,
         speeds_mm_s=(SLOW, FAST),
         holds_s=(0.0, HOLD_S),
+        depths_mm=DEPTHS,
         ultrasound_sd_mm=seen,
     )
     return tuple(
@@ -96,7 +102,7 @@ def designed(folder: Path, limb: Limb, edge_mm: float | None, ultrasound: bool) 
             row["hold_s"],
             row["indenter"] == "ball",
             round(row["depth_mm"], 2),
-            ultrasound,
+            ULTRASOUND if ultrasound else NOTHING,
         )
         for row in found["records"]
     )
@@ -107,14 +113,14 @@ def told_of(
 ) -> dict[Take, Option]:
     """What records tell of the true tissue where the model's own error is ``misfit`` of the largest value.
 
-    With what ultrasound sees where a take is ``seen``. Simulated on the study's meshes, once.
+    With what ultrasound sees where there is some. Simulated on the study's meshes, once.
     """
     study = plan_study(folder, limb, edge_mm)
     context = Context(study, Store(study.results), SerialExecutor(), lambda event: None)
     truth = study.vector(parameters_of(limb.seed))
     force = NoiseModel(EXPECTED_N, misfit, EXPECTED_CORRELATION)
     layers = NoiseModel(ULTRASOUND_NOISE_MM, misfit, EXPECTED_CORRELATION)
-    plain = [replace(take, seen=False) for take in takes]
+    plain = [replace(take, seen=NOTHING) for take in takes]
     jobs = []
     for take in plain:
         site = study.site(take.site).model_copy(update={"indenter": "ball" if take.ball else None})
@@ -126,7 +132,7 @@ def told_of(
         if not one.completed:
             raise SystemExit(f"{take.name} could not be simulated: {one.reason}")
         information = information_of(SiteResponse(one.force_N, one.jacobian), truth, force)
-        if take.seen:
+        if take.seen.ultrasound:
             for lost, slopes in zip(one.observed, one.observed_jacobian, strict=True):
                 information = information + information_of(SiteResponse(lost, slopes), truth, layers)
         place = take.site, "ball" if take.ball else "punch"
@@ -140,7 +146,7 @@ def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> Wanted:
 
 
 def best_at_truth(
-    folder: Path, limb: Limb, edge_mm: float | None, minutes: float, misfit: float, seen: bool
+    folder: Path, limb: Limb, edge_mm: float | None, minutes: float, misfit: float, seen: Seen
 ) -> tuple[Take, ...]:
     """The protocol of so many minutes that linear theory prefers at the true tissue."""
     ways = product(FITTED, (SLOW, FAST), (0.0, HOLD_S), (False, True))
@@ -157,11 +163,11 @@ def expected(folder: Path, limb: Limb, edge_mm: float | None) -> list[dict[str, 
     """
     wanted, rows = wanted_of(folder, limb, edge_mm), []
     for misfit in MISFITS:
-        chosen = {name: takes for name, takes in INGREDIENTS.items() if name != "prior"}
+        chosen = {name: takes for name, takes in INGREDIENTS.items() if name not in FITTED_ALONE}
         for name, seen, minutes in (
-            ("designed", True, MINUTES),
-            ("designed without ultrasound", False, MINUTES),
-            (SHORT, True, SHORT_MINUTES),
+            ("designed", ULTRASOUND, MINUTES),
+            ("designed without ultrasound", NOTHING, MINUTES),
+            (SHORT, ULTRASOUND, SHORT_MINUTES),
         ):
             chosen[name] = best_at_truth(folder, limb, edge_mm, minutes, misfit, seen)
         for name, takes in chosen.items():
@@ -211,7 +217,7 @@ def run_case(folder: Path, name: str, seed: int, edge_mm: float | None) -> dict[
     began = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     ultrasound = "without" not in name
     if name == SHORT:
-        takes = best_at_truth(folder, limb, edge_mm, SHORT_MINUTES, MISFITS[0], True)
+        takes = best_at_truth(folder, limb, edge_mm, SHORT_MINUTES, MISFITS[0], ULTRASOUND)
     else:
         takes = INGREDIENTS[name] if name in INGREDIENTS else designed(folder, limb, edge_mm, ultrasound)
     if not (place / "study.toml").is_file():

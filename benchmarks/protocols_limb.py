@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,20 +20,31 @@ from identification_cases import (
     Stump,
     parameters_of,
 )
+from scipy.interpolate import interp1d
 
 from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
 from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.fe import solve
-from limbfit.indentation import SiteModel, build_problem, observed
+from limbfit.indentation import (
+    SiteModel,
+    build_problem,
+    observed,
+    points_around,
+    read_indenter,
+    waves_under,
+)
 from limbfit.mesh import Mesh, gauges_along, read_vtu, write_vtu
 from limbfit.phantom.record import (
     CLEARANCE_MM,
     DISPLACEMENT_NOISE_MM,
-    HEADER,
+    NOTHING,
     RATE_HZ,
-    ULTRASOUND_HZ,
-    ULTRASOUND_NOISE_MM,
+    RobotRecord,
+    Seen,
+    write_surface,
+    write_ultrasound,
+    write_waves,
 )
 from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.study import IndenterTable
@@ -52,14 +63,14 @@ TISSUES = ("skin", "muscle")
 
 @dataclass(frozen=True)
 class Take:
-    """One record: where, with what, how fast and held for how long; ``seen``: with ultrasound."""
+    """One record: where, with what, how fast and held for how long, and what is ``seen`` beside its force."""
 
     site: str
     speed: float = SLOW
     hold_s: float = 0.0
     ball: bool = False
     depth: float | None = None
-    seen: bool = False
+    seen: Seen = NOTHING
 
     @property
     def name(self) -> str:
@@ -100,30 +111,43 @@ class Limb:
         return read_vtu(file), tuple(known["position"]), tuple(known["axis"])
 
     def answer(self, take: Take) -> dict[str, np.ndarray]:
-        """Times from touch-down, true force and compressions, and the layers' thickness; simulated once."""
-        file = self.folder / "truth" / f"{self.seed}-{take.name}.npz"
+        """Times from touch-down, true force, and what is seen beside it; simulated once."""
+        more = "-more" if take.seen.surface or take.seen.shear_waves else ""
+        file = self.folder / "truth" / f"{self.seed}-{take.name}{more}.npz"
         if not file.is_file():
             file.parent.mkdir(parents=True, exist_ok=True)
-            mesh, position, axis = self._mesh(take.site)
-            indenter = BALL if take.ball else INDENTER
-            model = SiteModel(take.name, Path(), "", position, axis, *take.knots, indenter=indenter)
-            gauges = gauges_along(mesh, np.array(position), np.array(axis))
-            model = replace(model, layers=tuple(one.region for one in gauges))
-            problem = build_problem(model, mesh, parameters_of(self.seed))
-            steps = replace(TRUE_STEPS, load_steps=12, unload_steps=20)  # holds take those of unloading
-            result = solve(replace(problem, element=TRUE_ELEMENT), steps=steps, store="all")
-            if not result.completed:
-                raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
-            times = model.curve_times(2001)
-            lost, _ = observed(result, model, times)
-            told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
-            told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}
-            np.savez(file, times=times, force=result.force_at(times), **told)
+            np.savez(file, **self._simulated(take))
         with np.load(file) as stored:
             return dict(stored)
 
+    def _simulated(self, take: Take) -> dict[str, np.ndarray]:
+        mesh, position, axis = self._mesh(take.site)
+        indenter = BALL if take.ball else INDENTER
+        model = SiteModel(take.name, Path(), "", position, axis, *take.knots, indenter=indenter)
+        gauges = gauges_along(mesh, np.array(position), np.array(axis))
+        points, waves = np.zeros((0, 3)), ()
+        if take.seen.surface:
+            points = points_around(mesh, read_indenter(indenter, position, axis, None))
+        if take.seen.shear_waves:
+            waves = waves_under(model, mesh)
+        model = replace(model, layers=tuple(one.region for one in gauges), waves=waves)
+        model = replace(model, skin_points=tuple(map(tuple, points)))
+        steps = replace(TRUE_STEPS, load_steps=12, unload_steps=20)  # holds take those of unloading
+        problem = replace(build_problem(model, mesh, parameters_of(self.seed)), element=TRUE_ELEMENT)
+        result = solve(problem, steps=steps, store="all")
+        if not result.completed:
+            raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
+        times = model.curve_times(2001)
+        values, _ = observed(result, model, times)
+        lost, moves, speeds = np.split(values, [len(gauges), len(values) - len(waves)])
+        told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
+        told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}
+        told |= {f"speed_{one.tissue}": row for one, row in zip(waves, speeds)}
+        told |= {"points": points, "moves": moves.reshape(len(points), 3, len(times))}
+        return {"times": times, "force": result.force_at(times), **told}
+
     def write(self, folder: Path, take: Take) -> None:
-        """What the robot writes of a record, and what ultrasound sees."""
+        """What the robot writes of a record, and what is seen beside it."""
         found = self.answer(take)
         random = np.random.default_rng([self.seed, *take.name.encode()])
         clearance = random.uniform(*CLEARANCE_MM)
@@ -136,22 +160,23 @@ class Limb:
         moved = np.interp(time, path_s, path_mm) + DISPLACEMENT_NOISE_MM * random.standard_normal(time.size)
         force = np.interp(time - touch, found["times"], found["force"], left=0.0, right=0.0)
         force = force + NOISE_N * random.standard_normal(time.size)
+        made = RobotRecord(time, moved, force, clearance, touch, NOISE_N)
         folder.mkdir(parents=True, exist_ok=True)
-        np.savetxt(
-            folder / f"{take.name}.csv", np.column_stack([time, moved, force]), fmt=("%.3f", "%.4f", "%.4f"),
-            delimiter=",", header=HEADER, comments="",
-        )  # fmt: skip
-        if take.seen:
-            time = np.arange(0.0, path_s[-1], 1 / ULTRASOUND_HZ)
-            columns = [time]
-            for tissue in TISSUES:
-                lost = np.interp(time - touch, found["times"], found[f"compression_{tissue}"], left=0.0)
-                noise = ULTRASOUND_NOISE_MM * random.standard_normal(time.size)
-                columns.append(float(found[f"thickness_{tissue}"]) - lost + noise)
-            np.savetxt(
-                folder / f"{take.name}-layers.csv", np.column_stack(columns), fmt="%.3f", delimiter=",",
-                header=",".join(["time_s", *(f"{tissue}_mm" for tissue in TISSUES)]), comments="",
-            )  # fmt: skip
+        made.write(folder / f"{take.name}.csv")
+
+        def at(name: str) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda t: np.interp(t, found["times"], found[name])
+
+        if take.seen.ultrasound:
+            layers = {one: (float(found[f"thickness_{one}"]), at(f"compression_{one}")) for one in TISSUES}
+            write_ultrasound(folder / f"{take.name}-layers.csv", made, layers, random)
+        if take.seen.surface:
+            moves = interp1d(found["times"], found["moves"])
+            own = found["points"], lambda t: moves(np.minimum(t, found["times"][-1]))
+            write_surface(folder / f"{take.name}-surface.csv", made, *own, random)
+        if take.seen.shear_waves:
+            speeds = {one: at(f"speed_{one}") for one in TISSUES}
+            write_waves(folder / f"{take.name}-waves.csv", made, speeds, random)
 
 
 def write_case(
@@ -182,5 +207,6 @@ def write_case(
         name = take.name.removeprefix(f"{take.site}-")
         text += f'\n[[records]]\nsite = "{take.site}"\nname = "{name}"\ntrace = "traces/{take.name}.csv"\n'
         text += 'indenter = "ball"\n' if take.ball else ""
-        text += f'ultrasound = "traces/{take.name}-layers.csv"\n' if take.seen else ""
+        for key, end in (("ultrasound", "layers"), ("surface", "surface"), ("shear_waves", "waves")):
+            text += f'{key} = "traces/{take.name}-{end}.csv"\n' if getattr(take.seen, key) else ""
     (folder / "study.toml").write_text(text, encoding="utf-8")

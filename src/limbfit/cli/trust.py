@@ -58,7 +58,7 @@ def design(
     depths: Annotated[
         str | None,
         typer.Option(
-            help="depths in mm to choose from, such as 3,5; default: the study's; with --protocol also twice it"
+            help="depths in mm to choose from, such as 3,5; default: the study's (--protocol: twice it, too)"
         ),
     ] = None,
     parameters: Annotated[

@@ -162,8 +162,8 @@ def _planned(
         own = model_of(context, one)
         deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
     for site in study.sites:
-        own = deepest[site.name]
-        wanted = depths_mm or (own, DEEPER * own)
+        usual = deepest[site.name]
+        wanted = depths_mm or (usual, DEEPER * usual)
         for name in study.all_indenters:
             model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True)
             if noises.layers is not None:
@@ -178,10 +178,10 @@ def _planned(
                 half = f"half of the tissue's {thickness:.1f} mm"
                 left_out.append(f"site {site.name}: no deeper than {most:.1f} mm, {half}")
             depths = dict.fromkeys(min(depth, most) for depth in wanted)
-            usual = min(depths, key=lambda depth: abs(depth - own))
+            nearest = min(depths, key=lambda depth: abs(depth - usual))
             for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
                 planned = press(model, depth, speed, hold)
-                found.append(Planned(site.name, name, depth, speed, hold, planned, depth == usual))
+                found.append(Planned(site.name, name, depth, speed, hold, planned, depth == nearest))
     return found, list(dict.fromkeys(left_out))
 
 
