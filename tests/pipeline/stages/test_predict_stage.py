@@ -133,6 +133,7 @@ def calibration() -> dict:
         "known_scale": 50.0,
     }
     known = {"covariance_log": np.diag(np.full(8, 0.02**2)).tolist(), "residuals": residuals}
+    known["most_probable"] = to_parameters(BEST, TISSUES)
     return {"stages": stages, "uncertainty": known}
 
 

@@ -273,11 +273,25 @@ def test_an_interval_takes_the_noise_of_what_is_compared() -> None:
         name: {"unit": unit, "compared_noise_sd_N": sd, "misfit_share": 0.0}
         for name, (unit, sd) in rows.items()
     }
-    known = Known(np.zeros((1, 1)), sites, 0.01, 50.0)
+    known = Known(np.zeros((1, 1)), np.ones(1), sites, 0.01, 50.0)
     assert known.residual("3")[0] == pytest.approx(0.2)
     assert known.residual("3-creep", "mm")[0] == pytest.approx(0.02)
     del sites["2-creep"]
     assert known.residual("3-creep", "mm") == (0.0, 0.01)
+
+
+def test_an_interval_covers_the_most_probable_parameters_too() -> None:
+    """Force in proportion to the parameter, whose answer is 10 % above the most probable value."""
+    sites = {"1": {"unit": "N", "compared_noise_sd_N": 0.01, "misfit_share": 0.0}}
+    force = np.linspace(0.0, 5.0, 6)
+    known = Known(np.array([[1e-4]]), np.array([2.0]), sites, 0.0, 1e6)
+    at_it, above = (
+        known.interval_95(SiteResponse(share * force, 0.5 * force[:, None]), np.array([2.0 * share]), "1")
+        for share in (1.0, 1.1)
+    )
+    assert at_it[1] - at_it[0] == pytest.approx(2 * 1.96 * np.hypot(0.01 * force, 0.01), rel=1e-3)
+    assert above[0] == pytest.approx(at_it[0], abs=0.01 * force[-1])
+    assert above[1] - 1.1 * force == pytest.approx(1.96 * np.hypot(0.011 * force, 0.01), rel=1e-3)
 
 
 def test_records_of_force_and_depth_are_never_exchanged() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from .objective import largest
+from .objective import SiteResponse, largest
 
 Array = NDArray[np.float64]
 
@@ -63,9 +63,11 @@ class Known:
 
     ``sites`` are noise and misfit of the fitted sites; ``known_scale`` the independent residuals on which the
     size of the misfit rests; ``site_factor`` how much farther than expected whole sites are off.
+    ``most_probable`` (p,): parameters that are so, which those of the least error need not be.
     """
 
     covariance_log: Array
+    most_probable: Array
     sites: dict[str, dict[str, Any]]
     misfit_elsewhere: float
     known_scale: float
@@ -77,6 +79,7 @@ class Known:
         residuals = uncertainty["residuals"]
         return cls(
             np.array(uncertainty["covariance_log"]),
+            np.array([value for one in uncertainty["most_probable"].values() for value in one.values()]),
             residuals["sites"],
             float(residuals["misfit_elsewhere"]),
             float(residuals["known_scale"]),
@@ -95,25 +98,27 @@ class Known:
         noise = [found["compared_noise_sd_N"] for found in alike]
         return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
-    def half_width_95(
+    def interval_95(
         self,
-        jacobian: Array,
+        response: SiteResponse,
         parameters: Array,
-        peak_N: float,
-        site: str,
+        name: str,
         unit: str = "N",
         site_N: Array | float = 0.0,
-    ) -> Array:
-        """Half the 95 % interval (n,) N of a new record at a site: parameters, misfit of the model, noise.
+    ) -> tuple[Array, Array]:
+        """The 95 % interval (n,) N of a new record at a site: parameters, misfit of the model, noise.
 
-        In mm for one that compares depths (``unit``). As few residuals as the misfit is known from widen it
-        (Student; Satterthwaite's freedom). ``site_N`` (n,) is one standard deviation of what is expected of
-        the stiffness of a site that was not fitted.
+        Of a ``response`` at the ``parameters`` (p,) and of that at the most probable ones. In mm for a record
+        that compares depths (``unit``). As few residuals as the misfit is known from widen it (Student;
+        Satterthwaite's freedom). ``site_N`` (n,) is one standard deviation of what is expected of the
+        stiffness of a site that was not fitted.
         """
-        noise_N, misfit = self.residual(site, unit)
-        misfit_N = misfit * peak_N
+        noise_N, misfit = self.residual(name, unit)
+        misfit_N = misfit * largest(response.force_N)
         own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
-        sd = prediction_sd(jacobian, parameters, self.covariance_log, own_N)
+        sd = prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
         freedom = np.clip(self.known_scale / np.maximum(share, 1e-3) ** 2, 3.0, 1e6)
-        return stdtrit(freedom, 0.975) * sd
+        half, off = stdtrit(freedom, 0.975) * sd, np.log(self.most_probable / parameters)
+        other = response.force_N + response.jacobian @ (parameters * off)
+        return np.minimum(response.force_N, other) - half, np.maximum(response.force_N, other) + half

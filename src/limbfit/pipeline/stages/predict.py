@@ -189,9 +189,8 @@ def _write_curves(context: Context, folder: Path, site: SitePrediction, best: Ar
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
         own = 0.0 if record.site.fitted else site_deviation(context, record, ours, best)
-        half = known.half_width_95(ours.jacobian, best, float(ours.force_N.max()), record.name, unit, own)
-        columns[f"{name}_low_{unit}"] = np.maximum(ours.force_N - half, 0.0)
-        columns[f"{name}_high_{unit}"] = ours.force_N + half
+        low, high = known.interval_95(ours, best, record.name, unit, own)
+        columns |= {f"{name}_low_{unit}": np.maximum(low, 0.0), f"{name}_high_{unit}": high}
     write_curves(folder / f"{record.name}.csv", **columns)
 
 
@@ -214,9 +213,8 @@ def _observed(
         if whole.completed:
             columns[f"{what}_simulated_{unit}"] = whole.force_N
         if ours.completed:
-            peak = largest(ours.force_N)
-            half = known.half_width_95(ours.jacobian, best, peak, one.name, one.unit)
-            columns |= {f"{what}_low_{unit}": ours.force_N - half, f"{what}_high_{unit}": ours.force_N + half}
+            low, high = known.interval_95(ours, best, one.name, one.unit)
+            columns |= {f"{what}_low_{unit}": low, f"{what}_high_{unit}": high}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
             {
