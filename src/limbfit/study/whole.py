@@ -304,12 +304,9 @@ class Study(TomlTable):
         if self.calibration.objective != "paper":
             return self
         for record in self.recorded:
-            why = 'control = "force"' if record.forced else record.observed
-            if why:
-                raise ValueError(
-                    f'{record.name}: {why} compares depths, and objective = "paper" adds squares of '
-                    'forces; use "pointwise"'
-                )
+            if why := 'control = "force"' if record.forced else record.observed:
+                what = f'{record.name}: {why} is no force, and objective = "paper" adds squares of forces'
+                raise ValueError(f'{what}; use "pointwise"')
         return self
 
     @model_validator(mode="after")
@@ -323,11 +320,13 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _stretched_unseen(self) -> Study:
-        seen = [record for record in self.recorded if record.observed]
-        if self.material.prestretch and seen:
-            why = f"{seen[0].name} has {seen[0].observed}, which sees no pre-stretch"
-            raise ValueError(f"material.prestretch: {why}; leave it out")
+    def _strained_unseen(self) -> Study:
+        taut, tense = self.material.prestretch, self.material.course
+        for one in self.recorded:
+            if (taut and one.observed) or (tense and one.shear_waves):
+                key, what = ("prestretch", "pre-stretch") if taut else ("activation", "contraction")
+                seen = one.observed if taut else "shear waves"
+                raise ValueError(f"material.{key}: {one.name} has {seen}, which sees no {what}; leave it out")
         return self
 
     @model_validator(mode="after")
