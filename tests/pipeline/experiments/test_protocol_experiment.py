@@ -87,20 +87,6 @@ def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
         assert one.depth_mm == pytest.approx(row["depth_mm"], abs=1e-3)
 
 
-@pytest.mark.slow
-def test_ultrasound_tells_more_in_the_same_time(found) -> None:
-    study, content = found
-    seen = limbfit.plan_protocol(
-        study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, ultrasound_sd_mm=0.1
-    )
-    rows = {row["design"]: row for row in seen["protocols"]}
-    assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
-    plain = {row["design"]: row for row in content["protocols"]}[PLAIN]
-    assert rows[PLAIN]["factor_95"] == pytest.approx(plain["factor_95"], rel=1e-6)
-    (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
-    assert (record["ultrasound"], record["ultrasound_sd_mm"]) == ("records/1-1-layers.csv", 0.1)
-
-
 def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:
     study, _ = found
     known = unknowns(study)
@@ -132,27 +118,20 @@ def test_it_is_in_the_report(found) -> None:
 
 
 @pytest.mark.slow
-def test_cameras_tell_more_in_the_same_time(found) -> None:
+@pytest.mark.parametrize(
+    ("key", "sd", "end"),
+    [
+        ("ultrasound_sd_mm", 0.1, "layers"),
+        ("surface_sd_mm", 0.05, "surface"),
+        ("shear_waves_sd_m_s", 0.1, "waves"),
+    ],
+)
+def test_what_is_seen_tells_more_in_the_same_time(found, key: str, sd: float, end: str) -> None:
     study, content = found
-    seen = limbfit.plan_protocol(
-        study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, surface_sd_mm=0.05
-    )
+    seen = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, **{key: sd})
     rows = {row["design"]: row for row in seen["protocols"]}
     assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
     plain = {row["design"]: row for row in content["protocols"]}[PLAIN]
     assert rows[PLAIN]["factor_95"] == pytest.approx(plain["factor_95"], rel=1e-6)
     (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
-    assert (record["surface"], record["surface_sd_mm"]) == ("records/1-1-surface.csv", 0.05)
-    assert "ultrasound" not in record
-
-
-@pytest.mark.slow
-def test_elastography_tells_more_in_the_same_time(found) -> None:
-    study, _ = found
-    seen = limbfit.plan_protocol(
-        study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, shear_waves_sd_m_s=0.1
-    )
-    rows = {row["design"]: row for row in seen["protocols"]}
-    assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
-    (record, *_) = tomllib.loads((Path(seen["folder"]) / "records.toml").read_text())["records"]
-    assert (record["shear_waves"], record["shear_waves_sd_m_s"]) == ("records/1-1-waves.csv", 0.1)
+    assert (record[key.partition("_sd")[0]], record[key]) == (f"records/1-1-{end}.csv", sd)

@@ -8,22 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import interp1d
+from seen_blocks import TRUTH, Made, SeenBlock
 
-import layered
-from layered import layered_block, store_blocks
 from limbfit.errors import TraceError
-from limbfit.execution import SerialExecutor
 from limbfit.indentation import (
-    Parameters,
-    SimulationJob,
+    Simulation,
     SiteModel,
     points_around,
     read_indenter,
-    simulate,
 )
-from limbfit.mesh import write_vtu
-from limbfit.phantom.record import Ramp, record, write_surface
-from limbfit.pipeline.shared.context import Context
+from limbfit.mesh import Mesh
+from limbfit.phantom.record import write_surface
 from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.shared.surface_points import MAX_POINTS, ChosenPoints, chosen_points
 from limbfit.pipeline.stages.calibrate import run_calibrate
@@ -33,19 +28,10 @@ from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.observed_figures import surface_figure
 from limbfit.report.site_tables import observed_table
 from limbfit.report.store import load_store
-from limbfit.study import Study, load_study
+from limbfit.study import Study
 from limbfit.traces import SurfaceMotion
 
-BLOCK = (3.0, 12.0)
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
-TEXT = """
-[study]
-name = "a block"
-[surfaces]
-skin = "skin.stl"
+TOOLS = """
 [indenter]
 shape = "sphere"
 width_mm = 12.0
@@ -53,68 +39,32 @@ width_mm = 12.0
 load_steps = 6
 unload_steps = 5
 penalty_per_mm = 200.0
-[mesh.coarse]
-edge_near_mm = 6.0
-[calibration]
-max_iterations = 2
-corrections = 1
-[[sites]]
-name = "a"
-fitted = true
-trace = "a.csv"
-position = [0.0, 0.0, 0.0]
 """
 SEEN = 'surface = "a-surface.csv"\n'
 FRAME = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # edge, across it, axis
 
 
-def study_of(folder: Path, more: str = SEEN) -> Study:
-    for name in ("skin.stl", "a.csv", "a-surface.csv"):
-        (folder / name).touch()
-    (folder / "study.toml").write_text(TEXT + more)
-    return load_study(folder)
+def with_points(model: SiteModel, mesh: Mesh) -> SiteModel:
+    points = points_around(mesh, read_indenter(model.indenter, model.position, model.axis, None))
+    return replace(model, skin_points=tuple(map(tuple, points)))
 
 
-def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
-    """A study of a block, whose record and surface come from the same mesh and element."""
-    mesh = layered_block(BLOCK, ("skin", "muscle"), 24.0, 6, 4.0)
+def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) -> None:
+    whole, times, random = made
+    points, axes = np.array(model.skin_points), np.eye(3)
+    if study.recorded[0].surface_frame == "site":
+        axes = FRAME
+    moves = interp1d(times, found.observed.reshape(len(points), 3, -1))
+    write_surface(
+        study.path(Path("a-surface.csv")),
+        whole,
+        points @ axes.T,
+        lambda t: np.einsum("ij,kjn->kin", axes, moves(np.minimum(t, times[-1]))),
+        random,
+    )
 
-    def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
-        write_vtu(mesh, folder / "truth.vtu")
-        model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", element=study.mesh.element)
-        points = points_around(mesh, read_indenter(model.indenter, model.position, model.axis, None))
-        times = np.linspace(0.0, model.knots_s[-1], 201)
-        job = SimulationJob(
-            replace(model, skin_points=tuple(map(tuple, points))),
-            study.tissues,
-            tuple(study.vector(truth)),
-            tuple(times),
-            False,
-        )
-        found = simulate(job)
-        made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
-        made.write(study.path(Path("a.csv")))
-        moves = interp1d(times, found.observed.reshape(len(points), 3, -1))
-        if study.recorded[0].surface_frame == "site":
-            points = points @ FRAME.T
-            write_surface(
-                folder / "a-surface.csv",
-                made,
-                points,
-                lambda t: np.einsum("ij,kjn->kin", FRAME, moves(np.minimum(t, times[-1]))),
-                random,
-            )
-        else:
-            write_surface(
-                folder / "a-surface.csv", made, points, lambda t: moves(np.minimum(t, times[-1])), random
-            )
 
-    monkeypatch.setattr(layered, "_write_record", write)
-    study = study_of(folder, more)
-    store = store_blocks(study, {"a": (BLOCK, 3.0, True)}, TRUTH, 6, coarse=6)
-    for place in (store["mesh"], store["mesh"] / "coarse"):
-        write_vtu(mesh, place / "a.vtu")
-    return Context(study, store, SerialExecutor(), lambda event: None)
+BLOCK = SeenBlock((3.0, 12.0), 24.0, 4.0, 6, TOOLS, "a-surface.csv", with_points, write_seen)
 
 
 @pytest.mark.slow
@@ -127,7 +77,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
     widths = []
     for name, more in (("force", ""), ("both", SEEN)):
         (tmp_path / name).mkdir()
-        context = stored(tmp_path / name, monkeypatch, more)
+        context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
         laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))
@@ -172,7 +122,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
 @pytest.mark.slow
 def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch) -> None:
     """The same points and the same moves, along the axis alone."""
-    context = stored(tmp_path, monkeypatch, SEEN + 'surface_frame = "site"\nedge = [0.0, 1.0, 0.0]\n')
+    context = BLOCK.stored(tmp_path, monkeypatch, SEEN + 'surface_frame = "site"\nedge = [0.0, 1.0, 0.0]\n')
     file = context.study.path(Path("a-surface.csv"))
     rows = np.loadtxt(file, delimiter=",", skiprows=1)
     np.savetxt(
@@ -193,7 +143,7 @@ PLACE = ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 def chosen(study: Study, points: np.ndarray | list) -> ChosenPoints:
     """Of points that all go down, on the block's top."""
-    mesh = layered_block(BLOCK, ("skin", "muscle"), 24.0, 6, 4.0)
+    mesh = BLOCK.mesh()
     moved = np.tile([0.0, 0.0, -1.0], (1, len(points), 1))
     motion = SurfaceMotion(np.asarray(points, dtype=float), np.array([1.0]), moved)
     skin = mesh.points, mesh.face_sets["skin"]
@@ -202,7 +152,8 @@ def chosen(study: Study, points: np.ndarray | list) -> ChosenPoints:
 
 def test_points_that_are_not_compared_are_counted(tmp_path: Path) -> None:
     found = chosen(
-        study_of(tmp_path), [[8, 0, 0.4], [0, 20, 0], [3, 0, 0], [0, -9, 6], [41, 0, 0], [30.5, 0, 0]]
+        BLOCK.study(tmp_path, SEEN),
+        [[8, 0, 0.4], [0, 20, 0], [3, 0, 0], [0, -9, 6], [41, 0, 0], [30.5, 0, 0]],
     )
     assert found.which.tolist() == [0, 1]
     assert found.points[0] == pytest.approx((8.0, 0.0, 0.0))
@@ -219,7 +170,7 @@ def test_points_that_are_not_compared_are_counted(tmp_path: Path) -> None:
 def test_many_points_are_thinned_evenly(tmp_path: Path) -> None:
     x, y = np.meshgrid(np.arange(-20.0, 20.1, 2.0), np.arange(-20.0, 20.1, 2.0))
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    found = chosen(study_of(tmp_path), points)
+    found = chosen(BLOCK.study(tmp_path, SEEN), points)
     assert len(found.which) == MAX_POINTS
     assert found.left_out["thinned out, to 30"] == x.size - MAX_POINTS - found.left_out["under the indenter"]
     kept = np.array(found.points)
@@ -243,5 +194,5 @@ def test_many_points_are_thinned_evenly(tmp_path: Path) -> None:
 def test_a_surface_elsewhere_is_refused(tmp_path: Path, frame: str, points: list, told: str) -> None:
     more = SEEN + f'surface_frame = "{frame}"\n' * (frame == "site")
     with pytest.raises(TraceError, match=told) as caught:
-        chosen(study_of(tmp_path, more), np.array(points))
+        chosen(BLOCK.study(tmp_path, more), np.array(points))
     assert caught.value.file == tmp_path / "a-surface.csv"

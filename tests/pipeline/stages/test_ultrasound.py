@@ -7,24 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from seen_blocks import TRUTH, Made, SeenBlock
 
 import layered
-from layered import layered_block, store_blocks
+from layered import layered_block
 from limbfit.bench.blocks import block_site
 from limbfit.bench.blocks import layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
-from limbfit.execution import SerialExecutor
-from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, to_vector
-from limbfit.mesh import gauges_along, write_vtu
-from limbfit.phantom.record import Ramp, record, write_ultrasound
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
+from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
+from limbfit.mesh import gauges_along
+from limbfit.phantom.record import write_ultrasound
+from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.observed_figures import layer_figure
 from limbfit.report.store import load_store
-from limbfit.study import SolverTable, Study, load_study
+from limbfit.study import SolverTable, Study
 from limbfit.traces import Layers, read_layers, thinnings
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -135,16 +134,7 @@ def test_readings_must_begin_before_and_last_into_contact() -> None:
         thinnings(layers, 2.98, 9.0, 0.1)
 
 
-BLOCK = (3.0, 9.0)
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
-TEXT = """
-[study]
-name = "a block"
-[surfaces]
-skin = "skin.stl"
+TOOLS = """
 [indenter]
 width_mm = 10.0
 edge_radius_mm = 2.0
@@ -152,47 +142,28 @@ edge_radius_mm = 2.0
 load_steps = 8
 unload_steps = 8
 penalty_per_mm = 100.0
-[mesh.coarse]
-edge_near_mm = 6.0
-[calibration]
-max_iterations = 2
-corrections = 1
-[[sites]]
-name = "a"
-fitted = true
-trace = "a.csv"
-position = [0.0, 0.0, 0.0]
 """
 
 
-def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
-    """A study of a block, whose record and ultrasound come from the same mesh and element."""
-    mesh = layered_block(BLOCK, ("skin", "muscle"), 12.0, 6, 3.0)
+def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) -> None:
+    whole, times, random = made
+    layers = {
+        tissue: (thick, lambda t, lost=lost: np.interp(t, times, lost))
+        for tissue, thick, lost in zip(model.layers, BLOCK.thickness, found.observed, strict=True)
+    }
+    write_ultrasound(study.path(Path("a-layers.csv")), whole, layers, random)
 
-    def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
-        write_vtu(mesh, folder / "truth.vtu")
-        model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", layers=study.tissues)
-        model = replace(model, element=study.mesh.element)
-        times = np.linspace(0.0, model.knots_s[-1], 201)
-        job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
-        found = simulate(job)
-        made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
-        made.write(study.path(Path("a.csv")))
-        layers = {
-            tissue: (thick, lambda t, lost=lost: np.interp(t, times, lost))
-            for tissue, thick, lost in zip(study.tissues, BLOCK, found.observed, strict=True)
-        }
-        write_ultrasound(folder / "a-layers.csv", made, layers, random)
 
-    monkeypatch.setattr(layered, "_write_record", write)
-    for name in ("skin.stl", "a.csv", "a-layers.csv"):
-        (folder / name).touch()
-    (folder / "study.toml").write_text(TEXT + more)
-    study = load_study(folder)
-    store = store_blocks(study, {"a": (BLOCK, 3.0, True)}, TRUTH, 4, coarse=4)
-    for place in (store["mesh"], store["mesh"] / COARSE):
-        write_vtu(mesh, place / "a.vtu")
-    return Context(study, store, SerialExecutor(), lambda event: None)
+BLOCK = SeenBlock(
+    (3.0, 9.0),
+    12.0,
+    3.0,
+    4,
+    TOOLS,
+    "a-layers.csv",
+    lambda model, mesh: replace(model, layers=("skin", "muscle")),
+    write_seen,
+)
 
 
 @pytest.mark.slow
@@ -201,7 +172,7 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
     widths = []
     for name, more in (("force", ""), ("both", 'ultrasound = "a-layers.csv"\n')):
         (tmp_path / name).mkdir()
-        context = stored(tmp_path / name, monkeypatch, more)
+        context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
         laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from seen_blocks import TRUTH, Made, SeenBlock
 
-import layered
-from layered import layered_block, store_blocks
 from limbfit.errors import TraceError
-from limbfit.execution import SerialExecutor
-from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate, waves_under
-from limbfit.mesh import write_vtu
-from limbfit.phantom.record import Ramp, record, write_waves
+from limbfit.indentation import Simulation, SiteModel, waves_under
+from limbfit.phantom.record import write_waves
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache, recorded_model
 from limbfit.pipeline.stages.calibrate import run_calibrate
@@ -24,18 +21,9 @@ from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.observed_figures import wave_figure
 from limbfit.report.site_tables import observed_table
 from limbfit.report.store import load_store
-from limbfit.study import Study, load_study
+from limbfit.study import Study
 
-BLOCK = (3.0, 9.0)
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
-TEXT = """
-[study]
-name = "a block"
-[surfaces]
-skin = "skin.stl"
+TOOLS = """
 [indenter]
 width_mm = 10.0
 edge_radius_mm = 2.0
@@ -43,48 +31,29 @@ edge_radius_mm = 2.0
 load_steps = 8
 unload_steps = 8
 penalty_per_mm = 100.0
-[mesh.coarse]
-edge_near_mm = 6.0
-[calibration]
-max_iterations = 2
-corrections = 1
-[[sites]]
-name = "a"
-fitted = true
-trace = "a.csv"
-position = [0.0, 0.0, 0.0]
 """
 WAVES = 'shear_waves = "a-waves.csv"\n'
 
 
-def stored(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
-    """A study of a block, whose record and shear waves come from the same mesh and element."""
-    mesh = layered_block(BLOCK, ("skin", "muscle"), 12.0, 6, 3.0)
+def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) -> None:
+    whole, times, random = made
+    speeds = {
+        place.tissue: lambda t, row=row: np.interp(t, times, row)
+        for place, row in zip(model.waves, found.observed, strict=True)
+    }
+    write_waves(study.path(Path("a-waves.csv")), whole, speeds, random)
 
-    def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
-        write_vtu(mesh, folder / "truth.vtu")
-        model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", element=study.mesh.element)
-        model = replace(model, waves=waves_under(model, mesh))
-        times = np.linspace(0.0, model.knots_s[-1], 201)
-        job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
-        found = simulate(job)
-        made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, found.force_N), random)
-        made.write(study.path(Path("a.csv")))
-        speeds = {
-            place.tissue: lambda t, row=row: np.interp(t, times, row)
-            for place, row in zip(model.waves, found.observed, strict=True)
-        }
-        write_waves(folder / "a-waves.csv", made, speeds, random)
 
-    monkeypatch.setattr(layered, "_write_record", write)
-    for name in ("skin.stl", "a.csv", "a-waves.csv"):
-        (folder / name).touch()
-    (folder / "study.toml").write_text(TEXT + more)
-    study = load_study(folder)
-    store = store_blocks(study, {"a": (BLOCK, 3.0, True)}, TRUTH, 4, coarse=4)
-    for place in (store["mesh"], store["mesh"] / "coarse"):
-        write_vtu(mesh, place / "a.vtu")
-    return Context(study, store, SerialExecutor(), lambda event: None)
+BLOCK = SeenBlock(
+    (3.0, 9.0),
+    12.0,
+    3.0,
+    4,
+    TOOLS,
+    "a-waves.csv",
+    lambda model, mesh: replace(model, waves=waves_under(model, mesh)),
+    write_seen,
+)
 
 
 @pytest.mark.slow
@@ -94,7 +63,7 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     widths = []
     for name, more in (("force", ""), ("both", WAVES)):
         (tmp_path / name).mkdir()
-        context = stored(tmp_path / name, monkeypatch, more)
+        context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
         laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))
@@ -142,7 +111,7 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     ],
 )
 def test_a_place_that_is_not_there_is_refused(tmp_path: Path, monkeypatch, name: str, told: str) -> None:
-    context = stored(tmp_path, monkeypatch, WAVES)
+    context = BLOCK.stored(tmp_path, monkeypatch, WAVES)
     file = tmp_path / "a-waves.csv"
     file.write_text(file.read_text().replace("skin_m_s", name))
     with pytest.raises(TraceError, match=told) as caught:

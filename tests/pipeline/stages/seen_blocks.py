@@ -1,0 +1,90 @@
+"""Studies of one block, whose record, and what is seen beside it, come from the same mesh and element."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import layered
+from layered import layered_block, store_blocks
+from limbfit.execution import SerialExecutor
+from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel, simulate
+from limbfit.mesh import Mesh, write_vtu
+from limbfit.phantom.record import Ramp, RobotRecord, record
+from limbfit.pipeline.shared.context import Context
+from limbfit.study import Study, load_study
+
+TRUTH = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
+TEXT = """
+[study]
+name = "a block"
+[surfaces]
+skin = "skin.stl"
+{}
+[mesh.coarse]
+edge_near_mm = 6.0
+[calibration]
+max_iterations = 2
+corrections = 1
+[[sites]]
+name = "a"
+fitted = true
+trace = "a.csv"
+position = [0.0, 0.0, 0.0]
+"""
+Made = tuple[RobotRecord, np.ndarray, np.random.Generator]  # and the times of its simulation, s
+
+
+@dataclass(frozen=True)
+class SeenBlock:
+    """A block of skin over muscle, mm, ``half`` as wide, and how it is indented.
+
+    ``wanted`` says of a model on its mesh what is seen; ``write`` writes it, of the simulation.
+    """
+
+    thickness: tuple[float, float]
+    half: float
+    growth: float
+    divisions: int
+    tools: str
+    seen: str
+    wanted: Callable[[SiteModel, Mesh], SiteModel]
+    write: Callable[[Study, SiteModel, Simulation, Made], None]
+
+    def mesh(self) -> Mesh:
+        return layered_block(self.thickness, ("skin", "muscle"), self.half, 6, self.growth)
+
+    def study(self, folder: Path, more: str = "") -> Study:
+        for name in ("skin.stl", "a.csv", self.seen):
+            (folder / name).touch()
+        (folder / "study.toml").write_text(TEXT.format(self.tools) + more)
+        return load_study(folder)
+
+    def stored(self, folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
+        """A study with ``more`` said of its site, and what the stages before a calibration make."""
+        mesh = self.mesh()
+
+        def write(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+            write_vtu(mesh, folder / "truth.vtu")
+            model = replace(model, mesh=folder / "truth.vtu", mesh_digest="truth", element=study.mesh.element)
+            model, times = self.wanted(model, mesh), np.linspace(0.0, model.knots_s[-1], 201)
+            job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
+            found = simulate(job)
+            ramp = Ramp(max(model.knots_mm), 0.96)
+            made = record(ramp, lambda t: np.interp(t, times, found.force_N), random)
+            made.write(study.path(Path("a.csv")))
+            self.write(study, model, found, (made, times, random))
+
+        monkeypatch.setattr(layered, "_write_record", write)
+        study, n = self.study(folder, more), self.divisions
+        store = store_blocks(study, {"a": (self.thickness, 3.0, True)}, TRUTH, n, coarse=n)
+        for place in (store["mesh"], store["mesh"] / "coarse"):
+            write_vtu(mesh, place / "a.vtu")
+        return Context(study, store, SerialExecutor(), lambda event: None)
