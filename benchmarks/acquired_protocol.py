@@ -36,7 +36,7 @@ from limbfit.pipeline.shared.store import Store
 
 COMMAND = (sys.executable, "-m", "limbfit")
 SPEEDS_MM_S, HOLD_S, REST_S = (4.8, 0.96), 30.0, 10.0
-BEYOND = 1.15  # of the planned depth, to which the limb is known
+BEYOND = 1.15  # of the deepest record of a site, to which the limb is known
 FASTER = 50  # than the wall's clock
 TRUE_LIMB = """
 [study]
@@ -105,9 +105,12 @@ def true_limb(folder: Path, plan: Path) -> Path:
         cut=f"proximal_cut = {{ point = {facts['cut_point']}, normal = {facts['cut_normal']} }}",
     )
     study = limbfit.load_study(plan)
-    placed = {row["site"]: row for row in Store(study.results).read("sites", "sites.json")["sites"]}
+    store = Store(study.results)
+    placed = {row["site"]: row for row in store.read("sites", "sites.json")["sites"]}
+    designed = store.read("protocol", "protocol.json")["records"]
     for site in study.sites:
-        text += SITE.format(name=site.name, position=placed[site.name]["position_mm"], depth=site.depth_mm)
+        depths = [site.depth_mm or 0.0, *(row["depth_mm"] for row in designed if row["site"] == site.name)]
+        text += SITE.format(name=site.name, position=placed[site.name]["position_mm"], depth=max(depths))
     (place / "study.toml").write_text(text)
     limb = limbfit.load_study(place)
     limbfit.run_study(limb, until="mesh", listener=quiet)
