@@ -135,7 +135,7 @@ def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch)
     assert set(seen.seen.components.tolist()) == {2}
     assert seen.compared.max() > 0.2  # into the limb
     off = at.responses[1].force_N - seen.compared
-    assert np.sqrt(np.mean(off**2)) < 1.3 * seen.seen.noise_mm
+    assert np.sqrt(np.mean(off**2)) < 1.3 * seen.seen.noise_sd
 
 
 PLACE = ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
