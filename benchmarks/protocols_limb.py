@@ -126,9 +126,8 @@ class Limb:
         model = SiteModel(take.name, Path(), "", position, axis, *take.knots, indenter=indenter)
         gauges = gauges_along(mesh, np.array(position), np.array(axis))
         points, waves = np.zeros((0, 3)), ()
-        if take.seen.surface:
+        if take.seen.surface or take.seen.shear_waves:
             points = points_around(mesh, read_indenter(indenter, position, axis, None))
-        if take.seen.shear_waves:
             waves = waves_under(model, mesh)
         model = replace(model, layers=tuple(one.region for one in gauges), waves=waves)
         model = replace(model, skin_points=tuple(map(tuple, points)))

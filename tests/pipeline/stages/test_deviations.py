@@ -52,9 +52,9 @@ def test_thin_tissue_is_stiffer_by_its_thickness() -> None:
 def test_a_site_is_off_by_its_surfaces_and_a_little_more(tmp_path: Path) -> None:
     found = context(tmp_path)
     radius = 20.0 / np.sqrt(np.pi)
-    share = expected_share(found.study, over_bone(found), 0.5)
+    share = expected_share(over_bone(found).model, 0.5)
     assert share == pytest.approx(np.hypot(LEAST_SHARE, by_thickness(radius, 18.0) * 0.5 / 18.0), rel=0.02)
-    assert expected_share(found.study, site_record(found, found.study.recorded[0]), 0.5) == LEAST_SHARE
+    assert expected_share(site_record(found, found.study.recorded[0]).model, 0.5) == LEAST_SHARE
 
 
 def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
@@ -81,4 +81,4 @@ def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None
     jacobian[:, moduli] = np.linspace(0, 1, 5)[:, None]
     jacobian[:, moduli[0] + 1] = 7.0
     off = site_deviation(found, record, SiteResponse(np.ones(5), jacobian), parameters)
-    assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * expected_share(found.study, record, GIVEN_MM))
+    assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * expected_share(record.model, GIVEN_MM))

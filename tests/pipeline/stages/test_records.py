@@ -105,7 +105,7 @@ WRONG = {
     "paper": (
         'indenter = "ball"',
         'control = "force"\n[calibration]\nobjective = "paper"',
-        '1-ball: control = "force" compares depths',
+        '1-ball: control = "force" is no force',
     ),
     "times": ("peak_s = 4.0", "peak_s = 4.0\ntouch_down_s = 5.0", "touch_down_s must come before peak_s"),
 }  # fmt: skip

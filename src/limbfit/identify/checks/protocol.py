@@ -107,12 +107,15 @@ def _of_each(values: Array, slopes: Array, parameters: Array, noise: NoiseModel)
 class Option:
     """A record that could be made: ``information`` (d, p, p) on log(parameters) at each draw.
 
-    ``place`` is what is prepared for it, a site with an indenter; records at one place share that time.
+    ``place`` is what is prepared for it, a site with an indenter; records at one place share that time. The
+    site's tissue may be stiffer as a whole, for all of its records, by a share with standard deviation
+    ``site_share``.
     """
 
     place: tuple[str, str]
     seconds: float
     information: Array
+    site_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -128,17 +131,34 @@ class Wanted:
     """What is to be determined: ``rows`` (k, p) times log(parameters); ``prior`` (p, p) information is given.
 
     Rows of the unit matrix are parameters; others are what follows from them, such as a pressure's logarithm.
+    ``stiffness`` (p,) is 1 for parameters that are moduli: how they change where a site is stiffer. None: no
+    site is.
     """
 
     prior: Array
     rows: Array
     criterion: Criterion = "D"
+    stiffness: Array | None = None
 
     def covariances(self, options: Sequence[Option], chosen: Sequence[int], draws: int) -> Array:
-        """Of log(parameters) (d, p, p) at each of the draws."""
+        """Of log(parameters) (d, p, p) at each of the draws.
+
+        What the records of a site tell together is less by what its own stiffness takes away, which they
+        share: the information with that as one more parameter, of known spread, that is then left out.
+        """
         total = np.repeat(self.prior[None], draws, axis=0)
+        sites: dict[str, list[Option]] = {}
         for i in chosen:
-            total = total + options[i].information
+            sites.setdefault(options[i].place[0], []).append(options[i])
+        for own in sites.values():
+            told = np.array([one.information for one in own])
+            total = total + told.sum(axis=0)
+            if self.stiffness is None:
+                continue
+            share = np.array([one.site_share for one in own])
+            along = np.einsum("r,rdij,j->di", share, told, self.stiffness)
+            alone = 1.0 + np.einsum("r,rdij,i,j->d", share**2, told, self.stiffness, self.stiffness)
+            total = total - along[:, :, None] * along[:, None, :] / alone[:, None, None]
         return np.asarray(np.linalg.inv(total))
 
     def of_wanted(self, covariances: Array) -> Array:
@@ -240,4 +260,4 @@ def _exchanged(start: Sequence[int], options: Sequence[Option], budget: Budget, 
 
 def _nothing(option: Option) -> Option:
     """A record that takes longer than any session: it is not chosen again."""
-    return Option(option.place, float("inf"), option.information)
+    return replace(option, seconds=float("inf"))

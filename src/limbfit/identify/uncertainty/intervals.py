@@ -88,13 +88,16 @@ def sampled_uncertainty(
     simulate: Simulate,
     evaluations: int = _MOST_EVALUATIONS,
     seed: int = 0,
+    moves: bool = True,
 ) -> Uncertainty:
     """``known`` with sampled intervals, combinations, verdicts and correlations.
 
+    The answer ``moves`` to what is most probable, or stays.
+
     Parameters
     ----------
-    known : linearised (``estimate_uncertainty``); its covariance of the residuals is used, and its covariance
-        of the answer stays.
+    known : linearised (``estimate_uncertainty``); its covariance of the residuals is used, and that of the
+        answer, or of what is most probable.
     space : of the calibration's last stage.
     kept : what the calibration simulated.
     simulate : for so many further ``evaluations``; one that fails is tried again half-way.
@@ -117,7 +120,11 @@ def sampled_uncertainty(
     for _ in range(evaluations):
         now = likelihood()
         _learn(runs, simulate, _most_probable(now, _sample(now, runs, seed)))
-    return both_readings(known, _sample(likelihood(), runs, seed, last=True), unknowns, space)
+    posterior = _sample(likelihood(), runs, seed, last=True)
+    if moves:
+        known = moved(known, unknowns, space.expand(space.reduce(np.log(posterior.median))))
+    found = both_readings(known, posterior, unknowns, space)
+    return replace(found, centre=known.parameters) if moves else found
 
 
 def _sample(likelihood: Likelihood, runs: KeptRuns, seed: int, last: bool = False) -> Posterior:
@@ -141,12 +148,23 @@ def _most_probable(likelihood: Likelihood, posterior: Posterior) -> Array:
 
 
 def _learn(runs: KeptRuns, simulate: Simulate, point: Array) -> None:
-    """Simulate at a point, in six digits so that a run taken up again asks for the very same; once more
-    half-way to the best that completed where that fails."""
-    point = np.array([float(f"{value:.6g}") for value in point])
+    """Simulate at a point; once more half-way to the best that completed where that fails."""
+    point = _six_digits(point)
     if not runs.add(point, simulate(point)):
         half = np.sqrt(point * runs.points[0])
         runs.add(half, simulate(half))
+
+
+def moved(known: Uncertainty, unknowns: Unknowns, parameters: Array) -> Uncertainty:
+    """``known`` about the most probable ``parameters`` (p,), in six digits."""
+    answer = _six_digits(parameters)
+    at_bound = tuple(map(bool, unknowns.at_bound(answer)))
+    return replace(known, parameters=answer, covariance=known.about_centre, at_bound=at_bound)
+
+
+def _six_digits(point: Array) -> Array:
+    """A point that a run taken up again comes to as well."""
+    return np.array([float(f"{value:.6g}") for value in point])
 
 
 def both_readings(

@@ -61,8 +61,9 @@ class Uncertainty:
     """What is known of the answer: linearised there, or with intervals that were sampled (``intervals``).
 
     ``method`` says which. ``centre`` (p,) are the most probable parameters; ``covariance`` (p, p) is that of
-    the answer's logarithms about the truth, always linearised, and ``sampling_covariance`` (p, p) the part of
-    it that records cause, the scatter of answers to other records with the same priors. ``correlation``
+    the answer's logarithms about the truth, always linearised, ``about_centre`` (p, p) that of the most
+    probable ones, and ``sampling_covariance`` (p, p) the part of it that records cause, the scatter of
+    answers to other records with the same priors. ``correlation``
     (p, p) is of the logarithms, ``intervals_95`` (p, 2) are of the parameters and lie between the bounds;
     ``degrees_of_freedom`` (p,) belong to the linearised ones. ``combinations`` are the principal axes, the
     best known first. ``prior_share`` and ``wider_without`` (p,): see `Beliefs.shares`.
@@ -72,6 +73,7 @@ class Uncertainty:
     parameters: Array
     centre: Array
     covariance: Array
+    about_centre: Array
     sampling_covariance: Array
     correlation: Array
     intervals_95: Array
@@ -131,14 +133,17 @@ class _Linear:
 
     ``centre`` (k,) is where generalised least squares by noise and misfit would go, with covariance ``best``
     (k, k); the calibration's own weights are not those. Where the two are farther apart than noise and misfit
-    explain, the rest counts as one more deviation: intervals must not say more than two readings of the same
-    residuals agree on.
+    explain, the rest counts as one more deviation of the answer: its intervals must not say more than two
+    readings of the same residuals agree on. ``about_centre`` (k, k) is without that. It is the covariance of
+    the calibration's own estimator, which no details of the records make small, and more than that of what
+    is most probable (Gauss and Markov).
     """
 
     z: Array
     centre: Array
     best: Array
     covariance: Array
+    about_centre: Array
     by_records: Array
     by_misfit: Array
     known_scale: float
@@ -173,6 +178,7 @@ class _Linear:
             centre=centre,
             best=best,
             covariance=_symmetric(covariance + apart),
+            about_centre=_symmetric(covariance),
             by_records=_symmetric(by_records),
             by_misfit=by_misfit + apart,
             known_scale=model.known_scale,
@@ -238,6 +244,7 @@ def _told(
         parameters=parameters,
         centre=np.exp(space.logarithms(linear.centre)),
         covariance=covariance,
+        about_centre=space.tie @ linear.about_centre @ space.tie.T,
         sampling_covariance=space.tie @ linear.by_records @ space.tie.T,
         correlation=covariance / np.outer(sd, sd),
         intervals_95=np.stack([low, high], axis=1),

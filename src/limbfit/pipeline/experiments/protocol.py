@@ -33,6 +33,7 @@ from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.planned import Planned, press, write_records
 from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
+from ..stages.deviations import expected_share, is_modulus, surface_error_mm
 from ..stages.laboratory import unknowns
 from .design import DEEPEST_SHARE
 
@@ -80,7 +81,8 @@ def run_protocol(
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     budget = Budget(60.0 * minutes, setup_s)
-    wanted = Wanted(bounds_information(known), rows, "A" if criterion == "A" else "D")
+    stiffness = is_modulus(study).astype(np.float64)
+    wanted = Wanted(bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness)
     plans, told_by = _plans_told(found, options, blind if noises.sees_more else None, budget, wanted)
     told = [
         _row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
@@ -231,7 +233,9 @@ def _options(
                 left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
     places = [(planned[k].site, planned[k].tool) for k in kept]
     seconds = [planned[k].seconds + rest_s for k in kept]
-    seeing, blind = (list(map(Option, places, seconds, info[kept])) for info in infos)
+    off_mm = surface_error_mm(context)
+    shares = [expected_share(planned[k].model, off_mm) for k in kept]
+    seeing, blind = (list(map(Option, places, seconds, info[kept], shares)) for info in infos)
     return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
 
 

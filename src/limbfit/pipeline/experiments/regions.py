@@ -127,7 +127,7 @@ def _row(
     """What ``regions.json`` holds of a region."""
     study, found = context.study, fit.calibration
     fitted, mine = chosen
-    known = laboratory.uncertainty(found, groupings(study)[-1], folder / "coarser")
+    _, known = laboratory.uncertainty(found, groupings(study)[-1], folder / "coarser", moves=False)
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, key), limits in zip(study.parameters, known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits

@@ -46,8 +46,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     with laboratory.meshing(folder / "coarser") as meshed:
         tried = multistart(run, unknowns(study), table.starts, table.seed, stages[0])
         meshed()
-    found = tried.best
-    known = laboratory.uncertainty(found, stages[-1], folder / "coarser")
+    found, known = laboratory.uncertainty(tried.best, stages[-1], folder / "coarser")
     rounds = rounds_of[tried.number]
     answers = laboratory.answer(found.parameters)
     for site, texts in laboratory.warnings.items():

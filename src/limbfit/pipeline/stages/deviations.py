@@ -74,14 +74,14 @@ def site_deviation(context: Context, record: SiteRecord, response: SiteResponse,
 
     In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,).
     """
-    share = expected_share(context.study, record, surface_error_mm(context))
-    return np.asarray(response.jacobian @ (parameters * _is_modulus(context.study)) * share)
+    share = expected_share(record.model, surface_error_mm(context))
+    return np.asarray(response.jacobian @ (parameters * is_modulus(context.study)) * share)
 
 
-def expected_share(study: Study, record: SiteRecord, surface_mm: float) -> float:
-    """Standard deviation of the force at a record's site over the force itself."""
-    radius = contact_radius(study.indenter_of(record.record))
-    thickness = bone_distance_mm(record.model)
+def expected_share(model: SiteModel, surface_mm: float) -> float:
+    """Standard deviation of the force at a site over the force itself, where surfaces are off by as much."""
+    radius = contact_radius(model.indenter)
+    thickness = bone_distance_mm(model)
     if thickness is None:  # a half-space has no thickness to be wrong
         return LEAST_SHARE
     return float(np.hypot(LEAST_SHARE, by_thickness(radius, thickness) * surface_mm / thickness))
@@ -122,5 +122,6 @@ def _distance(file: Path, digest: str, position: tuple[float, float, float]) -> 
     return float(np.linalg.norm(mesh.points[bone] - np.array(position), axis=1).min())
 
 
-def _is_modulus(study: Study) -> NDArray[np.bool_]:
+def is_modulus(study: Study) -> NDArray[np.bool_]:
+    """Which of the study's parameters are moduli, in flat order."""
     return np.array([name in study.law.moduli for _, name in study.parameters])

@@ -18,6 +18,7 @@ from ...identify.fit.calibration import calibrate
 from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
 from ...identify.fit.inside import go_on
+from ...identify.fit.moving import moved
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
@@ -41,9 +42,8 @@ COARSER = 1.3  # times the edges: another mesh that tells the error of the study
 # In logarithms of parameters: another simulation's states save work as first guesses as far as NEAR, and half
 # of it within CLOSE; one that is farther than that is the next one's start.
 NEAR, CLOSE, MOST_STARTS = 1.5, 0.35, 8
-ONLY_LINEARISED = (
-    "too few simulations completed near the answer: its intervals are linearised, and too narrow"
-)
+ONLY_LINEARISED = "too few simulations completed near the answer: its intervals are linearised, too narrow"
+STAYS = "what is most probable cannot be simulated, and the least squares are the answer"
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -153,8 +153,7 @@ class Laboratory:
         RunError
             Where a site cannot be simulated there.
         """
-        found = self.search(parameters)
-        anchored = Anchored(found, list, ())
+        anchored = Anchored(found := self.search(parameters), list, ())
         if self.is_apart:
             correction = CoarseToFine(found, self.check(parameters))
             anchored = Anchored(correction(found), correction, ())
@@ -165,10 +164,13 @@ class Laboratory:
                 raise RunError(f"site {one.site} cannot be simulated at the answer: {one.reason}")
         return anchored
 
-    def uncertainty(self, found: Calibration, grouping: Grouping, meshes: Path) -> Uncertainty:
-        """What the records tell about an answer, sampled on what was simulated near it and a little more.
+    def uncertainty(
+        self, found: Calibration, grouping: Grouping, meshes: Path, moves: bool = True
+    ) -> tuple[Calibration, Uncertainty]:
+        """The answer, which ``moves`` to what is most probable, and what the records tell about it.
 
-        Where that cannot be, for simulations that fail, it is linearised and a line says so. ``meshes`` is a
+        Sampled on what was simulated near it and a little more; linearised, and the answer stays, where that
+        cannot be for simulations that fail. It stays, too, where the paper's fit is wanted. ``meshes`` is a
         folder for the coarser meshes that tell the error of the study's own, where it has no others.
         """
         study, spent = self.context.study, 0
@@ -177,8 +179,7 @@ class Laboratory:
             anchored = self.anchored(found.parameters)
         if study.mesh.coarse is None and (coarser := self._coarser(meshes)):
             searched = self.search(found.parameters) if self.is_apart else anchored.responses
-            lacking = self._mesh_error(found.parameters, searched, coarser)
-            anchored = replace(anchored, mesh_N=lacking)
+            anchored = replace(anchored, mesh_N=self._mesh_error(found.parameters, searched, coarser))
             spent = self.simulated
         known = linearised(self.context, self.records, found.parameters, anchored)
         kept = KeptRuns()
@@ -189,13 +190,20 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, "a further evaluation, for the intervals")
             return anchored.as_fine(self.search(parameters))
 
-        bounds = unknowns(study)
-        space = search_space(bounds, grouping)
+        space = search_space(bounds := unknowns(study), grouping)
         evaluations = further_evaluations(self.simulated, spent)
-        sampled = sampled_uncertainty(known, self.measured, bounds, space, kept, simulate, evaluations)
+        about = known, self.measured, bounds, space, kept, simulate, evaluations
+        stays = not moves or "paper" in (study.calibration.objective, study.calibration.stopping)
+        sampled = sampled_uncertainty(*about, moves=not stays)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
-        return sampled
+        if stays or sampled.method == LINEARISED:
+            return found, sampled
+        answer = moved(found, sampled.parameters, self.measured, simulate(sampled.parameters), bounds)
+        if isinstance(answer, Calibration):
+            return answer, sampled
+        self.context.tell(self.title, 0, 0, f"warning: {STAYS}: {answer}")
+        return found, sampled_uncertainty(*about, moves=False)
 
     @contextmanager
     def meshing(self, folder: Path) -> Iterator[Callable[[], None]]:
