@@ -218,13 +218,16 @@ def main() -> None:
     parser.add_argument("--autocorrelation", type=float, default=0.0, help="of neighbouring samples")
     parser.add_argument("--misfit", type=float, default=0.0, help="percent of the largest force")
     parser.add_argument("--differ", type=float, default=1.0, help="of sites, over what is expected")
+    parser.add_argument("--most-probable", action="store_true", help="of what is most probable")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     robot, truth, emulator, free, deviation = study_robot(
         given.study, given.noise, given.autocorrelation, given.misfit / 100, given.differ, given.seed
     )
-    found = coverage_study(emulator, truth, free, robot, given.repeats, given.steps, deviation)
+    found = coverage_study(
+        emulator, truth, free, robot, given.repeats, given.steps, deviation, given.most_probable
+    )
     told = {
         "repeats": given.repeats,
         "noise_N": robot.noise_N,

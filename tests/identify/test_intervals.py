@@ -7,7 +7,9 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate
 
 from limbfit.identify import Measured, SiteResponse, calibrate, estimate_uncertainty, separate
+from limbfit.identify.fit.moving import moved
 from limbfit.identify.fit.parameters import Unknowns, search_space
+from limbfit.identify.fit.state import Calibration
 from limbfit.identify.uncertainty.coverage import coverage_study
 from limbfit.identify.uncertainty.intervals import KeptRuns, further_evaluations, sampled_uncertainty
 from limbfit.identify.uncertainty.noise import SiteNoise, curve_noise
@@ -109,3 +111,32 @@ def test_fixed_and_tied_parameters_stay_so():
     assert found.intervals_95[6] == pytest.approx([TRUTH[6], TRUTH[6]])
     assert found.verdicts[6] == known.verdicts[6] == "given, not identified"
     assert np.isfinite(found.correlation).all()
+
+
+def test_the_answer_moves_to_what_is_most_probable():
+    """Its intervals are about that, and the calibration ends there, with an error that is no smaller."""
+    data, kept, known, space = near_the_truth()
+    found = sampled_uncertainty(known, data, PAPER, space, kept, simulate, moves=True)
+    assert found.parameters == pytest.approx(found.centre)
+    assert not np.array_equal(found.parameters, known.parameters)
+    assert np.array_equal(found.covariance, known.about_centre)
+    low, high = found.intervals_95.T
+    assert ((low < found.parameters) & (found.parameters < high)).all()
+    assert ((low < TRUTH) & (high > TRUTH)).mean() >= 0.75
+    bounds = PAPER.from_start(TRUTH)
+    least = calibrate(kept.of(simulate), data, bounds, stages=(separate(NAMES),))
+    ended = moved(least, found.parameters, data, simulate(found.parameters), bounds)
+    assert isinstance(ended, Calibration)
+    assert np.array_equal(ended.parameters, found.parameters)
+    assert ended.cost >= least.cost
+    assert (ended.evaluations, len(ended.history)) == (least.evaluations + 1, len(least.history) + 1)
+    assert ended.stages[-1].reason.endswith("moved from the least squares to what is most probable")
+    failed = [SiteResponse(r.force_N, r.jacobian, False, "stopped") for r in simulate(found.parameters)]
+    assert "stopped" in str(moved(least, found.parameters, data, failed, bounds))
+
+
+def test_fixed_and_tied_parameters_stay_so_where_the_answer_moves():
+    data, kept, known, space = near_the_truth(grouping=(0, 1, 2, 3, 4, 1, -1, 3))
+    found = sampled_uncertainty(known, data, PAPER, space, kept, simulate, moves=True)
+    assert found.parameters[1] == found.parameters[5]
+    assert found.parameters[6] == pytest.approx(TRUTH[6], rel=1e-5)

@@ -87,3 +87,25 @@ def test_the_expected_factor_is_of_the_covariance():
 def test_too_little_time_is_told():
     with pytest.raises(CalibrationError, match="no record fits"):
         plan(options(4), Budget(10.0, 40.0), Wanted(PRIOR, np.eye(P)[[0]]))
+
+
+def test_records_of_a_site_share_what_it_is_off_by():
+    """As if each site's stiffness were one more parameter with a known spread, that nobody asks for.
+
+    What one site tells of a modulus is then no better than that spread, however many records it has.
+    """
+    stiffness, share = np.array([1.0, 0.0, 1.0]), 0.05
+    some = [Option((f"s{i % 2}", "tip"), 10.0, one.information, share) for i, one in enumerate(options(6))]
+    found = Wanted(PRIOR, np.eye(P), stiffness=stiffness).covariances(some, range(6), 2)
+    for draw in range(2):
+        whole = np.zeros((P + 2, P + 2))
+        whole[:P, :P], whole[P:, P:] = PRIOR, np.eye(2)
+        for one in some:
+            columns = np.zeros((P, P + 2))
+            columns[:, :P] = np.eye(P)
+            columns[:, P + int(one.place[0] == "s1")] = share * stiffness
+            whole += columns.T @ one.information[draw] @ columns
+        assert found[draw] == pytest.approx(np.linalg.inv(whole)[:P, :P])
+    many = [Option(("a", "tip"), 10.0, 1e8 * np.eye(P)[None], share)] * 5
+    known = Wanted(PRIOR, np.eye(P), stiffness=np.array([1.0, 0.0, 0.0])).covariances(many, range(5), 1)[0]
+    assert np.diag(known) == pytest.approx([share**2, 0.0, 0.0], rel=1e-2, abs=1e-8)

@@ -150,6 +150,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "material.tissues.fat.lower": ("calibrate", {"c_kPa": 1.0}),
     "material.tissues.fat.upper": ("calibrate", {"c_kPa": 10.0}),
     "calibration.stopping": ("calibrate", "paper"),
+    "calibration.answer": ("calibrate", "most probable"),
     "calibration.relative_tolerance": ("calibrate", 0.02),
     "calibration.max_iterations": ("calibrate", 9),
     "calibration.fixed": ("calibrate", ["muscle.gamma"]),

@@ -57,9 +57,7 @@ def design(
     sites: Annotated[int, typer.Option(help="how many to choose; 0: as many as the study fits", min=0)] = 0,
     depths: Annotated[
         str | None,
-        typer.Option(
-            help="depths in mm to choose from, such as 3,5; default: the study's (--protocol: twice it, too)"
-        ),
+        typer.Option(help="depths in mm to choose from, such as 3,5,7; default: the study's"),
     ] = None,
     parameters: Annotated[
         str | None,

@@ -269,9 +269,11 @@ class CalibrationTable(TomlTable):
     ``surface_error_mm``: how far skin and bone may be off; without it a share of the image's voxels.
     Parameters are searched on what of each mesh is within ``search_radius_mm`` of its site (0: on all of it),
     and on coarse meshes where the study has them (``mesh.coarse``); forces of the whole meshes correct that,
-    at most ``corrections`` times per stage.
+    at most ``corrections`` times per stage. The ``answer`` is that of the least squares, which predicts
+    forces best, or what noise, misfit and the errors of meshes and sites make most probable.
     """
 
+    answer: Literal["least squares", "most probable"] = "least squares"
     objective: Literal["pointwise", "paper"] = "pointwise"
     stopping: Literal["relative", "paper"] = "relative"
     relative_tolerance: Positive = 0.01
@@ -291,6 +293,8 @@ class CalibrationTable(TomlTable):
 
     @model_validator(mode="after")
     def _constraints(self) -> CalibrationTable:
+        if self.answer == "most probable" and "paper" in (self.objective, self.stopping):
+            raise ValueError('answer = "most probable" is not the paper\'s; leave objective and stopping out')
         names = [name for group in self.tied for name in group]
         doubled = [name for name in names if names.count(name) > 1 or name in self.fixed]
         if doubled:

@@ -98,11 +98,12 @@ def coverage_study(
     repeats: int,
     steps: int = 0,
     deviation: Deviation = no_deviation,
+    moves: bool = False,
 ) -> CoverageStudy:
     """Calibrate and judge ``repeats`` records of the forces at ``truth`` (p,), each with noise of its own.
 
     Each calibration starts about a tenth off the truth; ``deviation`` says what each site as a whole is
-    expected to be off by, (n,) N per site.
+    expected to be off by, (n,) N per site; ``moves`` as in ``sampled_uncertainty``.
     Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty`` and
     ``sampled_uncertainty`` with what was simulated, and with ``steps`` of the sampler the posterior on the
     model itself.
@@ -124,7 +125,8 @@ def coverage_study(
         )  # fmt: skip
         linear.append(_judged(u, truth))
         asked = KeptRuns()
-        ours = sampled_uncertainty(u, measured, unknowns, space, kept, asked.of(simulate))
+        asking = asked.of(simulate)
+        ours = sampled_uncertainty(u, measured, unknowns, space, kept, asking, moves=moves)
         stated.append(_judged(ours, truth))
         further.append(len(asked.points) * len(measured))
         misfit.append(100 * u.residual_model.misfit_elsewhere)

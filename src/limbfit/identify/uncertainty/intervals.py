@@ -88,11 +88,11 @@ def sampled_uncertainty(
     simulate: Simulate,
     evaluations: int = _MOST_EVALUATIONS,
     seed: int = 0,
-    moves: bool = True,
+    moves: bool = False,
 ) -> Uncertainty:
     """``known`` with sampled intervals, combinations, verdicts and correlations.
 
-    The answer ``moves`` to what is most probable, or stays.
+    Of the least squares; or of what is most probable, to which the answer ``moves``.
 
     Parameters
     ----------

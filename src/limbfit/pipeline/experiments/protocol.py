@@ -39,7 +39,6 @@ from .design import DEEPEST_SHARE
 
 Array = NDArray[np.float64]
 
-DEEPER = 2.0  # times as deep as a site was recorded or is planned, where no depth is asked for
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
 READING_S = 1.0
 DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
@@ -155,8 +154,10 @@ def _planned(
     depths_mm: Sequence[float],
     noises: Noises,
 ) -> tuple[list[Planned], list[str]]:
-    """Every site with every indenter, speed and hold, as deep as asked for, else as it was recorded or is
-    planned, and twice as deep; nowhere deeper than its tissue allows."""
+    """Every site with every indenter, speed and hold, as deep as asked for, else as recorded or planned.
+
+    Nowhere deeper than its tissue allows.
+    """
     study, found, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"])
     deepest: dict[str, float] = {}
@@ -165,7 +166,7 @@ def _planned(
         deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
     for site in study.sites:
         usual = deepest[site.name]
-        wanted = depths_mm or (usual, DEEPER * usual)
+        wanted = depths_mm or (usual,)
         for name in study.all_indenters:
             model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True)
             if noises.layers is not None:

@@ -167,11 +167,11 @@ class Laboratory:
     def uncertainty(
         self, found: Calibration, grouping: Grouping, meshes: Path, moves: bool = True
     ) -> tuple[Calibration, Uncertainty]:
-        """The answer, which ``moves`` to what is most probable, and what the records tell about it.
+        """The answer, which ``moves`` to what is most probable where that is wanted, and what is known of it.
 
         Sampled on what was simulated near it and a little more; linearised, and the answer stays, where that
-        cannot be for simulations that fail. It stays, too, where the paper's fit is wanted. ``meshes`` is a
-        folder for the coarser meshes that tell the error of the study's own, where it has no others.
+        cannot be for simulations that fail. ``meshes`` is a folder for the coarser meshes that tell the error
+        of the study's own, where it has no others.
         """
         study, spent = self.context.study, 0
         anchored = Anchored(list(found.responses), list, ())
@@ -193,7 +193,7 @@ class Laboratory:
         space = search_space(bounds := unknowns(study), grouping)
         evaluations = further_evaluations(self.simulated, spent)
         about = known, self.measured, bounds, space, kept, simulate, evaluations
-        stays = not moves or "paper" in (study.calibration.objective, study.calibration.stopping)
+        stays = not moves or study.calibration.answer == "least squares"
         sampled = sampled_uncertainty(*about, moves=not stays)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")

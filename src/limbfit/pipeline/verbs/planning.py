@@ -90,8 +90,8 @@ def plan_protocol(
     setup_s, rest_s : for each site with an indenter, and for the tissue to come back after each record.
     speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, within its limit.
     holds_s : at the deepest point, to choose from; 0: none.
-    depths_mm : to choose from; none: as deep as each site was recorded or is planned, and twice as deep. No
-        record goes deeper than half of the tissue's thickness.
+    depths_mm : to choose from; none: as deep as each site was recorded or is planned. No record goes deeper
+        than half of the tissue's thickness.
     determine : parameters such as ``muscle.c_kPa``; by default all. ``socket``: the mean pressures of the
         regions under every load of ``results/socket``, which needs identified parameters.
     criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances; by
