@@ -17,11 +17,13 @@ from limbfit.pipeline.stages.deviations import (
     GIVEN_MM,
     LEAST_SHARE,
     OF_A_VOXEL,
+    bone_distance_mm,
     by_thickness,
     expected_share,
     site_deviation,
     surface_error_mm,
 )
+from limbfit.pipeline.stages.observed import SeenWave
 from limbfit.pipeline.stages.records import SiteRecord, site_record
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
@@ -82,3 +84,18 @@ def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None
     jacobian[:, moduli[0] + 1] = 7.0
     off = site_deviation(found, record, SiteResponse(np.ones(5), jacobian), parameters)
     assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * expected_share(record.model, GIVEN_MM))
+
+
+def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> None:
+    """By the share of its strain, and not at rest, where its own stiffness alone may differ."""
+    found = context(tmp_path)
+    record, parameters = over_bone(found), found.study.vector(TRUTH)
+    speeds = np.array([4.0, 4.0, 4.5, 6.0])
+    at = np.eye(4, len(record.times_s))
+    seen = SeenWave("w", speeds, np.array([0.0, 0.0, 1.0, 2.0]), np.zeros(4, int), at, np.eye(4), {"sd": 0.1})
+    jacobian = np.zeros((4, len(parameters)))
+    jacobian[:, 0] = 0.5 * speeds / parameters[0]
+    off = site_deviation(found, replace(record, seen=seen), SiteResponse(speeds, jacobian), parameters)
+    thickness = bone_distance_mm(record.model)
+    assert thickness is not None
+    assert off == pytest.approx(0.5 * LEAST_SHARE * speeds + (speeds - 4.0) * GIVEN_MM / thickness)

@@ -72,10 +72,15 @@ def _curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
 def site_deviation(context: Context, record: SiteRecord, response: SiteResponse, parameters: Array) -> Array:
     """One standard deviation (n,) of what a record would be off by, as its site's tissue were stiffer.
 
-    In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,).
+    In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,). What thinner
+    tissue is strained more by shows in what is seen of it (`Observed.by_strain`), not in its moduli.
     """
-    share = expected_share(record.model, surface_error_mm(context))
-    return np.asarray(response.jacobian @ (parameters * is_modulus(context.study)) * share)
+    stiffer = np.asarray(response.jacobian @ (parameters * is_modulus(context.study)))
+    surface_mm, thickness_mm = surface_error_mm(context), bone_distance_mm(record.model)
+    strained = None if record.seen is None else record.seen.by_strain(response.force_N)
+    if strained is None or thickness_mm is None:
+        return stiffer * expected_share(record.model, surface_mm)
+    return stiffer * LEAST_SHARE + strained * surface_mm / thickness_mm
 
 
 def expected_share(model: SiteModel, surface_mm: float) -> float:

@@ -94,6 +94,10 @@ class Observed:
         """How the values (n,) change with the depth (n,), in their unit for each mm."""
         raise NotImplementedError
 
+    def by_strain(self, simulated: Array) -> Array | None:
+        """How the values (n,) change with the logarithm of all strain; None where a depth decides it."""
+        return None
+
     @property
     def columns(self) -> dict[str, Array]:
         """What the stored curves say of each value."""
@@ -146,6 +150,10 @@ class SeenWave(Observed):
     def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
         """What strain adds to a speed is nearly in proportion to the depth."""
         return _per_depth(depth_mm, simulated - simulated[np.argmin(depth_mm)])
+
+    def by_strain(self, simulated: Array) -> Array:
+        """As much as strain adds to a speed since the first reading."""
+        return np.asarray(simulated - simulated[np.argmin(self.time_s)])
 
 
 def _per_depth(depth_mm: Array, values: Array) -> Array:
