@@ -58,7 +58,7 @@ def _against_time(
         for i, (ax, (row, layer, whole)) in enumerate(zip(axes, rows, strict=True)):
             curves = thin(whole)
             x = curves["time_s"]
-            ax.plot(x, curves[f"{what}_measured_{unit}"], ".", ms=4, color=MEASURED, label="ultrasound")
+            ax.plot(x, curves[f"{what}_measured_{unit}"], ".", ms=4, color=MEASURED, label="measured")
             if f"{what}_simulated_{unit}" in curves:
                 ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
             if f"{what}_low_{unit}" in curves:
