@@ -24,7 +24,7 @@ from .sites import (
     steps_of,
 )
 from .skin_points import nearest_points, skin_points
-from .waves import WavePlace
+from .waves import WavePlace, as_vector
 
 __all__ = [
     "OFF_SKIN_MM",
@@ -36,6 +36,7 @@ __all__ = [
     "SimulationJob",
     "SiteModel",
     "WavePlace",
+    "as_vector",
     "build_problem",
     "clamped",
     "clamping_pins",

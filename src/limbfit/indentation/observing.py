@@ -19,7 +19,7 @@ from ..mesh import Gauge, Mesh, gauges_along, read_vtu
 from ..study import Vector
 from .sites import SiteModel, read_indenter
 from .skin_points import skin_points
-from .waves import WavePlace, wave_places, wave_speeds
+from .waves import WavePlace, as_vector, wave_places, wave_speeds
 
 Array = NDArray[np.float64]
 OFF_SKIN_MM = 5.0  # farther from the skin than that is no point of it
@@ -100,21 +100,16 @@ def layers_under(model: SiteModel) -> tuple[str, ...]:
 def waves_under(
     model: SiteModel, mesh: Mesh, wanted: Sequence[tuple[str, float | None]] | None = None
 ) -> tuple[WavePlace, ...]:
-    """Places of shear waves under a site's indenter, which run along its edge; see `wave_places`.
-
-    None ``wanted``: the middle of every tissue.
-    """
+    """Places of shear waves under a site's indenter, which run along its edge; see `wave_places`."""
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    position, axis = np.array(model.position), np.asarray(indenter.frame[2])
-    if wanted is None:
-        wanted = [(one.region, None) for one in gauges_along(mesh, position, axis)]
-    return wave_places(mesh, position, axis, indenter.frame[0], wanted)
+    edge, _, axis = indenter.frame
+    return wave_places(mesh, np.array(model.position), axis, edge, wanted)
 
 
 def skin_beside(model: SiteModel) -> tuple[Vector, ...]:
     """`points_around` a site's indenter on its stored mesh."""
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    return tuple((float(x), float(y), float(z)) for x, y, z in points_around(read_vtu(model.mesh), indenter))
+    return tuple(map(as_vector, points_around(read_vtu(model.mesh), indenter)))
 
 
 def observed(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:

@@ -53,11 +53,12 @@ class WavePlace:
 
 
 def wave_places(
-    mesh: Mesh, position: Array, axis: Array, way: Array, wanted: Sequence[tuple[str, float | None]]
+    mesh: Mesh, position: Array, axis: Array, way: Array, wanted: Sequence[tuple[str, float | None]] | None
 ) -> tuple[WavePlace, ...]:
     """Places under the middle of an indenter: of each tissue so deep below the skin, mm, or its own middle.
 
-    ``axis`` is the indenter's, along which the tissue moves; waves run along ``way``.
+    None ``wanted``: the middle of every tissue. ``axis`` is the indenter's, along which the tissue moves;
+    waves run along ``way``.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def wave_places(
     for gauge in gauges_along(mesh, position, axis):
         spans[gauge.region] = (top, top + gauge.thickness_mm)
         top += gauge.thickness_mm
-    for tissue, depth in wanted:
+    for tissue, depth in [(name, None) for name in spans] if wanted is None else wanted:
         if tissue not in spans:
             raise ProblemError(
                 f"no {tissue} lies under the indenter's axis, only {', '.join(spans)}",
@@ -81,11 +82,12 @@ def wave_places(
                 remedy="name the column after the tissue that is there, or leave the depth out",
             )
         point = position + (0.5 * (first + last) if depth is None else depth) * axis
-        found.append(WavePlace(tissue, _vector(point), _vector(axis), _vector(way)))
+        found.append(WavePlace(tissue, as_vector(point), as_vector(axis), as_vector(way)))
     return tuple(found)
 
 
-def _vector(values: Array) -> Vector:
+def as_vector(values: Array) -> Vector:
+    """Three numbers as a model or a study holds them."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 

@@ -39,6 +39,15 @@ fitted = true
 trace = "a.csv"
 position = [0.0, 0.0, 0.0]
 """
+PUNCH = """
+[indenter]
+width_mm = 10.0
+edge_radius_mm = 2.0
+[solver]
+load_steps = 8
+unload_steps = 8
+penalty_per_mm = 100.0
+"""
 Made = tuple[RobotRecord, np.ndarray, np.random.Generator]  # and the times of its simulation, s
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import TRUTH, Made, SeenBlock
+from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
 
 import layered
 from layered import layered_block
@@ -134,17 +134,6 @@ def test_readings_must_begin_before_and_last_into_contact() -> None:
         thinnings(layers, 2.98, 9.0, 0.1)
 
 
-TOOLS = """
-[indenter]
-width_mm = 10.0
-edge_radius_mm = 2.0
-[solver]
-load_steps = 8
-unload_steps = 8
-penalty_per_mm = 100.0
-"""
-
-
 def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) -> None:
     whole, times, random = made
     layers = {
@@ -159,7 +148,7 @@ BLOCK = SeenBlock(
     12.0,
     3.0,
     4,
-    TOOLS,
+    PUNCH,
     "a-layers.csv",
     lambda model, mesh: replace(model, layers=("skin", "muscle")),
     write_seen,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import TRUTH, Made, SeenBlock
+from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
 
 from limbfit.errors import TraceError
 from limbfit.indentation import Simulation, SiteModel, waves_under
@@ -23,15 +23,6 @@ from limbfit.report.site_tables import observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
 
-TOOLS = """
-[indenter]
-width_mm = 10.0
-edge_radius_mm = 2.0
-[solver]
-load_steps = 8
-unload_steps = 8
-penalty_per_mm = 100.0
-"""
 WAVES = 'shear_waves = "a-waves.csv"\n'
 
 
@@ -49,7 +40,7 @@ BLOCK = SeenBlock(
     12.0,
     3.0,
     4,
-    TOOLS,
+    PUNCH,
     "a-waves.csv",
     lambda model, mesh: replace(model, waves=waves_under(model, mesh)),
     write_seen,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TraceError
-from ...indentation import OFF_SKIN_MM, is_under, nearest_points, read_indenter
+from ...indentation import OFF_SKIN_MM, as_vector, is_under, nearest_points, read_indenter
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion
 from .artefacts import read_curves, write_curves
@@ -117,8 +117,8 @@ def chosen_points(
     which = usable[_spread(found.points[usable], int(np.argmin(away[usable])))]
     if len(which) < len(usable):
         left_out[f"thinned out, to {MAX_POINTS}"] = len(usable) - len(which)
-    chosen = tuple(_vector(point) for point in found.points[which])
-    x, y, z = (_vector(axis) for axis in axes)
+    chosen = tuple(as_vector(point) for point in found.points[which])
+    x, y, z = (as_vector(axis) for axis in axes)
     return ChosenPoints(chosen, (x, y, z), which, left_out)
 
 
@@ -136,8 +136,3 @@ def _spread(points: Array, first: int) -> Ints:
         chosen.append(int(np.argmax(away)))
         away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.array(sorted(chosen))
-
-
-def _vector(values: Array) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
