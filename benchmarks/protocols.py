@@ -33,7 +33,7 @@ from limbfit.identify.checks.design import NoiseModel, information_of, prior_inf
 from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import to_vector
-from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, Seen
+from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, Seen
 from limbfit.pipeline.experiments.protocol import DETERMINED
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
@@ -41,7 +41,6 @@ from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.laboratory import unknowns
 from limbfit.study import Study
 
-DEPTHS = (3.0, 6.0, 9.0)
 FAST, HOLD_S = 4.8, 30.0
 REST_S, SETUP_S, MINUTES = 30.0, 60.0, 25.0
 # Of linear theory: noise of a compared force, and the model's own error, which drifts along a record.
@@ -61,7 +60,12 @@ INGREDIENTS: dict[str, tuple[Take, ...]] = {
     "shear waves": tuple(replace(one, seen=Seen(shear_waves=True)) for one in RAMPS),
 }
 FITTED_ALONE = ("prior", "surface", "shear waves")  # linear theory is not asked of them
-DESIGNED = ("designed", "designed without ultrasound", "designed with prior")
+DESIGNED = {
+    "designed": ULTRASOUND,
+    "designed with shear waves": Seen(ultrasound=True, shear_waves=True),
+    "designed without ultrasound": NOTHING,
+    "designed with prior": ULTRASOUND,
+}
 SHORT, SHORT_MINUTES = "8 minutes", 8.0  # the best at the true tissue
 CASES = (*INGREDIENTS, *DESIGNED, SHORT)
 
@@ -84,16 +88,18 @@ def plan_study(folder: Path, limb: Limb, edge_mm: float | None) -> Study:
     return study
 
 
-def designed(folder: Path, limb: Limb, edge_mm: float | None, ultrasound: bool) -> tuple[Take, ...]:
+def designed(
+    folder: Path, limb: Limb, edge_mm: float | None, seen: Seen, depths_mm: Sequence[float]
+) -> tuple[Take, ...]:
     """The protocol that limbfit designs before anybody is indented: at the start and two more tissues."""
-    seen = ULTRASOUND_NOISE_MM if ultrasound else None
     found = plan_protocol(
         plan_study(folder, limb, edge_mm),
         minutes=MINUTES,
         speeds_mm_s=(SLOW, FAST),
         holds_s=(0.0, HOLD_S),
-        depths_mm=DEPTHS,
-        ultrasound_sd_mm=seen,
+        depths_mm=depths_mm,
+        ultrasound_sd_mm=ULTRASOUND_NOISE_MM if seen.ultrasound else None,
+        shear_waves_sd_m_s=WAVES_NOISE_M_S if seen.shear_waves else None,
     )
     return tuple(
         Take(
@@ -102,7 +108,7 @@ def designed(folder: Path, limb: Limb, edge_mm: float | None, ultrasound: bool) 
             row["hold_s"],
             row["indenter"] == "ball",
             round(row["depth_mm"], 2),
-            ULTRASOUND if ultrasound else NOTHING,
+            seen,
         )
         for row in found["records"]
     )
@@ -211,15 +217,18 @@ def judged(folder: Path, limb: Limb, takes: Sequence[Take]) -> dict[str, Any]:
     }
 
 
-def run_case(folder: Path, name: str, seed: int, edge_mm: float | None) -> dict[str, Any]:
+def run_case(
+    folder: Path, name: str, seed: int, edge_mm: float | None, depths_mm: Sequence[float]
+) -> dict[str, Any]:
     limb = Limb(folder, seed)
     place = folder / f"{seed}-{name.replace(' ', '-')}"
     began = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-    ultrasound = "without" not in name
     if name == SHORT:
         takes = best_at_truth(folder, limb, edge_mm, SHORT_MINUTES, MISFITS[0], ULTRASOUND)
+    elif name in DESIGNED:
+        takes = designed(folder, limb, edge_mm, DESIGNED[name], depths_mm)
     else:
-        takes = INGREDIENTS[name] if name in INGREDIENTS else designed(folder, limb, edge_mm, ultrasound)
+        takes = INGREDIENTS[name]
     if not (place / "study.toml").is_file():
         write_case(place, limb, takes, edge_mm, "prior" in name, HELD_OUT)
     run_study(load_study(place), until="predict", listener=lambda event: None)
@@ -257,6 +266,9 @@ def main() -> None:
     parser.add_argument(
         "--edge", type=float, help="of the study's meshes near a site, mm; else limbfit's own"
     )
+    parser.add_argument(
+        "--depths", type=float, nargs="+", default=(), help="that a design chooses among, mm; else the ramps'"
+    )
     parser.add_argument("--json", type=Path, help="write every case here; cases found there are kept")
     parser.add_argument("--expected", action="store_true", help="linear theory at the truth instead of fits")
     given = parser.parse_args()
@@ -272,7 +284,7 @@ def main() -> None:
         for name in given.only:
             known = next((one for one in cases if (one["case"], one["seed"]) == (name, seed)), None)
             if known is None:
-                known = run_case(given.folder, name, seed, given.edge)
+                known = run_case(given.folder, name, seed, given.edge, given.depths)
                 cases.append(known)
             print(line(known), flush=True)
             if given.json:

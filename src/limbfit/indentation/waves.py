@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,12 @@ from ..study import Vector
 Array = NDArray[np.float64]
 
 DENSITY = 1000.0  # kg/m^3, as elastography takes it for all soft tissue
-REGION_MM = 1.0  # a speed is the mean over a region of so much around its place, and in the tissue alone
+# A speed is the mean over a disc across the beam, around its place and in the tissue alone: about what
+# elastography reads. Under a ball the means of seven points differ by up to 13 % between meshes with edges of
+# 1.2 to 2.1 mm, those of this disc by 1 %.
+DISC_RADIUS_MM, DISC_HALF_MM = 2.0, 1.0
+_RINGS, _LAYERS = 2, 4
+_ON_TISSUE_MM = 0.1  # a point of the disc may be moved by so much into the tissue
 OFF_TISSUE_MM = 3.0  # farther from a tissue than that a place is not in it
 _STEP = 1e-4  # of a parameter
 _LEAST = 1e-12  # MPa: a tissue that carries no wave
@@ -152,12 +158,31 @@ def _contracting(a: Array, b: Array) -> Array:
     return np.column_stack([a * b, *off])
 
 
+@cache
+def disc_points() -> Array:
+    """Points (m, 3) of the disc, mm, along two ways across and its axis: the middle, then equal volumes."""
+    rings, angles = [np.zeros(1)], [np.zeros(1)]
+    most = 3 * _RINGS * (_RINGS + 1) + 1
+    for ring in range(1, _RINGS + 1):  # of 6, 12, ... points
+        inner, outer = 3 * ring * (ring - 1) + 1, 3 * ring * (ring + 1) + 1
+        rings.append(np.full(6 * ring, np.sqrt((inner + outer) / (2 * most))))
+        angles.append(2 * np.pi * np.arange(6 * ring) / (6 * ring))
+    radius, angle = DISC_RADIUS_MM * np.concatenate(rings), np.concatenate(angles)
+    found = []
+    for layer in range(_LAYERS):
+        turned = angle + np.pi * layer / (6 * _LAYERS)
+        height = DISC_HALF_MM * ((2 * layer + 1) / _LAYERS - 1)
+        found.append(
+            np.column_stack([radius * np.cos(turned), radius * np.sin(turned), np.full(len(radius), height)])
+        )
+    return np.concatenate([np.zeros((1, 3)), *found])
+
+
 def _located(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
     """Cells and local coordinates of the points of a place's region that are in its tissue."""
     region = mesh.region_names.index(place.tissue)
     motion, way = np.array(place.motion), np.array(place.way)
-    axes = np.stack([motion, way, np.cross(motion, way)])
-    points = np.array(place.point) + REGION_MM * np.concatenate([np.zeros((1, 3)), axes, -axes])
+    points = np.array(place.point) + disc_points() @ np.stack([way, np.cross(motion, way), motion])
     cells, local, off = locate(mesh, points, region)
     if off[0] > OFF_TISSUE_MM:
         where = ", ".join(f"{value:.1f}" for value in place.point)
@@ -165,8 +190,8 @@ def _located(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
             f"the place ({where}) is {off[0]:.1f} mm off the simulated {place.tissue}",
             remedy="take it out of the record's file of shear waves, or mesh the site finer",
         )
-    kept = off < 0.1 * REGION_MM
-    kept[0] = True
+    kept = off < _ON_TISSUE_MM
+    kept[0] |= not kept.any()
     return cells[kept], local[kept]
 
 
