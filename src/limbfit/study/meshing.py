@@ -61,7 +61,7 @@ def _edges(near: float, far: float, radius: float, growth: float, flatness: floa
 # (docs/convergence.md).
 ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
     "fast": (_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
-    "standard": (_edges(3.5, 30.0, 14.0, 0.9, 1.6), None),
+    "standard": (_edges(3.5, 30.0, 14.0, 0.6, 1.6), None),
     "fine": (_edges(3.0, 24.0, 14.0, 0.6, 1.6), _edges(5.5, 30.0, 12.0, 0.9, 1.6)),
 }
 _OWN = ACCURACIES["standard"][0]

@@ -56,7 +56,7 @@ def edges(settings: object) -> tuple[float, ...]:
 
 def test_a_bare_study_is_searched_on_less_and_corrected(stated: Any) -> None:
     study = stated()
-    assert edges(mesh_settings(study)) == (3.5, 30.0, 14.0, 0.9, 1.6)
+    assert edges(mesh_settings(study)) == (3.5, 30.0, 14.0, 0.6, 1.6)
     assert mesh_settings(study).element == "tet10"
     assert study.mesh.element == "tet10p0"
     assert coarse_settings(study) is None
@@ -102,7 +102,7 @@ def test_edges_suit_the_indenters(stated: Any, widths: tuple[float, ...], near: 
     indenters = f"[indenter]\nwidth_mm = {first}\n"
     indenters += "".join(f'[indenters.ball]\nshape = "sphere"\nwidth_mm = {width}\n' for width in more)
     study = stated(indenters)
-    assert edges(mesh_settings(study)) == pytest.approx((near, 30.0, radius, 0.9, 1.6))
+    assert edges(mesh_settings(study)) == pytest.approx((near, 30.0, radius, 0.6, 1.6))
     assert accuracy(study) == "standard"
     fine = coarse_settings(stated('[mesh]\naccuracy = "fine"\n' + indenters))
     assert fine is not None

@@ -18,9 +18,11 @@ SMALLEST_JACOBIAN = 0.3  # of the straight element's, at every node
 BISECTIONS = 5
 
 
-def curved(mesh: Mesh, target: Array) -> Mesh:
-    """A tet10 mesh with nodes moved to ``target`` (n, 3), less or not at all where elements would suffer."""
-    straight = node_jacobians(mesh).min(axis=1)
+def curved(mesh: Mesh, target: Array, straight: Array) -> Mesh:
+    """A tet10 mesh with nodes moved to ``target`` (n, 3), less or not at all where elements would suffer.
+
+    ``straight`` (m,) is the least Jacobian of each element with straight sides.
+    """
     share = np.ones(len(mesh.points))
     for attempt in count():
         points = mesh.points + share[:, None] * (target - mesh.points)

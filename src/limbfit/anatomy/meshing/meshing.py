@@ -8,7 +8,8 @@ The recipe
 2. Per site, a mesher adapts the base to the site's size field; it keeps the faces between regions.
 3. Nodes of layer, bones and regions are put on their smooth surfaces; the skin layer is extruded from the
    interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
-4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound.
+4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound;
+   faces that are too coarse to follow a bone are put on it in the mean (`balancing`).
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import MeshingError, ProblemError
-from ...mesh import Mesh, boundary_faces, check, to_tet10
+from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ..surfaces.surfaces import Anatomy
 from . import background
 from .background import BONE, LAYER, PLANE, REGION, TetGrid, volumes
+from .balancing import balanced
 from .curving import curved, with_diagonals
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .layered import core_mesh, curved_target, with_layers
@@ -214,7 +216,9 @@ def _meshed(
     if settings.element == "tet10" and not inverted(mesh).any():
         mesh = to_tet10(mesh)
         if settings.curved:
-            mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack))
+            straight = node_jacobians(mesh).min(axis=1)
+            mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack), straight)
+            mesh = balanced(mesh, fields, straight)
     _check_usable(mesh, fields)
     seconds = time.perf_counter() - start
     report = mesh_report(

@@ -1,0 +1,74 @@
+"""How near the largest forces on a study's meshes come to those on much finer ones.
+
+    python benchmarks/default_meshes.py STUDY [--sites 01 05] [--folder runs/default-meshes]
+
+STUDY has records (``limbfit demo``, or one of `protocols.py`); each is simulated at the start's parameters on
+the study's mesh of its site and on one of half the edges, fine to 1.5 times as far and all through the limb.
+Fine meshes are kept in the folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from limbfit import load_study, run_study
+from limbfit.execution import SerialExecutor
+from limbfit.mesh import read_vtu
+from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.shared.simulations import SimulationCache
+from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.stages.mesh import mesh_settings
+from limbfit.pipeline.stages.records import site_record
+from limbfit.pipeline.stages.remesh import meshed_models
+
+FINER, FARTHER, FAR_MM, GROWTH, FLATNESS = 0.5, 1.5, 8.0, 0.4, 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("study", type=Path)
+    parser.add_argument("--sites", nargs="+", help="by default all")
+    parser.add_argument("--folder", type=Path, default=Path("runs/default-meshes"))
+    given = parser.parse_args()
+    study = load_study(given.study)
+    run_study(study, until="mesh", listener=lambda event: None)
+    context = Context(study, Store(study.results), SerialExecutor(), lambda event: None)
+    own = mesh_settings(study)
+    fine = replace(
+        own,
+        edge_near_mm=FINER * own.edge_near_mm,
+        edge_far_mm=FAR_MM,
+        near_radius_mm=FARTHER * own.near_radius_mm,
+        growth=GROWTH,
+        flatness=FLATNESS,
+    )
+    start, cache = unknowns(study).start, SimulationCache(given.folder / "runs")
+    errors = []
+    for recorded in study.recorded:
+        if given.sites and recorded.site.name not in given.sites:
+            continue
+        record = site_record(context, recorded)
+        (model,) = meshed_models(context, given.folder / "fine", [record.model], fine, "fine meshes")
+        jobs = [one.job(start, sensitivities=False) for one in (record, replace(record, model=model))]
+        found = list(cache.run(jobs, context.executor))
+        if failed := [one.reason for one in found if not one.completed]:
+            print(f"{record.name}: {failed[0]}", flush=True)
+            continue
+        peaks = [float(one.force_N.max()) for one in found]
+        nodes = [len(read_vtu(one).points) for one in (record.model.mesh, model.mesh)]
+        errors.append(100.0 * (peaks[0] / peaks[1] - 1.0))
+        print(
+            f"{record.name}: {peaks[0]:.3f} N on {nodes[0]} nodes, {peaks[1]:.3f} N on {nodes[1]}: "
+            f"{errors[-1]:+.1f} %",
+            flush=True,
+        )
+    print(f"root mean square {np.sqrt(np.mean(np.square(errors))):.1f} %, most {max(map(abs, errors)):.1f} %")
+
+
+if __name__ == "__main__":
+    main()
