@@ -3,7 +3,7 @@
     python benchmarks/default_meshes.py STUDY [--sites 01 05] [--folder runs/default-meshes]
 
 STUDY has records (``limbfit demo``, or one of `protocols.py`); each is simulated at the start's parameters on
-the study's mesh of its site and on one of half the edges, fine to 1.5 times as far and all through the limb.
+the study's mesh of its site and on one with 0.6 of the edges, fine to 1.5 times as far, of at most 12 mm.
 Fine meshes are kept in the folder.
 """
 
@@ -26,7 +26,7 @@ from limbfit.pipeline.stages.mesh import mesh_settings
 from limbfit.pipeline.stages.records import site_record
 from limbfit.pipeline.stages.remesh import meshed_models
 
-FINER, FARTHER, FAR_MM, GROWTH, FLATNESS = 0.5, 1.5, 8.0, 0.4, 1.0
+FINER, FARTHER, FAR_MM, GROWTH, FLATNESS = 0.6, 1.5, 12.0, 0.4, 1.2
 
 
 def main() -> None:

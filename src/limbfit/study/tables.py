@@ -270,10 +270,11 @@ class CalibrationTable(TomlTable):
     Parameters are searched on what of each mesh is within ``search_radius_mm`` of its site (0: on all of it),
     and on coarse meshes where the study has them (``mesh.coarse``); forces of the whole meshes correct that,
     at most ``corrections`` times per stage. The ``answer`` is that of the least squares, which predicts
-    forces best, or what noise, misfit and the errors of meshes and sites make most probable.
+    forces best, or what noise, misfit and the errors of meshes and sites make most probable; none stated:
+    the first for one record of force per site, the second for more.
     """
 
-    answer: Literal["least squares", "most probable"] = "least squares"
+    answer: Literal["least squares", "most probable"] | None = None
     objective: Literal["pointwise", "paper"] = "pointwise"
     stopping: Literal["relative", "paper"] = "relative"
     relative_tolerance: Positive = 0.01

@@ -33,7 +33,7 @@ from ..shared.simulations import SimulationCache
 from .deviations import site_deviation, site_noise
 from .doubted import Doubted
 from .mesh import mesh_settings
-from .records import SiteRecord, all_compared, as_searched, site_record
+from .records import SiteRecord, all_compared, as_searched, is_moved, site_record
 from .remesh import meshed_meanwhile, meshed_models, scaled_edges
 
 Array = NDArray[np.float64]
@@ -193,7 +193,7 @@ class Laboratory:
         space = search_space(bounds := unknowns(study), grouping)
         evaluations = further_evaluations(self.simulated, spent)
         about = known, self.measured, bounds, space, kept, simulate, evaluations
-        stays = not moves or study.calibration.answer == "least squares"
+        stays = not (moves and is_moved(study))
         sampled = sampled_uncertainty(*about, moves=not stays)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")

@@ -14,7 +14,7 @@ from ...fe import texts_of
 from ...identify.fit.objective import Measured, SiteResponse
 from ...identify.uncertainty.noise import depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
-from ...study import Record, Site
+from ...study import Record, Site, Study
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ..shared.artefacts import read_curves
 from ..shared.context import Context
@@ -24,6 +24,20 @@ from .files import LAYERS, SMOOTHING, WAVES
 from .observed import Observed, SeenLayer, SeenSurface, SeenWave
 
 Array = NDArray[np.float64]
+
+
+def is_moved(study: Study) -> bool:
+    """Whether the answer is what is most probable, and not the least squares.
+
+    As the study states; else where a fitted site has more than one record of force. What the records' own
+    doubts weigh decides then: errors of touch-down and site that one fit to everything would take for tissue.
+    """
+    table, records = study.calibration, study.records_at(*study.fitted)
+    if table.answer is not None:
+        return table.answer == "most probable"
+    is_paper = "paper" in (table.objective, table.stopping)
+    more = len(records) > len(study.fitted) or any(record.observed for record in records)
+    return more and not is_paper
 
 
 @dataclass(frozen=True)
