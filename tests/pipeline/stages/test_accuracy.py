@@ -15,6 +15,7 @@ from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import ROUGHLY
 from limbfit.pipeline.shared.provenance import settings_record
 from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
+from limbfit.pipeline.stages.records import is_moved
 from limbfit.study import Study, load_study
 from limbfit.study.meshing import ACCURACIES, estimated_cells
 from limbfit.study.tables import SolverTable
@@ -52,6 +53,26 @@ def accuracy(study: Study) -> Any:
 
 def edges(settings: object) -> tuple[float, ...]:
     return tuple(asdict(settings)[key] for key in EDGES)  # type: ignore[call-overload]
+
+
+RECORD = '[[records]]\nsite = "1"\nname = "fast"\ntrace = "1.csv"\n'
+STATED = '[calibration]\nanswer = "{}"\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "moves"),
+    [
+        ("", False),
+        (RECORD, True),
+        ('ultrasound = "1.csv"\n', True),
+        (STATED.format("most probable"), True),
+        (RECORD + STATED.format("least squares"), False),
+        (RECORD + '[calibration]\nobjective = "paper"\n', False),
+    ],
+)
+def test_the_answer_goes_by_the_records(stated: Any, more: str, moves: bool) -> None:
+    """One record of force per site: the least squares; more: what is most probable, but for the paper."""
+    assert is_moved(stated(more)) is moves
 
 
 def test_a_bare_study_is_searched_on_less_and_corrected(stated: Any) -> None:
