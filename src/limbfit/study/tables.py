@@ -294,7 +294,7 @@ class CalibrationTable(TomlTable):
 
     @model_validator(mode="after")
     def _constraints(self) -> CalibrationTable:
-        if self.answer == "most probable" and "paper" in (self.objective, self.stopping):
+        if self.answer == "most probable" and self.is_papers:
             raise ValueError('answer = "most probable" is not the paper\'s; leave objective and stopping out')
         names = [name for group in self.tied for name in group]
         doubled = [name for name in names if names.count(name) > 1 or name in self.fixed]
@@ -306,6 +306,11 @@ class CalibrationTable(TomlTable):
         if (self.prior or self.priors) and self.objective == "paper":
             raise ValueError('objective = "paper" has no place for priors; use "pointwise"')
         return self
+
+    @property
+    def is_papers(self) -> bool:
+        """Whether anything of it is the paper's method."""
+        return "paper" in (self.objective, self.stopping)
 
     @property
     def named(self) -> tuple[str, ...]:

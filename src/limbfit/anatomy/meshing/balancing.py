@@ -41,15 +41,15 @@ def balanced(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
         places = np.einsum("qk,fki->fqi", shapes, mesh.points[faces])
         level, _ = fields.void(places.reshape(-1, 3))
         lack = -level.reshape(places.shape[:2]).mean(axis=1)
-        of_faces = np.repeat(area[:, None], faces.shape[1], axis=1)
-        total = np.bincount(faces.ravel(), of_faces.ravel(), len(mesh.points))
-        away = np.bincount(faces.ravel(), (of_faces * lack[:, None]).ravel(), len(mesh.points))
+        total, away = (
+            np.bincount(faces.ravel(), np.repeat(of_faces, faces.shape[1]))
+            for of_faces in (area, area * lack)
+        )
         _, slope = fields.void(mesh.points[nodes])
         room = np.maximum(fields.layer(mesh.points[nodes])[0] - fields.bone_clearance_mm, 0.0)
-        move = np.minimum(away[nodes] / total[nodes], room)[:, None] * slope
-        move[in_plane, 2] = 0.0
         moves = np.zeros_like(mesh.points)
-        moves[nodes] = move
+        moves[nodes] = np.minimum(away[nodes] / total[nodes], room)[:, None] * slope
+        moves[nodes[in_plane], 2] = 0.0
         mesh = curved(mesh, mesh.points + _with_edges(mesh, moves, nodes), straight)
     return mesh
 

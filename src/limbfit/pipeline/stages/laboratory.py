@@ -193,11 +193,11 @@ class Laboratory:
         space = search_space(bounds := unknowns(study), grouping)
         evaluations = further_evaluations(self.simulated, spent)
         about = known, self.measured, bounds, space, kept, simulate, evaluations
-        stays = not (moves and is_moved(study))
-        sampled = sampled_uncertainty(*about, moves=not stays)
+        moves = moves and is_moved(study)
+        sampled = sampled_uncertainty(*about, moves=moves)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
-        if stays or sampled.method == LINEARISED:
+        if not moves or sampled.method == LINEARISED:
             return found, sampled
         answer = moved(found, sampled.parameters, self.measured, simulate(sampled.parameters), bounds)
         if isinstance(answer, Calibration):

@@ -35,9 +35,8 @@ def is_moved(study: Study) -> bool:
     table, records = study.calibration, study.records_at(*study.fitted)
     if table.answer is not None:
         return table.answer == "most probable"
-    is_paper = "paper" in (table.objective, table.stopping)
     more = len(records) > len(study.fitted) or any(record.observed for record in records)
-    return more and not is_paper
+    return more and not table.is_papers
 
 
 @dataclass(frozen=True)
