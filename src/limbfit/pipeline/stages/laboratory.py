@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...anatomy.meshing.meshing import MeshSettings
-from ...errors import MeshingError, RunError
+from ...errors import RunError
 from ...identify.fit.calibration import calibrate
 from ...identify.fit.correction import CoarseToFine
 from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
@@ -34,7 +34,7 @@ from .deviations import site_deviation, site_noise
 from .doubted import Doubted
 from .mesh import mesh_settings
 from .records import SiteRecord, all_compared, as_searched, is_moved, site_record
-from .remesh import meshed_meanwhile, meshed_models, scaled_edges
+from .remesh import meshed_meanwhile, meshed_where_possible, scaled_edges
 
 Array = NDArray[np.float64]
 Responses = list[SiteResponse]
@@ -177,7 +177,7 @@ class Laboratory:
         anchored = Anchored(list(found.responses), list, ())
         if self.is_apart:
             anchored = self.anchored(found.parameters)
-        if study.mesh.coarse is None and (coarser := self._coarser(meshes)):
+        if study.mesh.coarse is None and any(coarser := self._coarser(meshes)):
             searched = self.search(found.parameters) if self.is_apart else anchored.responses
             anchored = replace(anchored, mesh_N=self._mesh_error(found.parameters, searched, coarser))
             spent = self.simulated
@@ -223,40 +223,39 @@ class Laboratory:
     def _coarser_edges(self) -> MeshSettings:
         return scaled_edges(mesh_settings(self.context.study), COARSER)
 
-    def _coarser(self, folder: Path) -> list[SiteRecord]:
+    def _coarser(self, folder: Path) -> list[SiteRecord | None]:
         """The records on coarser meshes than the study's own, which are made in ``folder``.
 
-        None of them where one cannot be made: a line says so.
+        None for a site of which none can be made: a line says so.
         """
-        try:
-            models = meshed_models(self.context, folder, self._models, self._coarser_edges, self.title)
-        except MeshingError as error:
-            text = "the error of the meshes is not known, and intervals do not count it: with coarser edges"
-            self.context.tell(self.title, 0, 0, f"warning: {text}, {error}")
-            return []
-        return [replace(record, model=model) for record, model in zip(self.records, models, strict=True)]
+        lost = "intervals do not count the error of the site's own mesh"
+        edges, title = self._coarser_edges, self.title
+        models = meshed_where_possible(self.context, folder, self._models, edges, title, lost)
+        pairs = zip(self.records, models, strict=True)
+        return [replace(record, model=model) if model else None for record, model in pairs]
 
     def _mesh_error(
-        self, parameters: Array, searched: Responses, others: Sequence[SiteRecord]
+        self, parameters: Array, searched: Responses, others: Sequence[SiteRecord | None]
     ) -> tuple[Array, ...]:
         """One standard deviation (n,) N of what the study's meshes lack at every site.
 
         It follows from the difference of what is ``searched`` and of the same on ``others``, meshes of other
-        edges. Zero where these cannot be simulated: a line says so.
+        edges. Zero where there are none, or these cannot be simulated: a line says so.
         """
-        study, lacking = self.context.study, []
+        study, lacking = self.context.study, [0.0 * record.compared for record in self.records]
         share = error_of_own_mesh(study.mesh)
-        near = [replace(other, model=replace(other.model, within_mm=study.within_mm)) for other in others]
+        there = [(i, other) for i, other in enumerate(others) if other is not None]
+        near = [replace(one, model=replace(one.model, within_mm=study.within_mm)) for _, one in there]
         jobs = [other.job(parameters, sensitivities=False) for other in near]
         done = self.cache.run(jobs, self.context.executor, again=True)
-        for record, simulation, known in zip(self.records, done, searched, strict=True):
-            found = record.respond(simulation)
+        for (i, _), simulation in zip(there, done, strict=True):
+            found, known = self.records[i].respond(simulation), searched[i]
             told = f"another mesh, site {simulation.site}"
             if not found.completed:
                 told = f"warning: site {simulation.site}: the error of its mesh is not known: {found.reason}"
             self.context.tell(self.title, 0, 0, told)
-            usable = found.completed and known.completed
-            lacking.append(share * (known.force_N - found.force_N) if usable else 0.0 * record.compared)
+            if found.completed and known.completed:
+                lacking[i] = share * (known.force_N - found.force_N)
         return tuple(lacking)
 
     def _facts(self, state: SearchState) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,9 +28,34 @@ def meshed_models(
     missing = _missing(jobs)
     for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
-    return [
-        replace(model, mesh=job.file, mesh_digest=file_digest(job.file)) for model, job in zip(models, jobs)
-    ]
+    return [_on_mesh(model, job) for model, job in zip(models, jobs, strict=True)]
+
+
+def meshed_where_possible(
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str, lost: str
+) -> list[SiteModel | None]:
+    """As `meshed_models`, but None for a site of which no such mesh can be made; a line says so, and that
+    ``lost`` with it."""
+    jobs = _jobs(context, folder, models, settings)
+    missing = _missing(jobs)
+    for job, error in zip(missing, context.executor.map(_try_mesh, missing), strict=True):
+        told = f"mesh of site {job.site}, {folder.name}"
+        context.tell(title, 0, 0, f"warning: {told}: {error}; {lost}" if error else told)
+    pairs = zip(models, jobs, strict=True)
+    return [_on_mesh(model, job) if is_meshed(job.file) else None for model, job in pairs]
+
+
+def _on_mesh(model: SiteModel, job: MeshJob) -> SiteModel:
+    return replace(model, mesh=job.file, mesh_digest=file_digest(job.file))
+
+
+def _try_mesh(job: MeshJob) -> str:
+    """Why a mesh cannot be made; empty where it was."""
+    try:
+        make_mesh(job)
+    except MeshingError as error:
+        return str(error)
+    return ""
 
 
 @contextmanager
@@ -53,8 +78,7 @@ def _mesh_idly(jobs: Sequence[MeshJob]) -> None:
     if hasattr(os, "nice"):  # not on Windows
         os.nice(19)
     for job in jobs:
-        with suppress(MeshingError):  # told where the mesh is wanted
-            make_mesh(job)
+        _try_mesh(job)  # why it cannot is told where the mesh is wanted
 
 
 def _jobs(

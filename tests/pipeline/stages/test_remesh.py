@@ -1,0 +1,34 @@
+"""Sites on meshes of other edges than their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from conftest import COARSE
+from limbfit import load_study, run_study
+from limbfit.execution import SerialExecutor
+from limbfit.pipeline.shared.context import Context, Progress
+from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.stages.mesh import mesh_settings
+from limbfit.pipeline.stages.records import site_record
+from limbfit.pipeline.stages.remesh import meshed_models, meshed_where_possible, scaled_edges
+
+
+def test_a_site_without_such_a_mesh_is_left_out_and_named(study):
+    """The others keep theirs: here one was made, and no time is left for the other."""
+    with (study / "study.toml").open("a") as stream:
+        stream.write(COARSE)
+    loaded, told = load_study(study), list[Progress]()
+    run_study(loaded, until="mesh")
+    context = Context(loaded, Store(loaded.results), SerialExecutor(), told.append)
+    models = [site_record(context, record).model for record in loaded.recorded]
+    coarser, folder = scaled_edges(mesh_settings(loaded), 1.3), study / "coarser"
+    meshed_models(context, folder, models[:1], coarser, "calibrate")
+    hurried = replace(coarser, time_limit_s=0.01)
+    found = meshed_where_possible(context, folder, models, hurried, "calibrate", "its error is not counted")
+    assert found == [replace(models[0], mesh=folder / "1.vtu", mesh_digest=found[0].mesh_digest), None]
+    assert found[0].mesh_digest != models[0].mesh_digest
+    made, lost = (event.text for event in told)
+    assert made == "mesh of site 1, coarser"
+    assert lost.startswith("warning: mesh of site 2, coarser: ")
+    assert lost.endswith("; its error is not counted")
