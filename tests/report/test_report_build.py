@@ -41,6 +41,10 @@ def test_one_file_without_requests(report: str) -> None:
     assert [a for a in outline.all("script") if "src" in a] == []
 
 
+def test_nothing_is_doubted_where_no_simulation_was(report: str) -> None:
+    assert "doubtful" not in without_scripts(report)
+
+
 def test_only_the_reports_own_script_may_run(report: str) -> None:
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', report)
     assert policy
