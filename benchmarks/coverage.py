@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,11 +32,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import block_diag
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "identify"))
+from coverage_study import Coverage, Deviation, coverage_study
+
 from limbfit import load_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify import Emulator, Measured, SiteNoise, SiteResponse, Unknowns, record_noise
-from limbfit.identify.uncertainty.coverage import Coverage, Deviation, coverage_study
-from limbfit.identify.uncertainty.noise import depth_slope
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import Unknowns
+from limbfit.identify.uncertainty.emulator import Emulator
+from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, estimate_record_noise
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.pipeline.shared.context import Context
@@ -71,7 +76,7 @@ class Robot:
     stiffer: tuple[Array, ...]
     seed: int
 
-    def __call__(self, repeat: int, smoothed: Sequence[Array]) -> tuple[list[Measured], list[SiteNoise]]:
+    def __call__(self, repeat: int, smoothed: Sequence[Array]) -> tuple[list[MeasuredCurve], list[SiteNoise]]:
         random = np.random.default_rng([self.seed, repeat])
         measured, noise = [], []
         how = zip(self.smoothing, self.responses, strict=True)
@@ -80,12 +85,12 @@ class Robot:
             true = force + random.standard_normal() * stiffer
             true = true + self._wrong(random, record.times_s, force)
             off, sd = self._touch_down(random, record, true)
-            true = true + off * depth_slope(record.times_s, record.displacement_mm, force)
+            true = true + off * compute_depth_slope(record.times_s, record.displacement_mm, force)
             smooth, residual = self.regularised(random, record, np.maximum(true, 0.0), smoothing)
             curve = np.interp(record.times_s, smooth.time_s, smooth.force_N)
-            measured.append(Measured(record.name, curve))
+            measured.append(MeasuredCurve(record.name, curve))
             site = record.name, record.times_s, residual, answer, record.displacement_mm, sd
-            noise.append(record_noise(*site, response))
+            noise.append(estimate_record_noise(*site, response))
         return measured, noise
 
     def _touch_down(
@@ -153,8 +158,8 @@ class Smoothed:
         found = zip(self.responses, self.emulator(parameters), strict=True)
         return [SiteResponse(S @ r.force_N, S @ r.jacobian) for S, r in found]
 
-    def forces(self, parameters: Array) -> Array:
-        return self.emulator.forces(parameters) @ block_diag(*self.responses).T
+    def predict_forces(self, parameters: Array) -> Array:
+        return self.emulator.predict_forces(parameters) @ block_diag(*self.responses).T
 
 
 def study_robot(

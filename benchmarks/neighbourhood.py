@@ -21,7 +21,7 @@ import numpy as np
 
 from limbfit import load_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify.fit.correction import CoarseToFine
+from limbfit.identify.fit.correction import MeshCorrection
 from limbfit.indentation import SimulationJob, build_problem, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context
@@ -80,7 +80,7 @@ def main() -> None:
         )
         for radius in args.radii:
             part = row(record, best, moved, radius)
-            correction = CoarseToFine([part["here"]], [whole["here"]])
+            correction = MeshCorrection([part["here"]], [whole["here"]])
             expected = correction([part["there"]])[0]
             off = np.abs(expected.force_N - whole["there"].force_N).max() / whole["there"].force_N.max()
             slopes = [one.jacobian * best for one in (correction([part["here"]])[0], whole["here"])]

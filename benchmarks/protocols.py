@@ -29,8 +29,14 @@ from protocols_limb import BALL_TABLE, SLOW, TISSUES, Limb, Take, write_case
 
 from limbfit import load_study, plan_protocol, run_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify.checks.design import NoiseModel, information_of, prior_information
-from limbfit.identify.checks.protocol import Budget, Option, Wanted, factors_95, plan
+from limbfit.identify.checks.design import NoiseModel, compute_bounds_information, compute_information
+from limbfit.identify.checks.protocol import (
+    Budget,
+    DesignTarget,
+    RecordOption,
+    compute_factors_95,
+    plan_records,
+)
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import to_vector
 from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, Seen
@@ -116,7 +122,7 @@ def designed(
 
 def told_of(
     folder: Path, limb: Limb, edge_mm: float | None, takes: Sequence[Take], misfit: float
-) -> dict[Take, Option]:
+) -> dict[Take, RecordOption]:
     """What records tell of the true tissue where the model's own error is ``misfit`` of the largest value.
 
     With what ultrasound sees where there is some. Simulated on the study's meshes, once.
@@ -137,18 +143,18 @@ def told_of(
     for take, one in zip(takes, done, strict=True):
         if not one.completed:
             raise SystemExit(f"{take.name} could not be simulated: {one.reason}")
-        information = information_of(SiteResponse(one.force_N, one.jacobian), truth, force)
+        information = compute_information(SiteResponse(one.force_N, one.jacobian), truth, force)
         if take.seen.ultrasound:
             for lost, slopes in zip(one.observed, one.observed_jacobian, strict=True):
-                information = information + information_of(SiteResponse(lost, slopes), truth, layers)
+                information = information + compute_information(SiteResponse(lost, slopes), truth, layers)
         place = take.site, "ball" if take.ball else "punch"
-        found[take] = Option(place, take.knots[0][-1] + REST_S, information[None])
+        found[take] = RecordOption(place, take.knots[0][-1] + REST_S, information[None])
     return found
 
 
-def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> Wanted:
+def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> DesignTarget:
     """All eight parameters, given the study's bounds."""
-    return Wanted(prior_information(unknowns(plan_study(folder, limb, edge_mm))), np.eye(8))
+    return DesignTarget(compute_bounds_information(unknowns(plan_study(folder, limb, edge_mm))), np.eye(8))
 
 
 def best_at_truth(
@@ -158,7 +164,7 @@ def best_at_truth(
     ways = product(FITTED, (SLOW, FAST), (0.0, HOLD_S), (False, True))
     every = [Take(site, speed, hold, ball, seen=seen) for site, speed, hold, ball in ways]
     options = list(told_of(folder, limb, edge_mm, every, misfit).values())
-    best = plan(options, Budget(60.0 * minutes, SETUP_S), wanted_of(folder, limb, edge_mm))
+    best = plan_records(options, Budget(60.0 * minutes, SETUP_S), wanted_of(folder, limb, edge_mm))
     return tuple(every[i] for i in best)
 
 
@@ -178,7 +184,7 @@ def expected(folder: Path, limb: Limb, edge_mm: float | None) -> list[dict[str, 
             chosen[name] = best_at_truth(folder, limb, edge_mm, minutes, misfit, seen)
         for name, takes in chosen.items():
             options = list(told_of(folder, limb, edge_mm, takes, misfit).values())
-            (factors,) = factors_95(wanted.covariances(options, range(len(options)), 1))
+            (factors,) = compute_factors_95(wanted.compute_covariances(options, range(len(options)), 1))
             rows.append(
                 {
                     "case": name,

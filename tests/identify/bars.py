@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limbfit.identify import Measured, SiteResponse, Unknowns
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import Unknowns
+from limbfit.identify.uncertainty.intervals import EvaluationStore
 
 NAMES = tuple(
     f"{tissue}.{name}" for tissue in ("skin", "muscle") for name in ("c_kPa", "m", "gamma", "tau_s")
@@ -73,10 +75,10 @@ def simulate(parameters):
     return [site.respond(parameters) for site in SITES]
 
 
-def records(noise: float = 0.0, seed: int = 0, truth: np.ndarray = TRUTH, sites=SITES) -> list[Measured]:
+def records(noise: float = 0.0, seed: int = 0, truth: np.ndarray = TRUTH, sites=SITES) -> list[MeasuredCurve]:
     rng = np.random.default_rng(seed)
     forces = [site.force(truth) for site in sites]
-    return [Measured(f"s{k}", f + noise * rng.standard_normal(f.size)) for k, f in enumerate(forces)]
+    return [MeasuredCurve(f"s{k}", f + noise * rng.standard_normal(f.size)) for k, f in enumerate(forces)]
 
 
 THREE = tuple(f"{tissue}.{name.split('.')[1]}" for tissue in ("skin", "fat", "muscle") for name in NAMES[:4])
@@ -133,6 +135,17 @@ def coarsened(parameters):
         columns = [biased(parameters + 1e-30j * row).imag / 1e-30 for row in np.eye(len(parameters))]
         responses.append(SiteResponse(biased(parameters), np.stack(columns, axis=1)))
     return responses
+
+
+def storing(store: EvaluationStore, simulation):
+    """The same simulation, whose evaluations are stored."""
+
+    def simulate_and_store(parameters):
+        responses = simulation(parameters)
+        store.add(parameters, responses)
+        return responses
+
+    return simulate_and_store
 
 
 def plain(parameters):

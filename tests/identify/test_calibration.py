@@ -19,18 +19,16 @@ from bars import (
 )
 
 from limbfit.errors import CalibrationError, ProblemError
-from limbfit.identify import (
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import (
     FIXED,
-    CalibrationSettings,
-    Measured,
-    SearchState,
-    SiteResponse,
     Unknowns,
-    calibrate,
-    search_space,
-    separate,
-    shared,
+    build_search_space,
+    group_by_kind,
+    group_separately,
 )
+from limbfit.identify.fit.state import CalibrationSettings, SearchState
 
 
 def test_complex_step_derivatives_agree_with_differences():
@@ -56,7 +54,7 @@ def test_truth_is_found_from_the_papers_start_in_few_evaluations():
 
 
 def test_the_one_material_stage_alone_keeps_tissues_equal():
-    found = calibrate(simulate, records(), PAPER, stages=(shared(PAPER.names),))
+    found = calibrate(simulate, records(), PAPER, stages=(group_by_kind(PAPER.names),))
     assert np.array_equal(found.parameters[:4], found.parameters[4:])
     assert found.cost > 1e-3
 
@@ -246,22 +244,30 @@ def test_the_limit_of_iterations_is_not_called_convergence():
 
 def test_sites_count_alike_whatever_their_force_and_sampling():
     data = records()
-    big = [Measured(d.name, d.force_N * 10) for d in data]
+    big = [MeasuredCurve(d.name, d.force_N * 10) for d in data]
     start = calibrate(
-        simulate, data, PAPER, CalibrationSettings(max_iterations=1), stages=(shared(PAPER.names),)
+        simulate, data, PAPER, CalibrationSettings(max_iterations=1), stages=(group_by_kind(PAPER.names),)
     ).history[0]
     scaled = [SiteResponse(10 * r.force_N, 10 * r.jacobian) for r in simulate(PAPER.start)]
     tenfold = calibrate(
-        lambda p: scaled, big, PAPER, CalibrationSettings(max_iterations=1), stages=(shared(PAPER.names),)
+        lambda p: scaled,
+        big,
+        PAPER,
+        CalibrationSettings(max_iterations=1),
+        stages=(group_by_kind(PAPER.names),),
     )
     assert tenfold.history[0].cost == pytest.approx(start.cost)
 
 
 def test_search_space_round_trip_and_derivatives():
-    for grouping in (shared(PAPER.names), separate(PAPER.names), (0, 1, 2, FIXED, 3, 1, 2, FIXED)):
-        space = search_space(PAPER, grouping)
+    for grouping in (
+        group_by_kind(PAPER.names),
+        group_separately(PAPER.names),
+        (0, 1, 2, FIXED, 3, 1, 2, FIXED),
+    ):
+        space = build_search_space(PAPER, grouping)
         z = (space.lower + space.upper) / 2
-        assert space.reduce(space.logarithms(z)) == pytest.approx(z)
+        assert space.reduce(space.to_logarithms(z)) == pytest.approx(z)
         jacobian = space.pull_back(np.eye(8), space.expand(z))
         for k, row in enumerate(np.eye(len(z))):
             difference = (space.expand(z + 1e-6 * row) - space.expand(z - 1e-6 * row)) / 2e-6
@@ -272,7 +278,7 @@ def test_impossible_bounds_are_bad_input():
     with pytest.raises(ProblemError, match=r"skin.gamma.*0 < lower"):
         Unknowns(PAPER.names, PAPER.start, PAPER.lower * [1, 1, 0, 1, 1, 1, 1, 1], PAPER.upper)
     with pytest.raises(ProblemError, match="no parameter is left"):
-        search_space(PAPER, (FIXED,) * 8)
+        build_search_space(PAPER, (FIXED,) * 8)
 
 
 class Doubtful:
@@ -303,8 +309,8 @@ def test_a_slip_does_not_lure_the_search():
     """Records as they look where the second bar slips: nearer to them, but another equilibrium's force."""
     run = Doubtful(too_soft, "slipped", 0.7)
     record = run(np.tile([3.5, 4.0, 2.5, 0.4], 2))
-    measured = [Measured(f"s{i}", one.force_N) for i, one in enumerate(record)]
-    found = calibrate(run, measured, PAPER, stages=[shared(PAPER.names)])
+    measured = [MeasuredCurve(f"s{i}", one.force_N) for i, one in enumerate(record)]
+    found = calibrate(run, measured, PAPER, stages=[group_by_kind(PAPER.names)])
     assert any(run.asked[1:])
     assert not any(run.accepted(found))
     assert not found.converged

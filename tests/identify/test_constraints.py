@@ -10,21 +10,18 @@ import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate
 
 from limbfit.errors import CalibrationError, ProblemError
-from limbfit.identify import (
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.multistart import describe_starts, draw_starts, run_multistart
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import (
     FIXED,
-    CalibrationSettings,
-    Measured,
     Prior,
-    SiteResponse,
-    calibrate,
-    constrained,
-    multistart,
-    random_starts,
-    separate,
-    shared,
-    two_stages,
+    constrain_grouping,
+    group_by_kind,
+    group_separately,
+    stage_groupings,
 )
-from limbfit.identify.fit.multistart import describe
+from limbfit.identify.fit.state import CalibrationSettings
 
 GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
 
@@ -32,7 +29,7 @@ GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
 def test_fixed_names_move_in_no_stage():
     start = PAPER.start.copy()
     start[GAMMA] = TRUTH[GAMMA]
-    stages = [constrained(grouping, NAMES, ["skin.gamma"]) for grouping in two_stages(NAMES)]
+    stages = [constrain_grouping(grouping, NAMES, ["skin.gamma"]) for grouping in stage_groupings(NAMES)]
     assert [stage[GAMMA] for stage in stages] == [FIXED, FIXED]
     tight = CalibrationSettings(relative_tolerance=1e-4)
     found = calibrate(simulate, records(), replace(PAPER, start=start), tight, stages=stages)
@@ -44,9 +41,9 @@ def test_fixed_names_move_in_no_stage():
 def test_tied_names_stay_equal_and_reach_a_truth_in_which_they_are():
     truth = TRUTH.copy()
     truth[TAU] = truth[TAU + 4]
-    grouping = constrained(separate(NAMES), NAMES, tied=[["skin.tau_s", "muscle.tau_s"]])
+    grouping = constrain_grouping(group_separately(NAMES), NAMES, tied=[["skin.tau_s", "muscle.tau_s"]])
     assert len(set(grouping)) == 7
-    stages = (shared(NAMES), grouping)
+    stages = (group_by_kind(NAMES), grouping)
     found = calibrate(simulate, records(truth=truth), PAPER, stages=stages)
     assert found.parameters[TAU] == found.parameters[TAU + 4]
     assert found.parameters == pytest.approx(truth, rel=2e-3)
@@ -54,7 +51,7 @@ def test_tied_names_stay_equal_and_reach_a_truth_in_which_they_are():
 
 def test_all_tied_is_one_material():
     ties = [[f"skin.{name}", f"muscle.{name}"] for name in ("c_kPa", "m", "gamma", "tau_s")]
-    assert constrained(separate(NAMES), NAMES, tied=ties) == shared(NAMES)
+    assert constrain_grouping(group_separately(NAMES), NAMES, tied=ties) == group_by_kind(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +65,7 @@ def test_all_tied_is_one_material():
 )
 def test_impossible_constraints_are_bad_input(fixed, tied, words):
     with pytest.raises(ProblemError, match=words):
-        constrained(separate(NAMES), NAMES, fixed, tied)
+        constrain_grouping(group_separately(NAMES), NAMES, fixed, tied)
 
 
 def test_a_prior_holds_what_the_data_do_not_show_and_hardly_what_they_do():
@@ -118,7 +115,7 @@ def test_priors_that_make_no_sense_are_bad_input():
 
 
 def test_a_heavier_record_is_fitted_closer():
-    wrong = [Measured(d.name, d.force_N * (1.15 if d.name == "s1" else 1.0)) for d in records()]
+    wrong = [MeasuredCurve(d.name, d.force_N * (1.15 if d.name == "s1" else 1.0)) for d in records()]
     heavy = [replace(d, weight=100.0) if d.name == "s1" else d for d in wrong]
     light, strong = (calibrate(simulate, data, PAPER).history[-1].errors_percent for data in (wrong, heavy))
     assert strong[1] < 0.5 * light[1]
@@ -127,15 +124,15 @@ def test_a_heavier_record_is_fitted_closer():
 
 def test_twenty_random_starts_between_the_bounds_end_at_the_same_optimum():
     data = records(0.03, seed=1)
-    found = multistart(lambda number, unknowns: calibrate(simulate, data, unknowns), PAPER, 20, seed=4)
+    found = run_multistart(lambda number, unknowns: calibrate(simulate, data, unknowns), PAPER, 20, seed=4)
     assert found.reached == 20, [(start.start, start.reason) for start in found.starts if not start.same]
     assert max(start.apart for start in found.starts) < 1.1
     assert found.best.cost == min(start.cost for start in found.starts)
-    assert "20 of 20 starts end at the same error" in describe(found, NAMES)
+    assert "20 of 20 starts end at the same error" in describe_starts(found, NAMES)
 
 
 def test_random_starts_are_of_their_seed_and_within_the_bounds():
-    one, two, other = (random_starts(PAPER, 5, seed) for seed in (1, 1, 2))
+    one, two, other = (draw_starts(PAPER, 5, seed) for seed in (1, 1, 2))
     assert np.array_equal(one, two)
     assert not np.array_equal(one[1:], other[1:])
     assert np.array_equal(one[0], PAPER.start)
@@ -145,8 +142,8 @@ def test_random_starts_are_of_their_seed_and_within_the_bounds():
 
 def test_random_starts_leave_what_is_fixed_and_keep_what_is_tied():
     names = list(PAPER.names)
-    grouping = constrained(shared(names), names, fixed=[names[1]], tied=[[names[3], names[7]]])
-    drawn = np.array(random_starts(PAPER, 6, 1, grouping))
+    grouping = constrain_grouping(group_by_kind(names), names, fixed=[names[1]], tied=[[names[3], names[7]]])
+    drawn = np.array(draw_starts(PAPER, 6, 1, grouping))
     assert np.all(drawn[:, 1] == PAPER.start[1])
     assert drawn[:, 3] == pytest.approx(drawn[:, 7])
     assert len(np.unique(drawn[:, 5].round(9))) == 6
@@ -160,7 +157,7 @@ def test_starts_that_end_in_one_place_count_as_one_however_good_the_fit():
     def run(number, unknowns):
         return calibrate(simulate, data, unknowns, loose)
 
-    found = multistart(run, PAPER, 6, seed=4)
+    found = run_multistart(run, PAPER, 6, seed=4)
     costs = [start.cost for start in found.starts]
     assert max(costs) > 1.5 * min(costs)
     assert found.reached == 6, costs
@@ -171,14 +168,14 @@ def test_a_start_that_fails_is_told_and_the_others_count():
         failing = Counted(forbidden=lambda p: number == 1)
         return calibrate(failing, records(), unknowns)
 
-    found = multistart(run, PAPER, 3, seed=1)
+    found = run_multistart(run, PAPER, 3, seed=1)
     assert [start.parameters is None for start in found.starts] == [False, True, False]
     assert "did not converge" in found.starts[1].reason
     assert found.reached == 2
     with pytest.raises(CalibrationError, match="no simulation completes"):
-        multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 1)
+        run_multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 1)
     with pytest.raises(CalibrationError, match="none of 2 starts"):
-        multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 2)
+        run_multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 2)
 
 
 @pytest.mark.parametrize("roughness", [1e-4, 1e-3])

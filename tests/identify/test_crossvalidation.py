@@ -9,15 +9,15 @@ import pytest
 from bars import PAPER, TRUTH, Bars
 
 from limbfit.errors import CalibrationError
-from limbfit.identify import Measured
 from limbfit.identify.checks.crossvalidation import (
-    choices_of,
     cross_validate,
-    errors_by_site,
     fit_sites,
-    standing,
-    without_regions,
+    list_choices,
+    list_choices_without_regions,
+    rank_fold,
+    summarise_errors_by_site,
 )
+from limbfit.identify.fit.objective import MeasuredCurve
 
 SITES = [
     Bars((400 * (1 - h) + 60, 400 * h + 60), (10 + 10 * h, 16 + 8 * h), 3.2 + 3.5 * h)
@@ -33,7 +33,7 @@ def records(misfit=()):
     """Forces of the truth; ``misfit`` are factors by which single sites differ from it."""
     factors = np.ones(len(SITES))
     factors[: len(misfit)] = misfit
-    return [Measured(f"s{k}", f * site.force(TRUTH)) for k, (f, site) in enumerate(zip(factors, SITES))]
+    return [MeasuredCurve(f"s{k}", f * site.force(TRUTH)) for k, (f, site) in enumerate(zip(factors, SITES))]
 
 
 def near(truth=TRUTH):
@@ -41,36 +41,36 @@ def near(truth=TRUTH):
 
 
 def test_all_choices_and_samples_without_repeats():
-    assert len(choices_of(6, 4)) == comb(6, 4)
-    drawn = choices_of(18, 4, most=100, seed=3)
+    assert len(list_choices(6, 4)) == comb(6, 4)
+    drawn = list_choices(18, 4, most=100, seed=3)
     assert len(set(drawn)) == len(drawn) == 100
-    assert drawn == choices_of(18, 4, most=100, seed=3) != choices_of(18, 4, most=100, seed=4)
-    assert len(set(choices_of(40, 8, most=50))) == 50
+    assert drawn == list_choices(18, 4, most=100, seed=3) != list_choices(18, 4, most=100, seed=4)
+    assert len(set(list_choices(40, 8, most=50))) == 50
     with pytest.raises(CalibrationError, match="none to be predicted"):
-        choices_of(4, 4)
+        list_choices(4, 4)
 
 
 def test_every_site_is_left_out_equally_often():
-    drawn = choices_of(12, 4, most=300)
+    drawn = list_choices(12, 4, most=300)
     counts = np.bincount(np.concatenate([np.array(c) for c in drawn]), minlength=12)
     assert counts == pytest.approx(100, rel=0.3)
 
 
 def test_regions_are_left_out_whole():
-    assert without_regions(["a", "b", "a", "c"]) == {"a": (1, 3), "b": (0, 2, 3), "c": (0, 1, 2)}
-    assert without_regions(["a", "a"]) == without_regions(["", ""]) == {}
+    assert list_choices_without_regions(["a", "b", "a", "c"]) == {"a": (1, 3), "b": (0, 2, 3), "c": (0, 1, 2)}
+    assert list_choices_without_regions(["a", "a"]) == list_choices_without_regions(["", ""]) == {}
 
 
 def test_perfect_records_are_predicted_from_any_choice():
-    folds = cross_validate(simulate, records(), near(), choices_of(5, 3))
+    folds = cross_validate(simulate, records(), near(), list_choices(5, 3))
     assert len(folds) == 10
     assert max(fold.mean_heldout for fold in folds) < 0.5
     assert all(len(fold.heldout) == 2 and fold.converged for fold in folds)
 
 
 def test_the_site_that_differs_is_predicted_badly_from_all_choices_without_it():
-    folds = cross_validate(simulate, records([1, 1, 1.2]), near(), choices_of(5, 3))
-    by_site = errors_by_site(folds, 5)
+    folds = cross_validate(simulate, records([1, 1, 1.2]), near(), list_choices(5, 3))
+    by_site = summarise_errors_by_site(folds, 5)
     assert [summary.sites for summary in by_site] == [4] * 5
     # 20 % more force: a mean absolute error of 20 % of the mean over the peak.
     force = SITES[2].force(TRUTH)
@@ -79,16 +79,16 @@ def test_the_site_that_differs_is_predicted_badly_from_all_choices_without_it():
 
 
 def test_the_standing_of_a_choice_is_its_rank():
-    folds = cross_validate(simulate, records([1.2]), near(), choices_of(5, 3))
+    folds = cross_validate(simulate, records([1.2]), near(), list_choices(5, 3))
     ranked = sorted(folds, key=lambda fold: fold.mean_heldout)
-    best, worst = standing(ranked[0], folds), standing(ranked[-1], folds)
+    best, worst = rank_fold(ranked[0], folds), rank_fold(ranked[-1], folds)
     assert best.share_better < 0.11
     assert worst.share_better > 0.89
     assert best.median_percent == pytest.approx(np.median([f.mean_heldout for f in folds]))
 
 
 def test_regions_have_their_names_and_limits_are_told():
-    choices = without_regions(["a", "a", "b", "b", "b"])
+    choices = list_choices_without_regions(["a", "a", "b", "b", "b"])
     folds = cross_validate(simulate, records(), near(), choices)
     assert [fold.label for fold in folds] == ["a", "b"]
     tight = PAPER.__class__(PAPER.names, TRUTH * 1.6, TRUTH * 1.5, TRUTH * 3)

@@ -9,20 +9,20 @@ import pytest
 from bars import PAPER, SITES, TRUTH
 
 from limbfit.errors import CalibrationError
-from limbfit.identify import SiteResponse, calibrate
 from limbfit.identify.checks.design import (
     Candidate,
     NoiseModel,
-    candidate,
-    choose,
-    efficiency,
-    evaluate,
-    information_of_field,
-    prior_information,
+    build_candidate,
+    choose_design,
+    compute_bounds_information,
+    compute_efficiency,
+    compute_field_information,
+    evaluate_design,
 )
-from limbfit.identify.fit.objective import Measured
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 
-PRIOR = prior_information(PAPER)
+PRIOR = compute_bounds_information(PAPER)
 
 
 def lines(slopes, noise=0.1):
@@ -31,7 +31,7 @@ def lines(slopes, noise=0.1):
     found = []
     for k, (a, b) in enumerate(slopes):
         response = SiteResponse(at + 0.1, np.outer(at, [a, b]))
-        found.append(candidate(f"s{k}", 1.0, response, np.ones(2), NoiseModel(noise)))
+        found.append(build_candidate(f"s{k}", 1.0, response, np.ones(2), NoiseModel(noise)))
     return found
 
 
@@ -47,7 +47,7 @@ def random_candidates(sites, depths, seed=0, p=4):
 
 def test_white_noise_gives_the_information_of_least_squares():
     response = SITES[0].respond(TRUTH)
-    found = candidate("s0", 4.0, response, TRUTH, NoiseModel(0.05))
+    found = build_candidate("s0", 4.0, response, TRUTH, NoiseModel(0.05))
     scaled = response.jacobian * TRUTH
     assert found.information == pytest.approx(scaled.T @ scaled / 0.05**2, rel=1e-9)
 
@@ -57,21 +57,21 @@ def test_correlated_noise_is_that_of_the_full_covariance():
     force, scaled = response.force_N, response.jacobian * TRUTH
     lags = np.abs(np.subtract.outer(np.arange(force.size), np.arange(force.size)))
     S = (0.03 * force.max()) ** 2 * 0.9**lags + 0.02**2 * np.eye(force.size)
-    found = candidate("s1", 3.5, response, TRUTH, noise).information
+    found = build_candidate("s1", 3.5, response, TRUTH, noise).information
     assert found == pytest.approx(scaled.T @ np.linalg.inv(S) @ scaled, rel=1e-6)
 
 
 def test_a_site_for_each_parameter_beats_two_for_the_same():
-    found = choose(lines([(1, 0), (1.1, 0), (0, 0.5), (0, 0.4)]), 2, 1e-6 * np.eye(2))
+    found = choose_design(lines([(1, 0), (1.1, 0), (0, 0.5), (0, 0.4)]), 2, 1e-6 * np.eye(2))
     assert found.chosen == (1, 2)
 
 
 @pytest.mark.parametrize("criterion", ["D", "A"])
 def test_exhaustive_choice_is_the_best_of_all(criterion):
     every = random_candidates(6, 2)
-    best = choose(every, 3, np.eye(4), criterion)
+    best = choose_design(every, 3, np.eye(4), criterion)
     pairs = [c for c in combinations(range(12), 3) if len({every[i].site for i in c}) == 3]
-    designs = [evaluate(every, c, np.eye(4)) for c in pairs]
+    designs = [evaluate_design(every, c, np.eye(4)) for c in pairs]
     if criterion == "D":
         assert best.log_det == pytest.approx(max(d.log_det for d in designs))
     else:
@@ -83,38 +83,38 @@ def test_exhaustive_choice_is_the_best_of_all(criterion):
 def test_exchanges_reach_what_looking_at_all_choices_finds(criterion, monkeypatch):
     for seed in range(5):
         every = random_candidates(9, 2, seed)
-        best = choose(every, 4, np.eye(4), criterion)
+        best = choose_design(every, 4, np.eye(4), criterion)
         with monkeypatch.context() as patch:
-            patch.setattr("limbfit.identify.checks.design.EXHAUSTIVE", 0)
-            found = choose(every, 4, np.eye(4), criterion)
+            patch.setattr("limbfit.identify.checks.design.MAX_EXHAUSTIVE_CHOICES", 0)
+            found = choose_design(every, 4, np.eye(4), criterion)
         assert not found.exhaustive
         assert len({every[i].site for i in found.chosen}) == 4
-        assert efficiency(found, best, criterion) > 0.995
+        assert compute_efficiency(found, best, criterion) > 0.995
 
 
 def test_a_deeper_indentation_with_more_information_is_chosen():
     every = random_candidates(5, 3)
-    assert all(every[i].depth_mm == 2.0 for i in choose(every, 2, np.eye(4)).chosen)
+    assert all(every[i].depth_mm == 2.0 for i in choose_design(every, 2, np.eye(4)).chosen)
 
 
 def test_efficiency_is_the_share_of_the_data_that_tells_as_much():
     every = random_candidates(4, 1)
-    one = evaluate(every, (0, 1), 1e-9 * np.eye(4))
+    one = evaluate_design(every, (0, 1), 1e-9 * np.eye(4))
     double = [Candidate(c.site, c.depth_mm, 2 * c.information) for c in every]
-    two = evaluate(double, (0, 1), 2e-9 * np.eye(4))
-    assert efficiency(one, two, "D") == pytest.approx(0.5)
-    assert efficiency(one, two, "A") == pytest.approx(0.5)
+    two = evaluate_design(double, (0, 1), 2e-9 * np.eye(4))
+    assert compute_efficiency(one, two, "D") == pytest.approx(0.5)
+    assert compute_efficiency(one, two, "A") == pytest.approx(0.5)
 
 
 def test_expected_widths_are_those_that_repeated_fits_scatter_with():
     noise, sd = NoiseModel(0.03), []
     truth = TRUTH
-    every = [candidate(f"s{k}", s.depth, s.respond(truth), truth, noise) for k, s in enumerate(SITES)]
-    expected = evaluate(every, range(4), PRIOR)
+    every = [build_candidate(f"s{k}", s.depth, s.respond(truth), truth, noise) for k, s in enumerate(SITES)]
+    expected = evaluate_design(every, range(4), PRIOR)
     for seed in range(25):
         rng = np.random.default_rng(seed)
         data = [
-            Measured(f"s{k}", s.force(truth) + 0.03 * rng.standard_normal(s.points))
+            MeasuredCurve(f"s{k}", s.force(truth) + 0.03 * rng.standard_normal(s.points))
             for k, s in enumerate(SITES)
         ]
         start = PAPER.__class__(PAPER.names, truth, PAPER.lower, PAPER.upper)
@@ -131,12 +131,12 @@ def test_expected_widths_are_those_that_repeated_fits_scatter_with():
 
 def test_what_cannot_be_chosen_is_refused():
     with pytest.raises(CalibrationError, match="5 sites are wanted of 4"):
-        choose(random_candidates(4, 2), 5, np.eye(4))
+        choose_design(random_candidates(4, 2), 5, np.eye(4))
     with pytest.raises(CalibrationError, match="noise"):
         NoiseModel(0.0)
     partial = SiteResponse(np.ones(3), np.ones((3, 2)), False, "did not converge")
     with pytest.raises(CalibrationError, match="did not converge"):
-        candidate("s0", 1.0, partial, np.ones(2), NoiseModel(0.1))
+        build_candidate("s0", 1.0, partial, np.ones(2), NoiseModel(0.1))
 
 
 def test_the_information_of_a_field_is_that_of_its_whole_covariance() -> None:
@@ -149,8 +149,8 @@ def test_the_information_of_a_field_is_that_of_its_whole_covariance() -> None:
     size = (0.05 * np.abs(values).max()) ** 2
     scaled = (slopes * parameters).reshape(21, 2)
     whole = scaled.T @ np.linalg.solve(0.01 * np.eye(21) + size * np.kron(alike, along), scaled)
-    assert information_of_field(values, slopes, alike, parameters, noise) == pytest.approx(whole)
+    assert compute_field_information(values, slopes, alike, parameters, noise) == pytest.approx(whole)
     apart = sum(
         row.T @ np.linalg.solve(0.01 * np.eye(7) + size * along, row) for row in scaled.reshape(3, 7, 2)
     )
-    assert information_of_field(values, slopes, np.eye(3), parameters, noise) == pytest.approx(apart)
+    assert compute_field_information(values, slopes, np.eye(3), parameters, noise) == pytest.approx(apart)

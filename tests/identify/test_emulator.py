@@ -7,7 +7,9 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate
 
 from limbfit.errors import CalibrationError
-from limbfit.identify import Emulator, SiteResponse, calibrate
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import SiteResponse
+from limbfit.identify.uncertainty.emulator import Emulator
 
 
 def cloud(count, width, seed=0, centre=TRUTH):
@@ -34,7 +36,7 @@ def test_a_quadratic_is_met_exactly_even_far_outside():
     points = cloud(4, 0.5, centre=np.ones(2))
     emulator = Emulator.fit(("x", "y"), points, [quadratic(p) for p in points], softening=1e4)
     for p in cloud(5, 2.0, seed=1, centre=np.ones(2)):
-        assert emulator.check(p, quadratic(p)).max() < 1e-3
+        assert emulator.compute_errors_percent(p, quadratic(p)).max() < 1e-3
         for ours, true in zip(emulator(p), quadratic(p)):
             assert ours.jacobian == pytest.approx(true.jacobian, rel=1e-4, abs=1e-4)
 
@@ -42,8 +44,8 @@ def test_a_quadratic_is_met_exactly_even_far_outside():
 def test_the_stated_errors_are_those_at_runs_it_does_not_know():
     emulator = bars_emulator()
     fresh = cloud(20, 0.3, seed=1)
-    actual = np.array([emulator.check(p, simulate(p)) for p in fresh])
-    stated = np.array([emulator.error_percent(p) for p in fresh])
+    actual = np.array([emulator.compute_errors_percent(p, simulate(p)) for p in fresh])
+    stated = np.array([emulator.expected_error_percent(p) for p in fresh])
     assert np.median(actual) < 0.1
     assert 0.4 < np.median(emulator.loo_percent) / np.median(actual) < 2.5
     assert 0.4 < np.median(stated) / np.median(actual) < 2.5
@@ -52,9 +54,9 @@ def test_the_stated_errors_are_those_at_runs_it_does_not_know():
 def test_more_runs_make_it_better_and_distance_makes_it_worse():
     few, many = bars_emulator(8), bars_emulator(24)
     assert np.median(many.loo_percent) < 0.5 * np.median(few.loo_percent)
-    assert many.inside(TRUTH)
-    assert not many.inside(3 * TRUTH)
-    assert many.error_percent(3 * TRUTH).max() > 10 * many.error_percent(TRUTH).max()
+    assert many.is_inside(TRUTH)
+    assert not many.is_inside(3 * TRUTH)
+    assert many.expected_error_percent(3 * TRUTH).max() > 10 * many.expected_error_percent(TRUTH).max()
 
 
 def test_derivatives_are_those_of_the_emulated_force():
@@ -72,7 +74,7 @@ def test_many_parameters_at_once_give_the_same_forces():
     emulator = bars_emulator(6)
     at = cloud(3, 0.2, seed=2)
     one_by_one = [np.concatenate([r.force_N for r in emulator(p)]) for p in at]
-    assert emulator.forces(at) == pytest.approx(np.array(one_by_one), rel=1e-12)
+    assert emulator.predict_forces(at) == pytest.approx(np.array(one_by_one), rel=1e-12)
 
 
 def test_a_calibration_on_the_emulator_is_one_on_the_solver():
@@ -98,6 +100,6 @@ def test_far_outside_its_runs_forces_stay_finite() -> None:
     found = bars_emulator(6)
     far = TRUTH * np.exp(40.0 * np.array([[1.0], [-1.0]]))
     with np.errstate(over="raise"):
-        assert np.isfinite(found.forces(far)).all()
-        assert np.isfinite(found.forces_and_doubt(far)[0]).all()
+        assert np.isfinite(found.predict_forces(far)).all()
+        assert np.isfinite(found.predict_forces_and_sd(far)[0]).all()
         assert all(np.isfinite(one.force_N).all() for one in found(far[0]))

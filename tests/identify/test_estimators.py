@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records, simulate
 
-from limbfit.identify import (
-    DETERMINED,
-    CalibrationSettings,
-    SiteResponse,
-    calibrate,
-    estimate_uncertainty,
-    separate,
-)
-from limbfit.identify.fit.objective import residuals
-from limbfit.identify.fit.parameters import Prior
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import SiteResponse, compute_residuals
+from limbfit.identify.fit.parameters import Prior, group_separately
+from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.noise import SiteNoise
+from limbfit.identify.uncertainty.uncertainty import DETERMINED, estimate_uncertainty
 
 DRAWS, SD = 200, 0.03
 NOISE = [SiteNoise(d.name, np.arange(60.0), SD**2 * np.eye(60), SD, 0.0) for d in records()]
@@ -40,8 +35,8 @@ def answers(settings, with_priors, medians_drawn):
             Prior(name, TRUTH[NAMES.index(name)] * factor**one, factor)
             for (name, factor), one in zip(KNOWN, off)
         ]
-        start = replace(PAPER.from_start(TRUTH), priors=tuple(stated if with_priors else ()))
-        found = calibrate(simulate, data, start, settings, stages=(separate(NAMES),))
+        start = replace(PAPER.with_start(TRUTH), priors=tuple(stated if with_priors else ()))
+        found = calibrate(simulate, data, start, settings, stages=(group_separately(NAMES),))
         assert found.converged, found.reason
         errors.append(np.log(found.parameters / TRUTH))
         arguments = (found.parameters, found.responses, data, start, NOISE)
@@ -104,11 +99,11 @@ def test_the_covariance_is_that_of_the_calibration(objective, with_priors, media
 def test_the_paper_objective_reaches_its_minimum():
     data = records(SD, seed=0)
     settings = CalibrationSettings("paper", relative_tolerance=1e-4, max_iterations=60)
-    start = PAPER.from_start(TRUTH * np.exp(np.random.default_rng(0).normal(0, 0.1, 8)))
-    found = calibrate(simulate, data, start, settings, stages=(separate(NAMES),))
+    start = PAPER.with_start(TRUTH * np.exp(np.random.default_rng(0).normal(0, 0.1, 8)))
+    found = calibrate(simulate, data, start, settings, stages=(group_separately(NAMES),))
     assert found.converged, found.reason
     assert found.evaluations <= 15
-    r, J = residuals("paper", found.responses, data)
+    r, J = compute_residuals("paper", found.responses, data)
     step = np.linalg.lstsq(J * found.parameters, -r, rcond=None)[0]
     assert np.abs(step).max() < 2e-3
 
@@ -119,12 +114,12 @@ def test_the_curvature_is_the_second_derivative_of_the_cost(objective):
     force, eye = SITES[1].force(TRUTH), np.eye(60)
 
     def gradient(at):
-        r, J = residuals(objective, [SiteResponse(at, eye)], [site])
+        r, J = compute_residuals(objective, [SiteResponse(at, eye)], [site])
         return r @ J
 
-    W = site.curvature(objective, force - site.force_N)
+    W = site.compute_cost_curvature(objective, force - site.force_N)
     slopes = np.array([(gradient(force + h) - gradient(force - h)) / 2e-6 for h in 1e-6 * eye])
     assert slopes == pytest.approx(W, abs=1e-6 * np.abs(W).max())
-    _, J = residuals(objective, [SiteResponse(force, eye)], [site])
+    _, J = compute_residuals(objective, [SiteResponse(force, eye)], [site])
     normal = J.T @ J
     assert normal == pytest.approx(W, abs=1e-12 * np.abs(W).max())

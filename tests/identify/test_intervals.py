@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, TRUTH, records, simulate
+from bars import NAMES, PAPER, TRUTH, records, simulate, storing
+from coverage_study import coverage_study
 
-from limbfit.identify import Measured, SiteResponse, calibrate, estimate_uncertainty, separate
-from limbfit.identify.fit.moving import moved
-from limbfit.identify.fit.parameters import Unknowns, search_space
+from limbfit.identify.fit.calibration import calibrate, move_answer
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import Unknowns, build_search_space, group_separately
 from limbfit.identify.fit.state import Calibration
-from limbfit.identify.uncertainty.coverage import coverage_study
-from limbfit.identify.uncertainty.intervals import KeptRuns, further_evaluations, sampled_uncertainty
-from limbfit.identify.uncertainty.noise import SiteNoise, curve_noise
-from limbfit.identify.uncertainty.uncertainty import LINEARISED, SAMPLED
+from limbfit.identify.uncertainty.intervals import (
+    EvaluationStore,
+    count_further_evaluations,
+    sample_uncertainty,
+)
+from limbfit.identify.uncertainty.noise import SiteNoise, estimate_curve_noise
+from limbfit.identify.uncertainty.uncertainty import LINEARISED, SAMPLED, estimate_uncertainty
 
 # Forces tell log c + BEND (log m)^2 well and log m itself poorly: a valley that is bent.
 POINTS, ABOUT_N, BEND, SD_N = 40, 10.0, 1.0, 0.05
@@ -26,20 +30,20 @@ BENT_TRUTH = np.array([1.2, 1.3, 0.9])
 class Valley:
     """A closed-form model of one site; also what a sampler asks thousands of times."""
 
-    def forces(self, parameters):
+    def predict_forces(self, parameters):
         a, b, c = np.log(np.atleast_2d(parameters)).T
         return ABOUT_N + np.stack([a + BEND * b**2, b, c], axis=1) @ X.T
 
     def __call__(self, parameters):
         slopes = np.eye(3)
         slopes[0, 1] = 2 * BEND * np.log(parameters[1])
-        return [SiteResponse(self.forces(parameters)[0], X @ slopes / parameters)]
+        return [SiteResponse(self.predict_forces(parameters)[0], X @ slopes / parameters)]
 
 
 def valley_record(repeat, forces):
     noise = SD_N * np.random.default_rng([3, repeat]).standard_normal(POINTS)
     claimed = SiteNoise("s", np.arange(float(POINTS)), SD_N**2 * np.eye(POINTS), SD_N, 0.0)
-    return [Measured("s", forces[0] + noise)], [claimed]
+    return [MeasuredCurve("s", forces[0] + noise)], [claimed]
 
 
 @pytest.mark.slow
@@ -52,25 +56,27 @@ def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
 
 
 def near_the_truth(noise=0.03, grouping=None):
-    data, kept = records(noise, seed=4), KeptRuns()
-    grouping = grouping or separate(NAMES)
-    found = calibrate(kept.of(simulate), data, PAPER.from_start(TRUTH), stages=(grouping,))
-    bounds = PAPER.from_start(TRUTH)
+    data, kept = records(noise, seed=4), EvaluationStore()
+    grouping = grouping or group_separately(NAMES)
+    found = calibrate(storing(kept, simulate), data, PAPER.with_start(TRUTH), stages=(grouping,))
+    bounds = PAPER.with_start(TRUTH)
     known = estimate_uncertainty(
         found.parameters,
         found.responses,
         data,
         bounds,
-        curve_noise(found.responses, data),
+        estimate_curve_noise(found.responses, data),
         grouping=grouping,
     )
-    return data, kept, known, search_space(bounds, grouping)
+    return data, kept, known, build_search_space(bounds, grouping)
 
 
 def test_further_simulations_are_few_and_asked_for_again_alike():
     data, kept, known, space = near_the_truth()
-    asked = KeptRuns(), KeptRuns()
-    one, other = (sampled_uncertainty(known, data, PAPER, space, kept, again.of(simulate)) for again in asked)
+    asked = EvaluationStore(), EvaluationStore()
+    one, other = (
+        sample_uncertainty(known, data, PAPER, space, kept, storing(again, simulate)) for again in asked
+    )
     assert one.method == SAMPLED
     assert 0 < len(asked[0].points) <= 2
     assert np.array_equal(asked[0].points, asked[1].points)
@@ -79,8 +85,8 @@ def test_further_simulations_are_few_and_asked_for_again_alike():
 
 
 def test_many_records_have_an_evaluation_at_the_most_probable_parameters():
-    assert [further_evaluations(records, 0) for records in (1, 4, 10, 24)] == [2, 2, 1, 1]
-    assert further_evaluations(4, 4) == further_evaluations(16, 16) == 1
+    assert [count_further_evaluations(records, 0) for records in (1, 4, 10, 24)] == [2, 2, 1, 1]
+    assert count_further_evaluations(4, 4) == count_further_evaluations(16, 16) == 1
 
 
 def test_failed_simulations_enter_no_interval():
@@ -91,21 +97,21 @@ def test_failed_simulations_enter_no_interval():
         return [SiteResponse(100 * good.force_N, good.jacobian, False, "stopped"), *rest]
 
     before = len(kept.points)
-    failing_kept = KeptRuns([*kept.points], [*kept.responses])
+    failing_kept = EvaluationStore([*kept.points], [*kept.responses])
     assert not failing_kept.add(1.1 * TRUTH, failing(1.1 * TRUTH))
     assert len(failing_kept.points) == before
-    found = sampled_uncertainty(known, data, PAPER, space, kept, failing)
+    found = sample_uncertainty(known, data, PAPER, space, kept, failing)
     assert found.method == SAMPLED
     assert np.mean((found.intervals_95[:, 0] < TRUTH) & (found.intervals_95[:, 1] > TRUTH)) >= 0.75
-    alone = KeptRuns(kept.points[:1], kept.responses[:1])
-    assert sampled_uncertainty(known, data, PAPER, space, alone, failing) is known
+    alone = EvaluationStore(kept.points[:1], kept.responses[:1])
+    assert sample_uncertainty(known, data, PAPER, space, alone, failing) is known
     assert known.method == LINEARISED
 
 
 def test_fixed_and_tied_parameters_stay_so():
     grouping = (0, 1, 2, 3, 4, 1, -1, 3)
     data, kept, known, space = near_the_truth(grouping=grouping)
-    found = sampled_uncertainty(known, data, PAPER, space, kept, simulate)
+    found = sample_uncertainty(known, data, PAPER, space, kept, simulate)
     assert len(found.combinations) == 5
     assert found.intervals_95[1] == pytest.approx(found.intervals_95[5])
     assert found.intervals_95[6] == pytest.approx([TRUTH[6], TRUTH[6]])
@@ -116,27 +122,27 @@ def test_fixed_and_tied_parameters_stay_so():
 def test_the_answer_moves_to_what_is_most_probable():
     """Its intervals are about that, and the calibration ends there, with an error that is no smaller."""
     data, kept, known, space = near_the_truth()
-    found = sampled_uncertainty(known, data, PAPER, space, kept, simulate, moves=True)
+    found = sample_uncertainty(known, data, PAPER, space, kept, simulate, move_answer=True)
     assert found.parameters == pytest.approx(found.centre)
     assert not np.array_equal(found.parameters, known.parameters)
     assert np.array_equal(found.covariance, known.about_centre)
     low, high = found.intervals_95.T
     assert ((low < found.parameters) & (found.parameters < high)).all()
     assert ((low < TRUTH) & (high > TRUTH)).mean() >= 0.75
-    bounds = PAPER.from_start(TRUTH)
-    least = calibrate(kept.of(simulate), data, bounds, stages=(separate(NAMES),))
-    ended = moved(least, found.parameters, data, simulate(found.parameters), bounds)
+    bounds = PAPER.with_start(TRUTH)
+    least = calibrate(storing(kept, simulate), data, bounds, stages=(group_separately(NAMES),))
+    ended = move_answer(least, found.parameters, data, simulate(found.parameters), bounds)
     assert isinstance(ended, Calibration)
     assert np.array_equal(ended.parameters, found.parameters)
     assert ended.cost >= least.cost
     assert (ended.evaluations, len(ended.history)) == (least.evaluations + 1, len(least.history) + 1)
     assert ended.stages[-1].reason.endswith("moved from the least squares to what is most probable")
     failed = [SiteResponse(r.force_N, r.jacobian, False, "stopped") for r in simulate(found.parameters)]
-    assert "stopped" in str(moved(least, found.parameters, data, failed, bounds))
+    assert "stopped" in str(move_answer(least, found.parameters, data, failed, bounds))
 
 
 def test_fixed_and_tied_parameters_stay_so_where_the_answer_moves():
     data, kept, known, space = near_the_truth(grouping=(0, 1, 2, 3, 4, 1, -1, 3))
-    found = sampled_uncertainty(known, data, PAPER, space, kept, simulate, moves=True)
+    found = sample_uncertainty(known, data, PAPER, space, kept, simulate, move_answer=True)
     assert found.parameters[1] == found.parameters[5]
     assert found.parameters[6] == pytest.approx(TRUTH[6], rel=1e-5)

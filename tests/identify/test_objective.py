@@ -9,32 +9,34 @@ import pytest
 from bars import PAPER, TRUTH, records, simulate
 
 from limbfit.errors import TraceError
-from limbfit.identify import Measured, SiteResponse, calibrate
-from limbfit.identify.fit.objective import residuals
-from limbfit.identify.fit.prediction import error_percent
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse, compute_residuals
+from limbfit.identify.fit.prediction import compute_error_percent
 
 N, SHARE = 50, 0.01
-DOUBTFUL = Measured("a", np.linspace(0.0, 2.0, N), doubt_N=np.linspace(0.0, 0.1, N) ** 2, error_share=SHARE)
+DOUBTFUL = MeasuredCurve(
+    "a", np.linspace(0.0, 2.0, N), touch_down_sd_N=np.linspace(0.0, 0.1, N) ** 2, error_share=SHARE
+)
 
 
 def test_the_cost_is_the_least_over_where_the_touch_down_may_be() -> None:
     """A shift by one standard deviation costs as much as forces that are off by their share throughout."""
     left = 0.05 * np.random.default_rng(0).standard_normal(N)
-    shape = DOUBTFUL.scale * DOUBTFUL.doubt_N
+    shape = DOUBTFUL.scale * DOUBTFUL.touch_down_sd_N
     rest = DOUBTFUL.scale * left
     shift = shape @ rest / (shape @ shape + SHARE**2)
     least = float(np.sum((rest - shift * shape) ** 2) + (SHARE * shift) ** 2)
-    assert float(np.sum((DOUBTFUL.scale * DOUBTFUL.discounted(left)) ** 2)) == pytest.approx(least)
-    assert left @ DOUBTFUL.curvature("pointwise", left) @ left == pytest.approx(least)
+    assert float(np.sum((DOUBTFUL.scale * DOUBTFUL.discount_touch_down(left)) ** 2)) == pytest.approx(least)
+    assert left @ DOUBTFUL.compute_cost_curvature("pointwise", left) @ left == pytest.approx(least)
 
 
 def test_a_sure_touch_down_changes_nothing() -> None:
-    sure = replace(DOUBTFUL, doubt_N=np.zeros(N))
+    sure = replace(DOUBTFUL, touch_down_sd_N=np.zeros(N))
     left = np.linspace(-1.0, 2.0, N)
-    assert sure.discounted(left) is left
+    assert sure.discount_touch_down(left) is left
     rows, plain = simulate(TRUTH)[:1], records(0.02)[:1]
-    found = residuals("pointwise", rows, plain)[0]
-    same = residuals("pointwise", rows, [replace(plain[0], doubt_N=np.zeros(60))])[0]
+    found = compute_residuals("pointwise", rows, plain)[0]
+    same = compute_residuals("pointwise", rows, [replace(plain[0], touch_down_sd_N=np.zeros(60))])[0]
     assert np.array_equal(found, same)
 
 
@@ -50,7 +52,7 @@ def test_parameters_suffer_less_from_a_wrong_touch_down(wrong: int) -> None:
         replace(r, force_N=r.force_N + 2.0 * d * (i == wrong))
         for i, (r, d) in enumerate(zip(records(), doubts, strict=True))
     ]
-    doubted = [replace(r, doubt_N=d) for r, d in zip(data, doubts, strict=True)]
+    doubted = [replace(r, touch_down_sd_N=d) for r, d in zip(data, doubts, strict=True)]
     off = [np.log(calibrate(simulate, given, PAPER).parameters / TRUTH) for given in (data, doubted)]
     assert np.linalg.norm(off[1]) < 0.55 * np.linalg.norm(off[0])
 
@@ -59,9 +61,9 @@ def test_lengths_may_be_negative_and_forces_may_not() -> None:
     """Displacements count over the largest one, whatever its sign."""
     down = np.array([-0.5, -2.0, 0.1])
     with pytest.raises(TraceError, match="no measured force"):
-        Measured("a", -np.abs(down))
-    seen = Measured("a+surface", down, unit="mm")
+        MeasuredCurve("a", -np.abs(down))
+    seen = MeasuredCurve("a+surface", down, unit="mm")
     assert seen.peak_N == 2.0
-    off, _ = residuals("pointwise", [SiteResponse(down + 0.2, np.zeros((3, 1)))], [seen])
+    off, _ = compute_residuals("pointwise", [SiteResponse(down + 0.2, np.zeros((3, 1)))], [seen])
     assert off @ off == pytest.approx(0.1**2)
-    assert error_percent(down + 0.2, down) == pytest.approx(10.0)
+    assert compute_error_percent(down + 0.2, down) == pytest.approx(10.0)

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from bars import PAPER, TRUTH, Bars
 
-from limbfit.identify import Measured, calibrate
-from limbfit.identify.checks.first_order import FirstOrder
-from limbfit.identify.checks.outliers import as_driven, find_outliers, leave_one_out, unit_of
+from limbfit.identify.checks.leave_one_out import LogLinearModel
+from limbfit.identify.checks.outliers import (
+    approximate_response,
+    find_outliers,
+    guess_force_unit,
+    leave_one_out,
+)
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve
 
 MISFIT = 0.03  # of amplitude and of shape, as a model's own error
 
@@ -35,7 +41,7 @@ def at_other(bar: Bars, record: Bars) -> Bars:
 
 @cache
 def study(seed: int, corruption: tuple = ("none",), fitted: int = 4):
-    """The flags on a study of six sites of which four were fitted, corrupted before the fit."""
+    """The warnings on a study of six sites of which four were fitted, corrupted before the fit."""
     rng = np.random.default_rng([seed, 1])
     bars = limb(seed)
     forces = []
@@ -54,13 +60,15 @@ def study(seed: int, corruption: tuple = ("none",), fitted: int = 4):
     if kind == "stiff":
         other = TRUTH * np.tile([2.5, 1, 1, 1], 2)
         forces[which[0]] = bars[which[0]].force(other)
-    data = [Measured(f"s{k}", force) for k, force in enumerate(forces)]
+    data = [MeasuredCurve(f"s{k}", force) for k, force in enumerate(forces)]
     found = calibrate(lambda p: [bar.respond(p) for bar in bars[:fitted]], data[:fitted], PAPER)
 
     def exchange(first):
         def pair(parameters, i, j):
             one, two = history(bars[i]), history(bars[j])
-            return as_driven(first.responses[i], one, two), as_driven(first.responses[j], two, one)
+            return approximate_response(first.responses[i], one, two), approximate_response(
+                first.responses[j], two, one
+            )
 
         return pair
 
@@ -77,14 +85,14 @@ def study(seed: int, corruption: tuple = ("none",), fitted: int = 4):
 
 def test_the_expansion_is_exact_where_only_moduli_change():
     bar = limb(0)[2]
-    first = FirstOrder(TRUTH, [bar.respond(TRUTH)])
+    first = LogLinearModel(TRUTH, [bar.respond(TRUTH)])
     peak = bar.force(TRUTH).max()
     doubled = TRUTH * np.tile([2.0, 1, 1, 1], 2)
     assert first(doubled)[0].force_N == pytest.approx(2 * bar.force(TRUTH), rel=0.02, abs=0.02 * peak)
 
 
 def test_derivatives_of_the_expansion_agree_with_differences():
-    first = FirstOrder(TRUTH, [limb(0)[2].respond(TRUTH)])
+    first = LogLinearModel(TRUTH, [limb(0)[2].respond(TRUTH)])
     at = TRUTH * np.exp(0.2 * np.random.default_rng(0).standard_normal(8))
     for k, row in enumerate(np.eye(8)):
         h = 1e-6 * at[k]
@@ -95,24 +103,24 @@ def test_derivatives_of_the_expansion_agree_with_differences():
 def test_a_curve_driven_by_another_record_is_close_to_its_simulation():
     bars = limb(0)
     for one, two in ((0, 1), (2, 5), (3, 4)):
-        about = as_driven(bars[one].respond(TRUTH), history(bars[one]), history(bars[two]))
+        about = approximate_response(bars[one].respond(TRUTH), history(bars[one]), history(bars[two]))
         true = at_other(bars[one], bars[two]).force(TRUTH)
         assert np.abs(about.force_N - true).mean() < 0.12 * true.max()
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_clean_studies_are_not_flagged(seed):
-    assert study(seed).flags == ()
+def test_clean_studies_have_no_warning(seed):
+    assert study(seed).warnings == ()
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("site", [1, 5])
 @pytest.mark.parametrize("factor", [9.81, 4.448])
 def test_a_force_in_another_unit_is_named(seed, site, factor):
-    flags = study(seed, ("force", site, factor)).flags
-    assert [(flag.sites, flag.kind) for flag in flags] == [((f"s{site}",), "unit")]
-    assert f"{factor:.3g}" in flags[0].cause
-    assert flags[0].evidence["error_after_percent"] < 12
+    warnings = study(seed, ("force", site, factor)).warnings
+    assert [(warning.sites, warning.kind) for warning in warnings] == [((f"s{site}",), "unit")]
+    assert f"{factor:.3g}" in warnings[0].cause
+    assert warnings[0].evidence["error_after_percent"] < 12
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 5), (4, 5)], ids=["both fitted", "one of each", "held out"])
@@ -123,30 +131,32 @@ def test_swapped_names_are_found_whoever_was_fitted(pair):
         # Sites that answer alike may be exchanged without harm, and nobody can tell.
         if abs(bars[pair[0]].depth - bars[pair[1]].depth) < 1.5:
             continue
-        flags = study(seed, ("swap", *pair)).flags
-        assert [(flag.sites, flag.kind) for flag in flags] == [(tuple(f"s{i}" for i in pair), "swap")]
+        warnings = study(seed, ("swap", *pair)).warnings
+        assert [(warning.sites, warning.kind) for warning in warnings] == [
+            (tuple(f"s{i}" for i in pair), "swap")
+        ]
         caught += 1
     assert caught
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_site_of_other_tissue_is_flagged_with_the_evidence(seed):
-    """Among six sites its record may also be explained by an exchange: it is among the flagged either way."""
-    flags = study(seed, ("stiff", 4)).flags
-    assert "s4" in {site for flag in flags for site in flag.sites}
-    for flag in flags:
-        if flag.kind == "outlier":
-            assert flag.evidence["standardised_error"] > 4
-            assert flag.evidence["force_ratio"] == pytest.approx(2.5, rel=0.2)
+def test_a_site_of_other_tissue_is_warned_of_with_the_evidence(seed):
+    """Among six sites its record may also be explained by an exchange: there is a warning either way."""
+    warnings = study(seed, ("stiff", 4)).warnings
+    assert "s4" in {site for warning in warnings for site in warning.sites}
+    for warning in warnings:
+        if warning.kind == "outlier":
+            assert warning.evidence["standardised_error"] > 4
+            assert warning.evidence["force_ratio"] == pytest.approx(2.5, rel=0.2)
 
 
 def test_cooks_distance_is_largest_where_the_fit_leans_on_a_bad_record():
     bars = limb(2)
-    data = [Measured(f"s{k}", bar.force(TRUTH)) for k, bar in enumerate(bars)]
-    clean = leave_one_out(FirstOrder(TRUTH, [bar.respond(TRUTH) for bar in bars]), data, TRUTH)
-    data[3] = Measured("s3", 1.4 * data[3].force_N)
+    data = [MeasuredCurve(f"s{k}", bar.force(TRUTH)) for k, bar in enumerate(bars)]
+    clean = leave_one_out(LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars]), data, TRUTH)
+    data[3] = MeasuredCurve("s3", 1.4 * data[3].force_N)
     found = calibrate(lambda p: [bar.respond(p) for bar in bars], data, PAPER)
-    simulate = FirstOrder(found.parameters, [bar.respond(found.parameters) for bar in bars])
+    simulate = LogLinearModel(found.parameters, [bar.respond(found.parameters) for bar in bars])
     left = leave_one_out(simulate, data, found.parameters)
     assert max(entry.cook for entry in clean) < 0.1 * left[3].cook
     assert max(left, key=lambda entry: entry.standardised).site == "s3"
@@ -154,12 +164,12 @@ def test_cooks_distance_is_largest_where_the_fit_leans_on_a_bad_record():
 
 def test_too_few_sites_cannot_tell_who_is_wrong():
     bars = limb(0)[:3]
-    data = [Measured(f"s{k}", bar.force(TRUTH) * (9.81 if k else 1)) for k, bar in enumerate(bars)]
-    simulate = FirstOrder(TRUTH, [bar.respond(TRUTH) for bar in bars])
-    assert find_outliers(simulate, data, TRUTH, lambda first: None).flags == ()
+    data = [MeasuredCurve(f"s{k}", bar.force(TRUTH) * (9.81 if k else 1)) for k, bar in enumerate(bars)]
+    simulate = LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars])
+    assert find_outliers(simulate, data, TRUTH, lambda first: None).warnings == ()
 
 
 def test_ratios_name_units():
-    assert "kgf" in unit_of(0.1)
-    assert "gf" in unit_of(98.0)
-    assert unit_of(1.3) == unit_of(0.8) == unit_of(-1.0) == ""
+    assert "kgf" in guess_force_unit(0.1)
+    assert "gf" in guess_force_unit(98.0)
+    assert guess_force_unit(1.3) == guess_force_unit(0.8) == guess_force_unit(-1.0) == ""

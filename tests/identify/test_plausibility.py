@@ -9,11 +9,11 @@ import pytest
 
 from limbfit.identify.checks.plausibility import (
     UNITS,
-    Flag,
     RecordFacts,
-    explained,
-    implausible,
-    layer_factor,
+    RecordWarning,
+    check_plausibility,
+    compute_layer_factor,
+    explain_warnings,
 )
 
 RADIUS = 20 / np.sqrt(np.pi)
@@ -27,7 +27,7 @@ def study(seed: int = 0, scatter: float = 0.2, thickness=THICKNESS) -> list[Reco
     for k, h in enumerate(thickness):
         depth = min(7.0, 0.4 * h) * rng.uniform(0.8, 1.0)
         modulus = 6.0 * np.exp(scatter * rng.standard_normal())
-        peak = modulus * 1e-3 * 8 * RADIUS * layer_factor(RADIUS / h) * depth
+        peak = modulus * 1e-3 * 8 * RADIUS * compute_layer_factor(RADIUS / h) * depth
         speed = 0.96 * (1 + 0.05 * rng.uniform(-1, 1))
         facts.append(RecordFacts(f"s{k}", peak, depth, speed, 0.002, RADIUS, h, 2.0, 0.2))
     return facts
@@ -45,11 +45,11 @@ def recorded(fact: RecordFacts, force: float, travel: float, time: float) -> Rec
 
 
 def test_the_layer_stiffens_from_the_half_space_to_the_cube_of_a_thin_layer():
-    assert layer_factor(0.0) == 1.0
+    assert compute_layer_factor(0.0) == 1.0
     ratios = np.linspace(0, 6, 100)
-    factors = np.array([layer_factor(r) for r in ratios])
+    factors = np.array([compute_layer_factor(r) for r in ratios])
     assert np.all(np.diff(factors) > 0)
-    assert layer_factor(8.0) == pytest.approx(8 * layer_factor(4.0))
+    assert compute_layer_factor(8.0) == pytest.approx(8 * compute_layer_factor(4.0))
 
 
 def test_the_modulus_comes_back_whatever_the_thickness():
@@ -58,8 +58,8 @@ def test_the_modulus_comes_back_whatever_the_thickness():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_clean_studies_are_not_flagged(seed):
-    assert implausible(study(seed)) == ()
+def test_clean_studies_have_no_warning(seed):
+    assert check_plausibility(study(seed)) == ()
 
 
 @pytest.mark.parametrize("unit", UNITS)
@@ -67,7 +67,7 @@ def test_clean_studies_are_not_flagged(seed):
 def test_a_record_in_another_unit_is_named(unit, seed):
     facts = study(seed)
     facts[seed] = recorded(facts[seed], *UNITS[unit])
-    flags = [flag for flag in implausible(facts) if flag.kind == "unit"]
+    flags = [flag for flag in check_plausibility(facts) if flag.kind == "unit"]
     assert [flag.sites for flag in flags] == [(f"s{seed}",)]
     near = {name for name, factors in UNITS.items() if np.allclose(factors, UNITS[unit], rtol=0.6)}
     assert flags[0].cause in near
@@ -79,7 +79,7 @@ def test_swapped_names_of_thin_and_thick_sites_are_found(seed):
     thin, thick = facts[1], facts[2]
     facts[1] = replace(thick, site="s1", thickness_mm=thin.thickness_mm)
     facts[2] = replace(thin, site="s2", thickness_mm=thick.thickness_mm)
-    swaps = [flag for flag in implausible(facts) if flag.kind == "swap"]
+    swaps = [flag for flag in check_plausibility(facts) if flag.kind == "swap"]
     assert [flag.sites for flag in swaps] == [("s1", "s2")]
     assert swaps[0].evidence["scatter_exchanged"] < 0.5 * swaps[0].evidence["scatter"]
 
@@ -87,12 +87,12 @@ def test_swapped_names_of_thin_and_thick_sites_are_found(seed):
 def test_a_slower_protocol_at_one_site_is_no_fault():
     facts = study()
     facts[3] = replace(facts[3], speed_mm_s=0.2)
-    assert implausible(facts) == ()
+    assert check_plausibility(facts) == ()
 
 
 def test_all_records_in_another_unit_are_told_from_a_limb():
     facts = [recorded(fact, 101.97, 1, 1) for fact in study()]
-    assert [flag.sites for flag in implausible(facts)] == [()]
+    assert [flag.sites for flag in check_plausibility(facts)] == [()]
 
 
 def test_axes_places_and_depths():
@@ -101,7 +101,7 @@ def test_axes_places_and_depths():
     facts[1] = replace(facts[1], axis_deg=178.0)
     facts[2] = replace(facts[2], off_skin_mm=4.5)
     facts[3] = replace(facts[3], hint_mm=20.0)
-    found = {flag.sites[0]: flag for flag in implausible(facts)}
+    found = {flag.sites[0]: flag for flag in check_plausibility(facts)}
     assert set(found) == {"s0", "s1", "s2", "s3"}
     assert "negate" in found["s1"].remedy
     assert found["s0"].evidence == {"axis_deg": 40.0}
@@ -109,15 +109,15 @@ def test_axes_places_and_depths():
 
 def test_without_thickness_only_gross_errors_are_told():
     facts = [replace(fact, thickness_mm=None) for fact in study()]
-    assert implausible(facts) == ()
+    assert check_plausibility(facts) == ()
     facts[4] = recorded(facts[4], 1000.0, 1, 1)
-    assert [flag.kind for flag in implausible(facts)] == ["unit"]
+    assert [flag.kind for flag in check_plausibility(facts)] == ["unit"]
 
 
 def test_flags_say_what_why_and_what_to_do():
     facts = study()
     facts[0] = recorded(facts[0], 9.80665, 1, 1)
-    told = implausible(facts)[0].to_dict()
+    told = check_plausibility(facts)[0].to_dict()
     for part in ("s0", "times", "likely", "convert"):
         assert part in told["text"]
     assert told["evidence"]["modulus_ratio"] > 4
@@ -127,12 +127,12 @@ def test_a_unit_that_the_record_shows_is_the_only_cause_told():
     """A displacement in cm looks like ten times the force to the model."""
     facts = study()
     facts[3] = recorded(facts[3], 1.0, 0.1, 1.0)
-    in_records = implausible(facts)
+    in_records = check_plausibility(facts)
     missed = [
-        Flag((site,), "unit", "predicted far too soft", {}, "force in kgf", "convert the force to N")
+        RecordWarning((site,), "unit", "predicted far too soft", {}, "force in kgf", "convert the force to N")
         for site in ("s3", "s4")
     ]
-    told = explained(missed, in_records)
+    told = explain_warnings(missed, in_records)
     assert [flag.sites for flag in in_records] == [("s3",)]
     assert (told[0].cause, told[0].remedy) == (in_records[0].cause, in_records[0].remedy)
     assert "displacement" in told[0].cause

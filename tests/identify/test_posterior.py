@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate
 
-from limbfit.identify import Emulator, Measured, SiteResponse, estimate_uncertainty, separate, shared
-from limbfit.identify.fit.parameters import Unknowns, search_space
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import Unknowns, build_search_space, group_by_kind, group_separately
 from limbfit.identify.uncertainty.discrepancy import ResidualModel
-from limbfit.identify.uncertainty.evidence import candidate, compare
+from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.likelihood import Likelihood
-from limbfit.identify.uncertainty.noise import SiteNoise, curve_noise
+from limbfit.identify.uncertainty.model_comparison import compare_models, fit_alternative
+from limbfit.identify.uncertainty.noise import SiteNoise, estimate_curve_noise
 from limbfit.identify.uncertainty.posterior import sample_posterior
-from limbfit.identify.uncertainty.profile import check_ends, profile
+from limbfit.identify.uncertainty.profile import check_profile_ends, compute_profile
+from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 
 # A model that is linear in the logarithms, with Gaussian noise: everything has a closed form.
 X = np.stack([np.ones(30), np.linspace(-1, 1, 30), np.linspace(-1, 1, 30) ** 2], axis=1)
@@ -28,19 +30,19 @@ def line(p):
 
 def linear_case(seed=0, sd=SD):
     rng = np.random.default_rng(seed)
-    data = [Measured("s", ABOUT + X @ [0.3, -0.2, 0.1] + sd * rng.standard_normal(30))]
+    data = [MeasuredCurve("s", ABOUT + X @ [0.3, -0.2, 0.1] + sd * rng.standard_normal(30))]
     noise = SiteNoise("s", np.arange(30.0), sd**2 * np.eye(30), sd, 0.0)
     model = ResidualModel((noise,), np.array([ABOUT]), np.zeros(1), 0.2, 0.0)
     points = np.exp(np.random.default_rng(1).uniform(-1, 1, (5, 3)))
     emulator = Emulator.fit(WIDE.names, points, [line(p) for p in points], softening=1e4)
-    space = search_space(WIDE, separate(WIDE.names))
+    space = build_search_space(WIDE, group_separately(WIDE.names))
     exact = np.linalg.lstsq(X, data[0].force_N - ABOUT, rcond=None)[0]
     return Likelihood(emulator, data, model, WIDE, space), exact, sd**2 * np.linalg.inv(X.T @ X)
 
 
 def bars_case(noise=0.01, seed=4):
     data = records(noise, seed=seed)
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, curve_noise(simulate(TRUTH), data))
+    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data))
     rng = np.random.default_rng(0)
     points = TRUTH * np.exp(0.25 * rng.uniform(-1, 1, (24, 8)))
     emulator = Emulator.fit(NAMES, points, [simulate(p) for p in points])
@@ -49,12 +51,12 @@ def bars_case(noise=0.01, seed=4):
 
 def test_the_likelihood_is_that_of_the_gaussian():
     likelihood, exact, _ = linear_case()
-    best = likelihood.optimum(np.zeros(3))
+    best = likelihood.find_optimum(np.zeros(3))
     assert best.z == pytest.approx(exact, abs=1e-5)
     left = likelihood.measured[0].force_N - ABOUT - X @ exact
     full = left @ left / SD**2 + 30 * np.log(2 * np.pi * SD**2)
     assert best.minus_2_log == pytest.approx(full, rel=1e-4)
-    assert likelihood.at_responses(line(best.parameters), best.parameters) == pytest.approx(full, rel=1e-4)
+    assert likelihood.minus_2_log_of(line(best.parameters), best.parameters) == pytest.approx(full, rel=1e-4)
 
 
 @pytest.mark.slow
@@ -65,15 +67,15 @@ def test_a_linear_posterior_is_the_closed_form():
     assert np.log(found.median) == pytest.approx(exact, abs=0.15 * np.sqrt(np.diag(covariance)).max())
     assert found.covariance == pytest.approx(covariance, abs=0.15 * covariance.max())
     again = sample_posterior(likelihood, exact, covariance, steps=1500, seed=1)
-    assert np.array_equal(found.draws, again.draws)
+    assert np.array_equal(found.samples, again.samples)
 
 
 def test_a_linear_profile_is_the_closed_form():
     likelihood, exact, covariance = linear_case()
-    best = likelihood.optimum(np.zeros(3))
+    best = likelihood.find_optimum(np.zeros(3))
     for k in range(3):
         sd = float(np.sqrt(covariance[k, k]))
-        found = profile(likelihood, best, k, sd)
+        found = compute_profile(likelihood, best, k, sd)
         assert np.log(found.interval_95) == pytest.approx(
             exact[k] + 1.96 * sd * np.array([-1, 1]), abs=0.02 * sd
         )
@@ -83,8 +85,8 @@ def test_a_linear_profile_is_the_closed_form():
 
 def test_uninformative_data_open_the_profile():
     likelihood, exact, covariance = linear_case(sd=30.0)
-    best = likelihood.optimum(np.clip(exact, -4, 4))
-    found = profile(likelihood, best, 2, float(np.sqrt(covariance[2, 2])))
+    best = likelihood.find_optimum(np.clip(exact, -4, 4))
+    found = compute_profile(likelihood, best, 2, float(np.sqrt(covariance[2, 2])))
     assert found.verdict != "determined on both sides"
     open_side = found.closed.index(False)
     assert found.interval_95[open_side] == pytest.approx((0.01, 100.0)[open_side])
@@ -92,26 +94,28 @@ def test_uninformative_data_open_the_profile():
 
 def test_bars_all_three_intervals_agree_and_hold_the_truth():
     emulator, data, u = bars_case(0.003)
-    space = search_space(PAPER, separate(NAMES))
+    space = build_search_space(PAPER, group_separately(NAMES))
     likelihood = Likelihood(emulator, data, u.residual_model, PAPER, space)
-    best = likelihood.optimum(np.log(TRUTH))
+    best = likelihood.find_optimum(np.log(TRUTH))
     found = sample_posterior(likelihood, best.z, u.covariance, steps=1500, seed=2)
     assert np.log(found.median / best.parameters) == pytest.approx(np.zeros(8), abs=0.1)
-    sampled = (np.log(found.draws) @ np.array([c.weights for c in u.combinations]).T).std(axis=0)
+    sampled = (np.log(found.samples) @ np.array([c.weights for c in u.combinations]).T).std(axis=0)
     stated = np.array([c.sd_log for c in u.combinations])
     # Stated is what the calibration reaches with its own weights, which is never less.
     assert np.all((sampled / stated > 0.5) & (sampled / stated < 1.8)), sampled / stated
-    one = profile(likelihood, best, 4, u.sd_log[4])
+    one = compute_profile(likelihood, best, 4, u.sd_log[4])
     width = np.log(one.interval_95[1] / one.interval_95[0]) / (2 * 1.96)
     assert 0.5 < width / u.sd_log[4] < 1.8
     assert one.interval_95[0] < TRUTH[4] < one.interval_95[1]
-    ends = check_ends(likelihood, best, simulate(best.parameters), one, [simulate(p) for p in one.ends])
+    ends = check_profile_ends(
+        likelihood, best, simulate(best.parameters), one, [simulate(p) for p in one.ends]
+    )
     assert ends.largest_difference < 0.5
 
 
 def two_models(truth, noise=0.003):
     data = records(noise, seed=6, truth=truth)
-    u = estimate_uncertainty(truth, simulate(truth), data, PAPER, curve_noise(simulate(truth), data))
+    u = estimate_uncertainty(truth, simulate(truth), data, PAPER, estimate_curve_noise(simulate(truth), data))
     middle = np.sqrt(truth * np.r_[truth[4:], truth[:4]])
     rng = np.random.default_rng(0)
     points = np.vstack(
@@ -122,38 +126,41 @@ def two_models(truth, noise=0.003):
     )
     emulator = Emulator.fit(NAMES, points, [simulate(p) for p in points])
     found = []
-    for name, grouping in (("one material", shared(NAMES)), ("two materials", separate(NAMES))):
-        space = search_space(PAPER, grouping)
+    for name, grouping in (
+        ("one material", group_by_kind(NAMES)),
+        ("two materials", group_separately(NAMES)),
+    ):
+        space = build_search_space(PAPER, grouping)
         likelihood = Likelihood(emulator, data, u.residual_model, PAPER, space)
         found.append(
-            candidate(name, likelihood, space.reduce(np.log(middle if len(found) == 0 else truth)))[0]
+            fit_alternative(name, likelihood, space.reduce(np.log(middle if len(found) == 0 else truth)))[0]
         )
     return found
 
 
 def test_two_materials_are_supported_where_there_are_two():
     one, two = two_models(TRUTH)
-    assert compare(one, two).better == "two materials"
-    assert "strongly" in compare(one, two).verdict
+    assert compare_models(one, two).better == "two materials"
+    assert "strongly" in compare_models(one, two).verdict
 
 
 def test_one_material_is_supported_where_there_is_one():
     one, two = two_models(np.tile([5.0, 4.5, 2.5, 0.4], 2))
     assert one.bic < two.bic
-    assert compare(one, two).better == "one material"
+    assert compare_models(one, two).better == "one material"
 
 
 def test_held_out_errors_speak_where_the_fit_does_not():
     one, two = (candidate_like(name) for name in ("one material", "two materials"))
     rng = np.random.default_rng(0)
     errors = 5 + rng.standard_normal(12)
-    alike = compare(one, two, errors, errors + 0.1 * rng.standard_normal(12))
+    alike = compare_models(one, two, errors, errors + 0.1 * rng.standard_normal(12))
     assert alike.better == ""
-    better = compare(one, two, errors, errors - 2 + 0.1 * rng.standard_normal(12))
+    better = compare_models(one, two, errors, errors - 2 + 0.1 * rng.standard_normal(12))
     assert better.better == "two materials"
     assert "predict better" in better.verdict
 
 
 def candidate_like(name):
     likelihood, exact, _ = linear_case()
-    return type(candidate(name, likelihood, exact)[0])(name, 3, 10.0, 30.0, 1.0, 16.0, 20.0)
+    return type(fit_alternative(name, likelihood, exact)[0])(name, 3, 10.0, 30.0, 1.0, 16.0, 20.0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records
 
-from limbfit.identify import calibrate
-from limbfit.identify.fit.parameters import separate
-from limbfit.identify.fit.regions import RegionRecords, fit_regions, mean_percent
+from limbfit.identify.checks.crossvalidation import RegionRecords, average_errors, fit_regions
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.parameters import group_separately
 
 SOFT = TRUTH * np.array([0.6, 1.0, 1.2, 1.0, 0.7, 1.0, 0.9, 1.1])
 
@@ -24,7 +24,9 @@ def region(sites, truth, fitted=None) -> RegionRecords:
         return [site.respond(parameters) for site in sites]
 
     def identify(start):
-        return calibrate(lambda p: simulate(p)[:used], measured[:used], start, stages=(separate(NAMES),))
+        return calibrate(
+            lambda p: simulate(p)[:used], measured[:used], start, stages=(group_separately(NAMES),)
+        )
 
     return RegionRecords(identify, simulate, tuple(measured))
 
@@ -45,7 +47,7 @@ def test_each_region_finds_its_own_tissues(found):
 
 def test_a_regions_own_model_errs_less_than_the_whole_limbs(found):
     for fit in found.values():
-        assert mean_percent(fit.own_percent) < 0.1 < 3.0 < mean_percent(fit.whole_percent)
+        assert average_errors(fit.own_percent) < 0.1 < 3.0 < average_errors(fit.whole_percent)
 
 
 def test_a_held_out_site_of_a_region_is_judged_too(found):
@@ -68,7 +70,7 @@ def test_a_partial_simulation_has_no_error():
 
     fit = fit_regions({"one": replace(one, simulate=fails_at_the_last)}, PAPER, TRUTH)["one"]
     assert fit.own_percent["s3"] is None
-    assert mean_percent(fit.own_percent) == pytest.approx(
+    assert average_errors(fit.own_percent) == pytest.approx(
         np.mean([fit.own_percent[f"s{i}"] for i in range(3)])
     )
-    assert mean_percent({"s3": None}) is None
+    assert average_errors({"s3": None}) is None

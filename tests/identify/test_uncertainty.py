@@ -9,25 +9,18 @@ import pytest
 from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, records, simulate, three_tissues
 from scipy.linalg import block_diag
 
-from limbfit.identify import (
-    DETERMINED,
-    GIVEN,
-    UNDETERMINED,
-    Measured,
-    calibrate,
-    error_percent,
-    estimate_uncertainty,
-    prediction_sd,
-    separate,
-    summarise,
-)
-from limbfit.identify.uncertainty.discrepancy import ResidualModel, _Rows, matern
-from limbfit.identify.uncertainty.noise import curve_noise
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve
+from limbfit.identify.fit.parameters import group_separately
+from limbfit.identify.fit.prediction import compute_error_percent, compute_prediction_sd, summarise_errors
+from limbfit.identify.uncertainty.discrepancy import ResidualModel, _RestrictedLikelihood, compute_matern
+from limbfit.identify.uncertainty.noise import estimate_curve_noise
+from limbfit.identify.uncertainty.uncertainty import DETERMINED, GIVEN, UNDETERMINED, estimate_uncertainty
 
 
 def fitted(data, run=simulate):
     found = calibrate(run, data, PAPER)
-    noise = curve_noise(found.responses, data)
+    noise = estimate_curve_noise(found.responses, data)
     return found, estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
 
 
@@ -39,7 +32,7 @@ def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=(), site_N
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
     found = estimate_uncertainty(
-        truth, moved, data, unknowns, curve_noise(moved, data), mesh_N=mesh_N, site_N=site_N
+        truth, moved, data, unknowns, estimate_curve_noise(moved, data), mesh_N=mesh_N, site_N=site_N
     )
     return step, found
 
@@ -53,7 +46,7 @@ def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER, st
     for seed in range(repeats):
         rng = np.random.default_rng(seed)
         forces = [(1 + stiffer * rng.standard_normal()) * d.force_N for d in clean]
-        data = [Measured(d.name, f + noise_of(rng, f.size)) for d, f in zip(clean, forces)]
+        data = [MeasuredCurve(d.name, f + noise_of(rng, f.size)) for d, f in zip(clean, forces)]
         site_N = [expected * d.force_N for d in clean] if expected else ()
         off, u = linear_fit(data, truth, sites, unknowns, site_N=site_N)
         best = u.combinations[: len(truth) // 2]
@@ -63,7 +56,7 @@ def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER, st
 
 def smooth_misfit(rng, n, length=0.2, size=0.05):
     """A misfit that wanders along the record, and a little noise."""
-    L = np.linalg.cholesky(matern(np.arange(float(n)), length) + 1e-9 * np.eye(n))
+    L = np.linalg.cholesky(compute_matern(np.arange(float(n)), length) + 1e-9 * np.eye(n))
     return size * L @ rng.standard_normal(n) + 0.004 * rng.standard_normal(n)
 
 
@@ -141,12 +134,12 @@ def test_records_of_a_site_share_the_error_of_its_mesh():
     twice = [replace(d, name=f"{d.name}-2", site=d.name) for d in records()]
     noisy = [replace(d, force_N=d.force_N + n) for d, n in zip([*records(), *twice], 2 * scatter(0.01))]
     responses = 2 * simulate(TRUTH)
-    noise = curve_noise(responses, noisy)
+    noise = estimate_curve_noise(responses, noisy)
     one = estimate_uncertainty(TRUTH, responses[:4], noisy[:4], PAPER, noise[:4], mesh_N=mesh)
     both = estimate_uncertainty(TRUTH, responses, noisy, PAPER, noise, mesh_N=2 * mesh)
     alone = [replace(d, site="") for d in noisy]
     apart = estimate_uncertainty(
-        TRUTH, responses, alone, PAPER, curve_noise(responses, alone), mesh_N=2 * mesh
+        TRUTH, responses, alone, PAPER, estimate_curve_noise(responses, alone), mesh_N=2 * mesh
     )
     stiffness = np.eye(8)[0] + np.eye(8)[4]  # both moduli, which the mesh moves
 
@@ -157,8 +150,8 @@ def test_records_of_a_site_share_the_error_of_its_mesh():
     assert sd(apart) < 0.8 * sd(one)
     model = both.residual_model
     rows = [np.cos(np.arange(60.0))[:, None] + i for i in range(8)]
-    E = np.concatenate(model.shared)
-    whole = block_diag(*(model.own(i) for i in range(8))) + E @ E.T
+    E = np.concatenate(model.shared_deviations)
+    whole = block_diag(*(model.own_covariance(i) for i in range(8))) + E @ E.T
     assert np.concatenate(model.solve(rows)) == pytest.approx(np.linalg.solve(whole, np.concatenate(rows)))
 
 
@@ -169,7 +162,7 @@ def scatter(sd):
 
 def test_misfit_and_noise_are_told_apart():
     rng = np.random.default_rng(1)
-    data = [Measured(d.name, d.force_N + smooth_misfit(rng, d.force_N.size)) for d in records()]
+    data = [MeasuredCurve(d.name, d.force_N + smooth_misfit(rng, d.force_N.size)) for d in records()]
     model = linear_fit(data)[1].residual_model
     noise = [site.sd_N for site in model.noise]
     assert noise == pytest.approx([0.004] * 4, rel=0.5)
@@ -185,7 +178,7 @@ def test_intervals_are_useful_where_the_model_is_wrong_a_little():
     """Misfit of one percent of the force, smooth: well narrower than the bounds, unlike one free residual."""
     rng = np.random.default_rng(3)
     data = [
-        Measured(d.name, d.force_N + smooth_misfit(rng, d.force_N.size, 0.2, 0.01 * d.force_N.max()))
+        MeasuredCurve(d.name, d.force_N + smooth_misfit(rng, d.force_N.size, 0.2, 0.01 * d.force_N.max()))
         for d in records()
     ]
     u = linear_fit(data)[1]
@@ -265,7 +258,7 @@ def test_two_tissues_that_cannot_be_told_apart_are_correlated():
 def test_what_is_given_is_not_called_identified():
     data, grouping = records(0.01), (0, 1, 2, -1, 3, 4, 5, -1)
     u = estimate_uncertainty(
-        TRUTH, simulate(TRUTH), data, PAPER, curve_noise(simulate(TRUTH), data), grouping=grouping
+        TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data), grouping=grouping
     )
     assert u.verdicts[3] == u.verdicts[7] == GIVEN
     assert u.sd_log[3] == 0
@@ -279,7 +272,7 @@ def test_an_answer_on_its_bound_is_flagged():
     data = records(0.01)
     found = calibrate(simulate, data, bounded)
     u = estimate_uncertainty(
-        found.parameters, found.responses, data, bounded, curve_noise(found.responses, data)
+        found.parameters, found.responses, data, bounded, estimate_curve_noise(found.responses, data)
     )
     assert u.at_bound == (True,) + (False,) * 7
     assert u.intervals_95[0, 1] <= 6.0
@@ -287,7 +280,7 @@ def test_an_answer_on_its_bound_is_flagged():
 
 def test_a_perfect_fit_is_no_division_by_zero():
     data = records()
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, curve_noise(simulate(TRUTH), data))
+    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data))
     assert np.all(np.isfinite(u.covariance))
     assert set(u.verdicts) == {DETERMINED}
 
@@ -302,13 +295,13 @@ def test_prediction_intervals_match_the_spread_of_predictions():
             lambda p: [s.respond(p) for s in rest],  # noqa: B023
             data,
             type(PAPER)(PAPER.names, TRUTH, PAPER.lower, PAPER.upper),
-            stages=(separate(PAPER.names),),
+            stages=(group_separately(PAPER.names),),
         )
         forces.append(held_out.force(found.parameters))
         if seed == 0:
-            noise = curve_noise(found.responses, data)
+            noise = estimate_curve_noise(found.responses, data)
             u = estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
-            predicted = prediction_sd(
+            predicted = compute_prediction_sd(
                 held_out.respond(found.parameters).jacobian, found.parameters, u.covariance
             )
     spread = np.std(forces, axis=0)
@@ -317,16 +310,16 @@ def test_prediction_intervals_match_the_spread_of_predictions():
 
 
 def test_noise_adds_to_a_prediction():
-    sd = prediction_sd(np.zeros((3, 2)), np.ones(2), np.eye(2), noise_N=0.05)
+    sd = compute_prediction_sd(np.zeros((3, 2)), np.ones(2), np.eye(2), noise_N=0.05)
     assert sd == pytest.approx([0.05] * 3)
 
 
 def test_the_error_is_the_papers():
-    assert error_percent(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.5, 4.0])) == pytest.approx(12.5)
-    summary = summarise([1.0, 2.0, 6.0])
+    assert compute_error_percent(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.5, 4.0])) == pytest.approx(12.5)
+    summary = summarise_errors([1.0, 2.0, 6.0])
     assert (summary.sites, summary.mean_percent, summary.largest_percent) == (3, 3.0, 6.0)
     assert summary.sd_percent == pytest.approx(np.std([1, 2, 6], ddof=1))
-    assert np.isnan(summarise([]).mean_percent)
+    assert np.isnan(summarise_errors([]).mean_percent)
 
 
 @pytest.mark.parametrize("site", [(), [0.03 * np.linspace(0, 1, 60) ** 2] * 4], ids=["same", "sites"])
@@ -334,11 +327,11 @@ def test_the_error_is_the_papers():
 def test_the_slope_of_the_restricted_likelihood_is_its_derivative(mesh, site):
     data = records(0.02, seed=1)
     left = [r.force_N - d.force_N for r, d in zip(simulate(TRUTH), data)]
-    noise = curve_noise(simulate(TRUTH), data)
+    noise = estimate_curve_noise(simulate(TRUTH), data)
     peaks = np.array([d.force_N.max() for d in data])
     scaled = [r.jacobian * TRUTH for r in simulate(TRUTH)]
     unit = ResidualModel(tuple(noise), peaks, np.ones(4), 0.2, 0.0, mesh_N=tuple(mesh), site_N=tuple(site))
-    rows = _Rows(left, scaled, unit, np.eye(8))
+    rows = _RestrictedLikelihood(left, scaled, unit, np.eye(8))
     at, h = np.log([0.01, 0.02, 0.005, 0.03, 1.5][: 5 if site else 4]), 1e-5
     steps = h * np.eye(len(at))
     slopes = [(rows.criterion(at + e)[0] - rows.criterion(at - e)[0]) / (2 * h) for e in steps]

@@ -15,18 +15,13 @@ from ..errors import ProblemError
 from ..fe import Problem, StepControl, System, texts_of
 from ..fe import solve as simulate
 from ..fe.checking import check
-from ..identify import (
-    CalibrationSettings,
-    Measured,
-    SiteResponse,
-    Uncertainty,
-    Unknowns,
-    curve_noise,
-    error_percent,
-    estimate_uncertainty,
-    separate,
-)
-from ..identify import calibrate as search
+from ..identify.fit.calibration import calibrate as search
+from ..identify.fit.objective import MeasuredCurve, SiteResponse
+from ..identify.fit.parameters import Unknowns, group_separately
+from ..identify.fit.prediction import compute_error_percent
+from ..identify.fit.state import CalibrationSettings
+from ..identify.uncertainty.noise import estimate_curve_noise
+from ..identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 from .solution import Solution, announce_compilation, new_axes, solve
 
 Array = NDArray[np.float64]
@@ -60,7 +55,7 @@ class Fit:
         """
         measured = _measured(self.curves)
         best = np.array(list(self.parameters.values()))
-        noise = curve_noise(self.responses, measured)
+        noise = estimate_curve_noise(self.responses, measured)
         return estimate_uncertainty(best, self.responses, measured, self.unknowns, noise)
 
     def table(self) -> str:
@@ -130,12 +125,15 @@ def calibrate(
     announce_compilation()
     model = _Model(cases, given, unknowns.names, steps or StepControl(), listener)
     measured = _measured(given)
-    found = search(model, measured, unknowns, CalibrationSettings(), stages=[separate(unknowns.names)])
+    found = search(
+        model, measured, unknowns, CalibrationSettings(), stages=[group_separately(unknowns.names)]
+    )
     names, best = unknowns.names, found.parameters
     return Fit(
         parameters=dict(zip(names, best.tolist(), strict=True)),
         error_percent=tuple(
-            error_percent(r.force_N, one.force_N) for r, one in zip(found.responses, measured, strict=True)
+            compute_error_percent(r.force_N, one.force_N)
+            for r, one in zip(found.responses, measured, strict=True)
         ),
         converged=found.stages[-1].converged,
         reason=found.stages[-1].reason,
@@ -235,5 +233,5 @@ def _unknowns(
     return Unknowns(tuple(start), values, low, high)
 
 
-def _measured(curves: Sequence[tuple[Array, Array]]) -> list[Measured]:
-    return [Measured(f"curve {k + 1}", force) for k, (_, force) in enumerate(curves)]
+def _measured(curves: Sequence[tuple[Array, Array]]) -> list[MeasuredCurve]:
+    return [MeasuredCurve(f"curve {k + 1}", force) for k, (_, force) in enumerate(curves)]

@@ -11,7 +11,7 @@ import pytest
 import limbfit
 from conftest import COARSE
 from limbfit.errors import InputError
-from limbfit.identify.checks.protocol import drawn
+from limbfit.identify.checks.protocol import sample_tissues
 from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, UNSEEN
 from limbfit.pipeline.stages.laboratory import unknowns
 
@@ -87,7 +87,7 @@ def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
 def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:
     study, _ = found
     known = unknowns(study)
-    tissues = drawn(known, known.start, 64, seed=1)
+    tissues = sample_tissues(known, known.start, 64, seed=1)
     assert np.array_equal(tissues[0], known.start)
     assert (tissues >= known.lower).all()
     assert (tissues <= known.upper).all()

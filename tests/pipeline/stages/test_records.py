@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from limbfit.errors import StudyError, TraceError
-from limbfit.identify.checks.crossvalidation import Fold, by_site, choices_of, expanded
-from limbfit.identify.checks.first_order import Sites
-from limbfit.identify.checks.outliers import _pairs
-from limbfit.identify.checks.plausibility import RecordFacts, implausible
-from limbfit.identify.fit.objective import Measured, SiteResponse
-from limbfit.identify.fit.prediction import Known
-from limbfit.identify.uncertainty.noise import record_noise
-from limbfit.identify.uncertainty.sources import Gain
+from limbfit.identify.checks.crossvalidation import Fold, average_by_site, expand_to_records, list_choices
+from limbfit.identify.checks.leave_one_out import LeaveOutFits
+from limbfit.identify.checks.outliers import _list_pairs
+from limbfit.identify.checks.plausibility import RecordFacts, check_plausibility
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.prediction import PredictionModel
+from limbfit.identify.uncertainty.estimator import FitSensitivity
+from limbfit.identify.uncertainty.noise import estimate_record_noise
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.curves import read_record
@@ -150,10 +150,10 @@ def test_a_mesh_is_fine_under_the_widest_indenter_of_its_site(folder: Path) -> N
 
 def test_cross_validation_chooses_sites_with_all_their_records() -> None:
     groups = [(0, 1, 2), (3,), (4, 5)]
-    chosen = [expanded(choice, groups) for choice in choices_of(3, 2)]
+    chosen = [expand_to_records(choice, groups) for choice in list_choices(3, 2)]
     assert chosen == [(0, 1, 2, 3), (0, 1, 2, 4, 5), (3, 4, 5)]
     fold = Fold((0, 1, 2, 3), np.ones(2), (1.0, 2.0, 3.0, 5.0, 4.0, 8.0), True, ())
-    found = by_site(fold, (0, 1), groups)
+    found = average_by_site(fold, (0, 1), groups)
     assert found.errors_percent == (2.0, 5.0, 6.0)
     assert (found.heldout, found.mean_heldout) == ((2,), 6.0)
 
@@ -166,29 +166,29 @@ def test_a_record_is_left_out_with_its_site() -> None:
         return [SiteResponse(slopes @ p, slopes) for _ in range(5)]
 
     true, wrong = np.array([1.0, 1.0]), np.array([2.0, 1.0])
-    measured = [Measured(name, slopes @ true) for name in ("a", "b", "c")]
-    twins = [Measured(name, slopes @ wrong, 0.5, "d") for name in ("d", "d-fast")]
+    measured = [MeasuredCurve(name, slopes @ true) for name in ("a", "b", "c")]
+    twins = [MeasuredCurve(name, slopes @ wrong, 0.5, "d") for name in ("d", "d-fast")]
     alone = [replace(one, site="") for one in twins]
-    together, apart = (Sites(simulate, [*measured, *some], true) for some in (twins, alone))
-    assert together.without(3) == pytest.approx(true, rel=1e-6)
-    assert together.without(3) is together.without(4)
-    assert apart.without(3)[0] > 1.02
+    together, apart = (LeaveOutFits(simulate, [*measured, *some], true) for some in (twins, alone))
+    assert together.fit_without(3) == pytest.approx(true, rel=1e-6)
+    assert together.fit_without(3) is together.fit_without(4)
+    assert apart.fit_without(3)[0] > 1.02
 
 
 def test_what_is_a_site_s_own_moves_its_records_together() -> None:
-    gain = Gain(tuple(np.array([[value]]) for value in (1.0, 2.0, 3.0)))
+    gain = FitSensitivity(tuple(np.array([[value]]) for value in (1.0, 2.0, 3.0)))
     change = [np.ones(1)] * 3
-    assert gain.covariance(change, False) == pytest.approx(1 + 4 + 9)
-    assert gain.covariance(change, False, ("1", "1", "2")) == pytest.approx((1 + 2) ** 2 + 9)
+    assert gain.compute_covariance(change, False) == pytest.approx(1 + 4 + 9)
+    assert gain.compute_covariance(change, False, ("1", "1", "2")) == pytest.approx((1 + 2) ** 2 + 9)
 
 
 def test_records_of_one_site_may_differ() -> None:
     """Another speed or indenter is another stiffness; one wrong axis is told of once."""
     one = RecordFacts("1", 5.0, 5.0, 1.0, 0.01, 11.0, 20.0, 40.0, position_mm=(0.0, 0.0, 0.0), place="1")
     facts = [one, replace(one, site="1-fast", peak_N=8.0)]
-    assert [(flag.sites, flag.kind) for flag in implausible(facts)] == [(("1",), "axis")]
+    assert [(flag.sites, flag.kind) for flag in check_plausibility(facts)] == [(("1",), "axis")]
     apart = [replace(one, place="") for one in facts]
-    assert {flag.kind for flag in implausible(apart)} == {"axis", "place"}
+    assert {flag.kind for flag in check_plausibility(apart)} == {"axis", "place"}
 
 
 def test_table_2_has_a_row_of_each_record_and_means_over_sites(tmp_path: Path) -> None:
@@ -262,7 +262,7 @@ def test_a_force_that_never_rises_is_refused_in_one_line(folder: Path) -> None:
 def test_a_wrong_touch_down_shifts_all_depths() -> None:
     times = np.linspace(0.0, 5.0, 40)
     white = np.random.default_rng(5).normal(0.0, 0.004, 4000)
-    found = record_noise("1", times, white, np.full(40, 3.0), None, 0.02)
+    found = estimate_record_noise("1", times, white, np.full(40, 3.0), None, 0.02)
     assert found.unit == "mm"
     assert np.linalg.eigvalsh(found.covariance)[-1] == pytest.approx(40 * 0.02**2, rel=0.05)
 
@@ -273,20 +273,22 @@ def test_an_interval_takes_the_noise_of_what_is_compared() -> None:
         name: {"unit": unit, "compared_noise_sd_N": sd, "misfit_share": 0.0}
         for name, (unit, sd) in rows.items()
     }
-    known = Known(np.zeros((1, 1)), np.ones(1), sites, 0.01, 50.0)
-    assert known.residual("3")[0] == pytest.approx(0.2)
-    assert known.residual("3-creep", "mm")[0] == pytest.approx(0.02)
+    known = PredictionModel(np.zeros((1, 1)), np.ones(1), sites, 0.01, 50.0)
+    assert known.find_residual_sd("3")[0] == pytest.approx(0.2)
+    assert known.find_residual_sd("3-creep", "mm")[0] == pytest.approx(0.02)
     del sites["2-creep"]
-    assert known.residual("3-creep", "mm") == (0.0, 0.01)
+    assert known.find_residual_sd("3-creep", "mm") == (0.0, 0.01)
 
 
 def test_an_interval_covers_the_most_probable_parameters_too() -> None:
     """Force in proportion to the parameter, whose answer is 10 % above the most probable value."""
     sites = {"1": {"unit": "N", "compared_noise_sd_N": 0.01, "misfit_share": 0.0}}
     force = np.linspace(0.0, 5.0, 6)
-    known = Known(np.array([[1e-4]]), np.array([2.0]), sites, 0.0, 1e6)
+    known = PredictionModel(np.array([[1e-4]]), np.array([2.0]), sites, 0.0, 1e6)
     at_it, above = (
-        known.interval_95(SiteResponse(share * force, 0.5 * force[:, None]), np.array([2.0 * share]), "1")
+        known.compute_interval_95(
+            SiteResponse(share * force, 0.5 * force[:, None]), np.array([2.0 * share]), "1"
+        )
         for share in (1.0, 1.1)
     )
     assert at_it[1] - at_it[0] == pytest.approx(2 * 1.96 * np.hypot(0.01 * force, 0.01), rel=1e-3)
@@ -297,9 +299,9 @@ def test_an_interval_covers_the_most_probable_parameters_too() -> None:
 def test_records_of_force_and_depth_are_never_exchanged() -> None:
     curve = np.linspace(0.1, 1.0, 20)
     measured = [
-        Measured("1", curve),
-        Measured("2", curve),
-        Measured("2-creep", curve, site="2", unit="mm"),
-        Measured("3", curve, unit="mm"),
+        MeasuredCurve("1", curve),
+        MeasuredCurve("2", curve),
+        MeasuredCurve("2-creep", curve, site="2", unit="mm"),
+        MeasuredCurve("3", curve, unit="mm"),
     ]
-    assert _pairs(measured, [3, 0, 1, 2]) == [(0, 1), (2, 3)]
+    assert _list_pairs(measured, [3, 0, 1, 2]) == [(0, 1), (2, 3)]

@@ -7,7 +7,10 @@ import pytest
 
 from layered import layered_block
 from limbfit.bench.blocks import block_site
-from limbfit.identify import FIXED, CalibrationSettings, Measured, Unknowns, calibrate
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve
+from limbfit.identify.fit.parameters import FIXED, Unknowns
+from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.pipeline.stages.records import as_response
 from limbfit.study import SolverTable
@@ -56,7 +59,7 @@ def test_the_solver_s_own_folds_and_slips_reach_the_search(block):
 
 
 def test_a_search_that_starts_where_the_tissue_slips_leaves_it_and_does_not_return(block):
-    measured = [Measured("a", block(TRUTH)[0].force_N)]
+    measured = [MeasuredCurve("a", block(TRUTH)[0].force_N)]
     names = tuple(f"{tissue}.{name}" for tissue in TISSUES for name in ("c_kPa", "m", "gamma", "tau_s"))
     start = np.array(SLIPPING)
     lower, upper = start / 100, start * 100

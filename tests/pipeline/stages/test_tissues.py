@@ -12,7 +12,7 @@ from limbfit.bench.blocks import block_site
 from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor
-from limbfit.identify import Unknowns, separate, shared, two_stages
+from limbfit.identify.fit.parameters import Unknowns, group_by_kind, group_separately, stage_groupings
 from limbfit.indentation import SimulationJob, flat_names, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context, Progress
@@ -71,10 +71,10 @@ def test_flat_vectors_go_by_tissue_then_parameter():
 
 def test_stages_share_by_parameter_and_a_single_tissue_has_one():
     names = tuple(f"{tissue}.{name}" for tissue, name in flat_names(TISSUES))
-    assert shared(names) == (0, 1, 2, 3) * 3
-    assert separate(names) == tuple(range(12))
-    assert two_stages(names) == (shared(names), separate(names))
-    assert two_stages(names[:4]) == ((0, 1, 2, 3),)
+    assert group_by_kind(names) == (0, 1, 2, 3) * 3
+    assert group_separately(names) == tuple(range(12))
+    assert stage_groupings(names) == (group_by_kind(names), group_separately(names))
+    assert stage_groupings(names[:4]) == ((0, 1, 2, 3),)
 
 
 def test_forces_and_sensitivities_of_three_tissues_equal_central_differences(tmp_path):

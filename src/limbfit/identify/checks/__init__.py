@@ -1,1 +1,1 @@
-"""Records that cannot be right, other choices of sites, sites worth testing."""
+"""Checks of records, cross-validation, and the choice of sites and records."""

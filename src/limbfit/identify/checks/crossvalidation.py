@@ -1,9 +1,12 @@
-"""Cross-validation: fitted on some of the sites, judged at the others.
+"""Cross-validation: a fit to some of the sites is judged at the others.
 
-A choice of k sites out of n is one of many, and its held-out error one draw of a distribution. Here every
+A choice of k sites out of n is one of many, and its held-out error is one draw of a distribution. Here every
 choice, or a sample of them, is fitted and predicts the sites that it did not see; so is every choice that
-leaves a region out. There are thousands of fits in it, so ``simulate`` is meant to be an emulator that was
-checked against the solver; its region of validity comes as the bounds of ``unknowns``.
+leaves a region out. It takes thousands of fits, so ``simulate`` is meant to be an emulator that was checked
+against the solver; the region in which it is valid enters as the bounds of ``unknowns``.
+
+`fit_regions` fits a model of each region of the limb, to compare with that of the whole limb (the paper's
+table 3).
 """
 
 from __future__ import annotations
@@ -19,16 +22,16 @@ from numpy.typing import NDArray
 
 from ...errors import CalibrationError
 from ..fit.calibration import calibrate
-from ..fit.objective import Measured, Simulate, SiteResponse
-from ..fit.parameters import Unknowns, separate
-from ..fit.prediction import Summary, error_percent, summarise
-from ..fit.state import CalibrationSettings
+from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
+from ..fit.parameters import Unknowns, group_separately
+from ..fit.prediction import ErrorSummary, compute_error_percent, summarise_errors
+from ..fit.state import Calibration, CalibrationSettings
 
 Array = NDArray[np.float64]
 Choice = tuple[int, ...]
 
-_EDGE = 1e-3  # of the logarithm: this close to a bound is on it
-_ALL = 20_000  # choices that are listed before some are drawn
+
+_MAX_LISTED_CHOICES = 20_000  # choices that are listed before some are drawn
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Fold:
         return float(np.mean([self.errors_percent[i] for i in self.fitted]))
 
     def to_dict(self, sites: Sequence[str], names: Sequence[str]) -> dict[str, Any]:
-        """JSON-like values."""
+        """Return JSON-like values."""
         return {
             "label": self.label,
             "fitted": [sites[i] for i in self.fitted],
@@ -75,13 +78,14 @@ class Fold:
         }
 
 
-def choices_of(sites: int, size: int, most: int | None = None, seed: int = 0) -> list[Choice]:
-    """Every choice of ``size`` out of ``sites`` sites, in order, or ``most`` of them drawn without repeats.
+def list_choices(sites: int, size: int, most: int | None = None, seed: int = 0) -> list[Choice]:
+    """List every choice of ``size`` out of ``sites`` sites, in order, or ``most`` of them drawn without
+    repeats.
 
     Raises
     ------
     CalibrationError
-        Where no site would be left to be predicted.
+        If no site would be left to be predicted.
     """
     if not 0 < size < sites:
         raise CalibrationError(f"{size} of {sites} sites fitted leave none to be predicted")
@@ -89,7 +93,7 @@ def choices_of(sites: int, size: int, most: int | None = None, seed: int = 0) ->
     if most is None or most >= number:
         return list(combinations(range(sites), size))
     rng = np.random.default_rng(seed)
-    if number <= _ALL:
+    if number <= _MAX_LISTED_CHOICES:
         every = list(combinations(range(sites), size))
         return [every[i] for i in np.sort(rng.choice(number, most, replace=False))]
     drawn: set[Choice] = set()
@@ -98,19 +102,19 @@ def choices_of(sites: int, size: int, most: int | None = None, seed: int = 0) ->
     return sorted(drawn)
 
 
-def expanded(choice: Choice, groups: Sequence[Choice]) -> Choice:
-    """The records of a choice of sites; ``groups`` are the records of each site."""
+def expand_to_records(choice: Choice, groups: Sequence[Choice]) -> Choice:
+    """Return the records of a choice of sites; ``groups`` are the records of each site."""
     return tuple(record for site in choice for record in groups[site])
 
 
-def by_site(fold: Fold, choice: Choice, groups: Sequence[Choice]) -> Fold:
-    """A fit to the records of a choice of sites as one to them: an error is the mean of a site's records."""
+def average_by_site(fold: Fold, choice: Choice, groups: Sequence[Choice]) -> Fold:
+    """Turn a fold over records into one over sites, whose errors are the means of each site's records."""
     errors = tuple(float(np.mean([fold.errors_percent[i] for i in group])) for group in groups)
     return replace(fold, fitted=choice, errors_percent=errors)
 
 
-def without_regions(regions: Sequence[str]) -> dict[str, Choice]:
-    """For each region the sites of all others; none where there are fewer than two regions with a name."""
+def list_choices_without_regions(regions: Sequence[str]) -> dict[str, Choice]:
+    """Return for each region the sites of all others; nothing if fewer than two regions have a name."""
     named = [region for region in dict.fromkeys(regions) if region]
     if len(named) < 2:
         return {}
@@ -119,18 +123,18 @@ def without_regions(regions: Sequence[str]) -> dict[str, Choice]:
 
 def fit_sites(
     simulate: Simulate,
-    measured: Sequence[Measured],
+    measured: Sequence[MeasuredCurve],
     unknowns: Unknowns,
     chosen: Choice,
     settings: CalibrationSettings | None = None,
     label: str = "",
 ) -> Fold:
-    """Fit the ``chosen`` sites, every tissue its own material, and predict all of them.
+    """Fit the ``chosen`` sites with every tissue its own material, and predict all of them.
 
     Parameters
     ----------
-    simulate : gives all sites of ``measured``, in order.
-    unknowns : starts at the study's own answer.
+    simulate : returns all sites of ``measured``, in order.
+    unknowns : start at the study's own answer.
     """
 
     def of_chosen(parameters: Array) -> list[SiteResponse]:
@@ -142,31 +146,26 @@ def fit_sites(
         [measured[i] for i in chosen],
         unknowns,
         settings or CalibrationSettings(),
-        stages=(separate(unknowns.names),),
+        stages=(group_separately(unknowns.names),),
     )
     errors = [
-        error_percent(response.force_N, site.force_N)
+        compute_error_percent(response.force_N, site.force_N)
         for response, site in zip(simulate(found.parameters), measured, strict=True)
     ]
-    return Fold(
-        chosen, found.parameters, tuple(errors), found.converged, _at_limit(found.parameters, unknowns), label
-    )
-
-
-def _at_limit(parameters: Array, unknowns: Unknowns) -> tuple[str, ...]:
-    near = (np.log(parameters / unknowns.lower) < _EDGE) | (np.log(unknowns.upper / parameters) < _EDGE)
-    return tuple(name for name, edge in zip(unknowns.names, near) if edge)
+    is_at_bound = unknowns.is_at_bound(found.parameters)
+    at_limit = tuple(name for name, stuck in zip(unknowns.names, is_at_bound) if stuck)
+    return Fold(chosen, found.parameters, tuple(errors), found.converged, at_limit, label)
 
 
 def cross_validate(
     simulate: Simulate,
-    measured: Sequence[Measured],
+    measured: Sequence[MeasuredCurve],
     unknowns: Unknowns,
     choices: Sequence[Choice] | Mapping[str, Choice],
     settings: CalibrationSettings | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Fold, ...]:
-    """Fit every choice (with its label where they are named) and predict the others."""
+    """Fit every choice (with its label if ``choices`` have names) and predict the other sites."""
     pairs = list(choices.items()) if isinstance(choices, Mapping) else [("", choice) for choice in choices]
     folds = []
     for i, (label, choice) in enumerate(pairs):
@@ -176,8 +175,8 @@ def cross_validate(
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Where one fold lies among the others: ``share_better`` of them have a smaller held-out error."""
+class FoldRanking:
+    """The rank of one fold among others: ``share_better`` of them have a smaller held-out error."""
 
     mean_percent: float
     share_better: float
@@ -186,19 +185,117 @@ class Standing:
     high_percent: float
 
 
-def standing(own: Fold, folds: Sequence[Fold]) -> Standing:
-    """The mean held-out error of ``own`` in the distribution over ``folds`` (5, 50 and 95 %)."""
+def rank_fold(own: Fold, folds: Sequence[Fold]) -> FoldRanking:
+    """Rank the mean held-out error of a fold in the distribution over ``folds`` (5, 50 and 95 %)."""
     means = np.array([fold.mean_heldout for fold in folds])
     low, middle, high = np.percentile(means, [5, 50, 95])
     # Ties, itself above all, count half.
     better = np.mean(means < own.mean_heldout - 1e-9) + 0.5 * np.mean(
         np.abs(means - own.mean_heldout) <= 1e-9
     )
-    return Standing(own.mean_heldout, float(better), float(middle), float(low), float(high))
+    return FoldRanking(own.mean_heldout, float(better), float(middle), float(low), float(high))
 
 
-def errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[Summary, ...]:
-    """Errors of each site over the folds that did not fit it."""
+def summarise_errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[ErrorSummary, ...]:
+    """Summarise the errors of each site over the folds that did not fit it."""
     return tuple(
-        summarise([fold.errors_percent[i] for fold in folds if i not in fold.fitted]) for i in range(sites)
+        summarise_errors([fold.errors_percent[i] for fold in folds if i not in fold.fitted])
+        for i in range(sites)
     )
+
+
+Identify = Callable[[Unknowns], Calibration]
+
+
+@dataclass(frozen=True)
+class RegionRecords:
+    """The records of a region.
+
+    Parameters
+    ----------
+    identify : finds parameters from the records of the region's fitted sites.
+    simulate : returns the force at all of its sites, in the order of ``measured``.
+    """
+
+    identify: Identify
+    simulate: Simulate
+    measured: tuple[MeasuredCurve, ...]
+
+
+@dataclass(frozen=True)
+class RegionFit:
+    """A region's own model, and the errors (percent, by site) of it and of the whole limb's model.
+
+    An error is None if the simulation did not reach the end of the record.
+    """
+
+    calibration: Calibration
+    own_percent: dict[str, float | None]
+    whole_percent: dict[str, float | None]
+
+
+def fit_regions(
+    regions: Mapping[str, RegionRecords], unknowns: Unknowns, whole: Array
+) -> dict[str, RegionFit]:
+    """Fit the parameters of each region, started from those of the whole limb.
+
+    Parameters
+    ----------
+    unknowns : names and bounds; their start is not used.
+    whole : (p,) the parameters identified for the whole limb.
+    """
+    start = unknowns.with_start(np.clip(whole, unknowns.lower, unknowns.upper))
+    fits = {}
+    for name, region in regions.items():
+        whole_percent = compute_site_errors(region.simulate, whole, region.measured)
+        found = region.identify(start)
+        own_percent = compute_site_errors(region.simulate, found.parameters, region.measured)
+        fits[name] = RegionFit(found, own_percent, whole_percent)
+    return fits
+
+
+def compute_site_errors(
+    simulate: Simulate, parameters: Array, measured: Sequence[MeasuredCurve]
+) -> dict[str, float | None]:
+    """Return the force error of each site in percent; None if its simulation is not complete."""
+    return {
+        site.name: compute_error_percent(response.force_N, site.force_N) if response.completed else None
+        for response, site in zip(simulate(parameters), measured, strict=True)
+    }
+
+
+def average_errors(errors_percent: Mapping[str, float | None]) -> float | None:
+    """Return the mean over the sites that have an error; None if none has."""
+    known = [error for error in errors_percent.values() if error is not None]
+    return float(np.mean(known)) if known else None
+
+
+_CANDIDATES = 600
+# Standard deviations of log(parameters) along the axes of the covariance: what fits scatter by at least, at
+# most.
+_MIN_SD_LOG, _MAX_SD_LOG = 0.08, 0.45
+_WIDENING = 2.0  # than the fit's own covariance: fewer records, or others, tell less
+
+
+def spread_points(centre: Array, covariance_log: Array, unknowns: Unknowns, count: int, seed: int) -> Array:
+    """Spread ``count`` points (count, p) around a fit's answer, far from one another and inside the bounds.
+
+    An emulator learns there what fits to other records will ask of it.
+
+    Parameters
+    ----------
+    centre : (p,) the answer.
+    covariance_log : (p, p) of the logarithms of the parameters.
+    """
+    rng = np.random.default_rng(seed)
+    values, axes = np.linalg.eigh(covariance_log)
+    sd = np.clip(_WIDENING * np.sqrt(np.maximum(values, 0.0)), _MIN_SD_LOG, _MAX_SD_LOG)
+    unit = rng.standard_normal((_CANDIDATES, len(centre)))
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True) / np.sqrt(len(centre)), 1.0)
+    found: list[int] = []
+    distance = np.linalg.norm(unit, axis=1)  # to the answer, which is simulated too
+    for _ in range(count):
+        found.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(unit - unit[found[-1]], axis=1))
+    points = centre * np.exp((unit[found] * sd) @ axes.T)
+    return np.clip(points, unknowns.lower, unknowns.upper)

@@ -1,11 +1,10 @@
-"""Records judged before anything is simulated: units, names, axes and places that cannot be right.
+"""Checks of records before anything is simulated: units, names, axes and places that cannot be right.
 
-What makes records of different sites comparable is the apparent shear modulus: peak force over depth, taken
-as that of a rigid flat punch on an incompressible layer bonded to bone (Hayes et al. 1972),
-``F / d = 8 a G k(a / h)`` with the punch's radius a and the tissue's thickness h. Over clean synthetic limbs
-its standard deviation is a factor of about 1.25, while the stiffness itself varies sevenfold. A wrong unit
-shifts it, the speed, the depth and the time step by known factors, so the hypothesis that explains all four
-names the unit.
+Records of different sites are compared by the apparent shear modulus: peak force over depth, taken as that of
+a rigid flat punch on an incompressible layer bonded to bone (Hayes et al. 1972), ``F / d = 8 a G k(a / h)``
+with the punch's radius a and the tissue's thickness h. Over clean synthetic limbs its standard deviation is a
+factor of about 1.25, while the stiffness itself varies sevenfold. A wrong unit shifts it, the speed, the
+depth and the time step by known factors, so the hypothesis that explains all four names the unit.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 # Hayes, Keer, Herrmann and Mockros 1972, flat punch, Poisson's ratio 0.5: kappa against a / h.
-_HAYES = (
+_HAYES_FACTORS = (
     (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0),
     (1.0, 1.281, 1.683, 2.211, 2.855, 3.609, 5.970, 9.069),
 )
@@ -29,14 +28,17 @@ _HAYES = (
 MODULUS_KPA = (1.0, 100.0)
 # Standard deviations (logarithmic) below which differences between sites of one study mean nothing:
 # modulus with and without a known thickness, speed, time step, depth.
-_FLOORS = {"modulus": 0.3, "stiffness": 0.75, "speed": 0.2, "step": 0.1, "depth": 0.4}
+_MIN_SDS = {"modulus": 0.3, "stiffness": 0.75, "speed": 0.2, "step": 0.1, "depth": 0.4}
 _MIN_OTHERS = 3
-_LARGE = 3.8  # standard deviations of one quantity
-_BOTH = 4.0  # of two sites together, exchanged
-_DROP = 12.0  # by which a hypothesis must lower chi-square
-_EXPLAINED = 16.0  # the chi-square (of 4) up to which a hypothesis explains what it names
-AXIS_DEG, OFF_SKIN_MM, HINT_MM, DEPTH_SHARE = 25.0, 3.0, 12.0, 0.8
-SAME_PLACE_MM, REPEATABLE = 2.0, 1.15  # sites so close are one, and what repeats there differ by at most
+_MAX_STANDARDISED = 3.8  # standard deviations of one quantity
+_MIN_PAIR_DEVIATION = 4.0  # of two sites together, exchanged
+_MIN_CHI2_DROP = 12.0  # by which a hypothesis must lower chi-square
+_MAX_CHI2_EXPLAINED = 16.0  # the chi-square (of 4) up to which a hypothesis explains what it names
+MAX_AXIS_DEG, MAX_OFF_SKIN_MM, MAX_HINT_MM, MAX_DEPTH_SHARE = 25.0, 3.0, 12.0, 0.8
+SAME_PLACE_MM, MAX_REPEAT_RATIO = (
+    2.0,
+    1.15,
+)  # sites so close are one, and what repeats there differ by at most
 
 # Recorded over true number: force, displacement, time.
 UNITS: dict[str, tuple[float, float, float]] = {
@@ -59,8 +61,8 @@ UNITS: dict[str, tuple[float, float, float]] = {
 
 
 @dataclass(frozen=True)
-class Flag:
-    """Something that looks wrong: sites, what, the numbers that say so, the likely cause, the remedy."""
+class RecordWarning:
+    """A warning about records: sites, what is wrong, numbers that show it, likely cause, remedy."""
 
     sites: tuple[str, ...]
     kind: str
@@ -76,21 +78,24 @@ class Flag:
         return f"{head}: {self.what}; likely {self.cause}; {self.remedy}"
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like values, the text among them."""
+        """Return JSON-like values, the text among them."""
         return {**asdict(self), "sites": list(self.sites), "evidence": dict(self.evidence), "text": self.text}
 
 
-def explained(found: Sequence[Flag], in_records: Sequence[Flag]) -> list[Flag]:
-    """Flags against the model; where a record itself shows a wrong unit, that is their cause, and no other.
+def explain_warnings(
+    warnings: Sequence[RecordWarning], in_records: Sequence[RecordWarning]
+) -> list[RecordWarning]:
+    """Give warnings against the model the cause and remedy that the record itself shows, if it shows a wrong
+    unit.
 
     The model compares forces, and takes a wrong displacement for a wrong force.
     """
-    units = {flag.sites: flag for flag in in_records if flag.kind == "unit"}
+    units = {warning.sites: warning for warning in in_records if warning.kind == "unit"}
     return [
-        replace(flag, cause=units[flag.sites].cause, remedy=units[flag.sites].remedy)
-        if flag.sites in units
-        else flag
-        for flag in found
+        replace(warning, cause=units[warning.sites].cause, remedy=units[warning.sites].remedy)
+        if warning.sites in units
+        else warning
+        for warning in warnings
     ]
 
 
@@ -98,11 +103,11 @@ def explained(found: Sequence[Flag], in_records: Sequence[Flag]) -> list[Flag]:
 class RecordFacts:
     """A record and its site in numbers; what is not known (yet) is None.
 
-    ``site`` is the record's name, ``place`` the site's where it has several. ``position_mm`` (LPS) is where
-    that is on the skin, ``step_s`` the time between samples, ``radius_mm`` that of a circle of the punch's
-    area, ``thickness_mm`` the soft tissue under the indenter along its axis, ``axis_deg`` the angle between
-    that axis and the skin's inward normal, ``hint_mm`` how far its marker is from where the site was said to
-    be.
+    ``site`` is the record's name, and ``place`` the name of the site if it has several records.
+    ``position_mm`` (LPS) is where that is on the skin, ``step_s`` the time between samples, ``radius_mm``
+    that of a circle of the punch's area, ``thickness_mm`` the soft tissue under the indenter along its axis,
+    ``axis_deg`` the angle between that axis and the skin's inward normal, ``hint_mm`` how far its marker is
+    from where the study says the site is.
     """
 
     site: str
@@ -119,68 +124,83 @@ class RecordFacts:
     place: str = ""
 
     @property
-    def where(self) -> str:
-        """What records of one site have in common."""
+    def site_name(self) -> str:
+        """The name that all records of one site share."""
         return self.place or self.site
 
     @property
     def modulus_kPa(self) -> float:
-        """The apparent shear modulus; that of a half-space where the thickness is not known."""
+        """The apparent shear modulus; that of a half-space if the thickness is not known."""
         stiffness = self.peak_N / self.depth_mm / (8 * self.radius_mm) * 1e3
-        return stiffness / (layer_factor(self.radius_mm / self.thickness_mm) if self.thickness_mm else 1.0)
+        return stiffness / (
+            compute_layer_factor(self.radius_mm / self.thickness_mm) if self.thickness_mm else 1.0
+        )
 
 
-def layer_factor(radius_over_thickness: float) -> float:
-    """How much stiffer a bonded incompressible layer is than a half-space, under a flat punch."""
-    ratios, factors = _HAYES
+def compute_layer_factor(radius_over_thickness: float) -> float:
+    """Return how much stiffer a bonded incompressible layer is than a half-space, under a flat punch."""
+    ratios, factors = _HAYES_FACTORS
     if radius_over_thickness > ratios[-1]:  # the limit of a thin layer: as the cube
         return factors[-1] * (radius_over_thickness / ratios[-1]) ** 3
     return float(np.interp(radius_over_thickness, ratios, factors))
 
 
-def implausible(facts: Sequence[RecordFacts]) -> tuple[Flag, ...]:
-    """Flags on the records of a study: each against the others, and against what limbs are like."""
-    return (*_places(facts), *_shared_places(facts), *_absolute(facts), *_against_others(facts))
+def check_plausibility(facts: Sequence[RecordFacts]) -> tuple[RecordWarning, ...]:
+    """Check the records of a study, each against the others and against what limbs are like."""
+    return (
+        *_check_places(facts),
+        *_check_shared_places(facts),
+        *_check_all_moduli(facts),
+        *_compare_records(facts),
+    )
 
 
-def _places(facts: Sequence[RecordFacts]) -> list[Flag]:
-    flags: list[Flag] = []
-    told: set[str] = set()  # of a site once, however many records it has
+def _check_places(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
+    warnings: list[RecordWarning] = []
+    seen_sites: set[str] = set()  # of a site once, however many records it has
     for f in facts:
         share = f.depth_mm / f.thickness_mm if f.thickness_mm else 0.0
-        if share > DEPTH_SHARE:
+        if share > MAX_DEPTH_SHARE:
             what = f"it goes {f.depth_mm:.1f} mm deep where the soft tissue is {f.thickness_mm:.1f} mm thick"
             cause = "another place, another limb, or a wrong unit of displacement"
-            flags.append(Flag((f.site,), "depth", what, {"depth_share": share}, cause, "check the record"))
-        if f.where in told:
+            warnings.append(
+                RecordWarning((f.site,), "depth", what, {"depth_share": share}, cause, "check the record")
+            )
+        if f.site_name in seen_sites:
             continue
-        told.add(f.where)
-        if f.axis_deg is not None and f.axis_deg > AXIS_DEG:
+        seen_sites.add(f.site_name)
+        if f.axis_deg is not None and f.axis_deg > MAX_AXIS_DEG:
             outward = f.axis_deg > 90
             what = f"the axis is {f.axis_deg:.0f} degrees from the inward normal of the skin"
             cause = "an axis that points out of the limb" if outward else "an axis of another site or frame"
             remedy = "negate it" if outward else "check it, or leave axis out to take the skin's normal"
-            flags.append(Flag((f.where,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy))
-        if f.off_skin_mm is not None and f.off_skin_mm > OFF_SKIN_MM:
+            warnings.append(
+                RecordWarning((f.site_name,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy)
+            )
+        if f.off_skin_mm is not None and f.off_skin_mm > MAX_OFF_SKIN_MM:
             what = f"the stated position is {f.off_skin_mm:.1f} mm off the skin"
             cause, remedy = "a wrong position or coordinate system", "give LPS millimetres on the skin"
-            flags.append(Flag((f.where,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy))
-        if f.hint_mm is not None and f.hint_mm > HINT_MM:
+            warnings.append(
+                RecordWarning((f.site_name,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy)
+            )
+        if f.hint_mm is not None and f.hint_mm > MAX_HINT_MM:
             what = f"its marker lies {f.hint_mm:.1f} mm from where the study says the site is"
             cause, remedy = "another site's marker", "check 'near' of this site and its neighbours"
-            flags.append(Flag((f.where,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy))
-    return flags
+            warnings.append(
+                RecordWarning((f.site_name,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy)
+            )
+    return warnings
 
 
-def _shared_places(facts: Sequence[RecordFacts]) -> list[Flag]:
-    """Sites at one place whose records differ by more than repeats do."""
-    flags = []
+def _check_shared_places(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
+    """Warn of sites at one place whose records differ by more than repeats do."""
+    warnings = []
     for one, two in combinations(facts, 2):
-        if one.position_mm is None or two.position_mm is None or one.where == two.where:
+        if one.position_mm is None or two.position_mm is None or one.site_name == two.site_name:
             continue
         apart = float(np.linalg.norm(np.subtract(one.position_mm, two.position_mm)))
         ratio = one.modulus_kPa / two.modulus_kPa
-        if apart > SAME_PLACE_MM or max(ratio, 1 / ratio) < REPEATABLE:
+        if apart > SAME_PLACE_MM or max(ratio, 1 / ratio) < MAX_REPEAT_RATIO:
             continue
         what = (
             f"they are at one place ({apart:.1f} mm apart), but the apparent modulus of the first record is "
@@ -188,12 +208,14 @@ def _shared_places(facts: Sequence[RecordFacts]) -> list[Flag]:
         )
         numbers = {"apart_mm": apart, "modulus_ratio": ratio}
         remedy = "give each site its own place"
-        flags.append(Flag((one.site, two.site), "place", what, numbers, "a position given twice", remedy))
-    return flags
+        warnings.append(
+            RecordWarning((one.site, two.site), "place", what, numbers, "a position given twice", remedy)
+        )
+    return warnings
 
 
-def _absolute(facts: Sequence[RecordFacts]) -> list[Flag]:
-    """Where all records together cannot be a limb's."""
+def _check_all_moduli(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
+    """Warn if all records together cannot be those of a limb."""
     known = [f.modulus_kPa for f in facts if f.thickness_mm]
     if len(known) < 2:
         return []
@@ -204,45 +226,48 @@ def _absolute(facts: Sequence[RecordFacts]) -> list[Flag]:
     what = f"an apparent shear modulus of {middle:.3g} kPa is not that of soft tissue ({low:g} to {high:g})"
     wanted = float(np.log(middle / 8.0))
     cause = min(UNITS, key=lambda name: abs(np.log(UNITS[name][0] / UNITS[name][1]) - wanted))
-    return [Flag((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")]
+    return [RecordWarning((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")]
 
 
-def _features(f: RecordFacts) -> Array:
+def _compute_features(f: RecordFacts) -> Array:
     return np.log([f.modulus_kPa, f.speed_mm_s, f.step_s, f.depth_mm])
 
 
-def _spreads(rest: Array, known: bool) -> Array:
-    """Standard deviations (4,) of single sites about the others' median, robust, never below the floors."""
-    floors = [_FLOORS["modulus" if known else "stiffness"], *(_FLOORS[k] for k in ("speed", "step", "depth"))]
+def _compute_spreads(rest: Array, known: bool) -> Array:
+    """Return robust standard deviations (4,) of sites about the others' median, at least the floors."""
+    floors = [
+        _MIN_SDS["modulus" if known else "stiffness"],
+        *(_MIN_SDS[k] for k in ("speed", "step", "depth")),
+    ]
     deviation = 1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0)
     return np.maximum(floors, deviation) * np.sqrt(1 + 1 / len(rest))
 
 
-def _against_others(facts: Sequence[RecordFacts]) -> list[Flag]:
+def _compare_records(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
     if len(facts) < _MIN_OTHERS + 1:
         return []
     known = all(f.thickness_mm for f in facts)
     if not known:
         facts = [replace(f, thickness_mm=None) for f in facts]
-    table = np.array([_features(f) for f in facts])
+    table = np.array([_compute_features(f) for f in facts])
     away, spread = np.zeros_like(table), np.zeros_like(table)
     for i in range(len(facts)):
         rest = np.delete(table, i, axis=0)
-        away[i], spread[i] = table[i] - np.median(rest, axis=0), _spreads(rest, known)
-    swapped = _swapped(facts, away[:, 0] / spread[:, 0]) if known else None
-    flags = [] if swapped is None else [swapped]
+        away[i], spread[i] = table[i] - np.median(rest, axis=0), _compute_spreads(rest, known)
+    swapped = _find_exchange(facts, away[:, 0] / spread[:, 0]) if known else None
+    warnings = [] if swapped is None else [swapped]
     taken = set() if swapped is None else set(swapped.sites)
     for f, shift, sd in zip(facts, away, spread):
-        flag = None if f.site in taken else _odd(f, shift, sd)
-        if flag is not None:
-            flags.append(flag)
-    return flags
+        warning = None if f.site in taken else _explain_odd_record(f, shift, sd)
+        if warning is not None:
+            warnings.append(warning)
+    return warnings
 
 
-def _odd(f: RecordFacts, shift: Array, sd: Array) -> Flag | None:
-    """What is odd about one record: a unit that explains it all, or a stiffness that nothing explains."""
+def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> RecordWarning | None:
+    """Explain what is odd about a record: a unit that explains it all, or an unexplained stiffness."""
     null = float(((shift / sd) ** 2).sum())
-    if np.abs(shift / sd).max() < _LARGE:
+    if np.abs(shift / sd).max() < _MAX_STANDARDISED:
         return None
     name, best = "", null
     for unit, (force, travel, time) in UNITS.items():
@@ -263,16 +288,18 @@ def _odd(f: RecordFacts, shift: Array, sd: Array) -> Flag | None:
         f"against the other sites its apparent modulus is {np.exp(shift[0]):.2g} times, its speed "
         f"{np.exp(shift[1]):.2g} times, its depth {np.exp(shift[3]):.2g} times"
     )
-    if name and best < _EXPLAINED and null - best > _DROP:
-        return Flag((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
-    if abs(shift[0] / sd[0]) < _LARGE:
+    if name and best < _MAX_CHI2_EXPLAINED and null - best > _MIN_CHI2_DROP:
+        return RecordWarning((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
+    if abs(shift[0] / sd[0]) < _MAX_STANDARDISED:
         return None  # a protocol of its own is no fault
     cause = "a swapped name, another place or another limb"
-    return Flag((f.site,), "stiffness", what, numbers, cause, "check which site this record belongs to")
+    return RecordWarning(
+        (f.site,), "stiffness", what, numbers, cause, "check which site this record belongs to"
+    )
 
 
-def _swapped(facts: Sequence[RecordFacts], z: Array) -> Flag | None:
-    """The exchange of two records that makes the moduli of all sites alike, where they are not.
+def _find_exchange(facts: Sequence[RecordFacts], z: Array) -> RecordWarning | None:
+    """Find the exchange of two records that makes the moduli of all sites alike if they are not.
 
     Both sites must be odd, one too stiff and one too soft for its tissue's thickness: two errors that no
     single unit makes.
@@ -285,7 +312,7 @@ def _swapped(facts: Sequence[RecordFacts], z: Array) -> Flag | None:
     before = scatter(facts)
     found: tuple[float, int, int] | None = None
     for i, j in combinations(range(len(facts)), 2):
-        if z[i] * z[j] > 0 or np.hypot(z[i], z[j]) < _BOTH or min(abs(z[i]), abs(z[j])) < 2.0:
+        if z[i] * z[j] > 0 or np.hypot(z[i], z[j]) < _MIN_PAIR_DEVIATION or min(abs(z[i]), abs(z[j])) < 2.0:
             continue
         rows = list(facts)
         rows[i] = replace(facts[i], thickness_mm=facts[j].thickness_mm)
@@ -303,4 +330,4 @@ def _swapped(facts: Sequence[RecordFacts], z: Array) -> Flag | None:
     )
     numbers = {"scatter": before, "scatter_exchanged": after}
     remedy = "exchange the traces of the two sites, or their names"
-    return Flag((one.site, two.site), "swap", what, numbers, "swapped site names", remedy)
+    return RecordWarning((one.site, two.site), "swap", what, numbers, "swapped site names", remedy)

@@ -1,10 +1,10 @@
-"""Which records fit into a patient's time, and what they would determine: Bayesian choice of a protocol.
+"""The choice of records that fit into a patient's time and determine the parameters best (Bayesian design).
 
-Each record that could be made has a Fisher information on the logarithms of the parameters, at several draws
-of them, since what a record tells depends on the tissue. A protocol is judged by the covariance of the
-parameters that are wanted, or of what follows from them, the others being unknown too: by the mean over the
-draws of the logarithm of its determinant (D) or of its trace (A) (Chaloner and Verdinelli, Statistical
-Science 1995, 10:273).
+Each record that could be made has a Fisher information on the logarithms of the parameters. It is computed at
+several samples of the parameters, because what a record tells depends on the tissue. A protocol is judged by
+the covariance of the target parameters, or of quantities that follow from them, while the others are unknown,
+too: by the mean over the samples of the logarithm of its determinant (D) or of its trace (A) (Chaloner and
+Verdinelli, Statistical Science 1995, 10:273).
 """
 
 from __future__ import annotations
@@ -19,19 +19,21 @@ from scipy.stats import norm, qmc
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import Unknowns
-from ..uncertainty.noise import alike_on_skin
+from ..uncertainty.noise import compute_skin_similarity
 from ..uncertainty.uncertainty import NORMAL_95
-from .design import Criterion, NoiseModel, information_of, information_of_field
+from .design import Criterion, NoiseModel, compute_field_information, compute_information
 
 Array = NDArray[np.float64]
 
-_LARGEST_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), however little is known
+_MAX_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), however little is known
 
 
 @dataclass(frozen=True)
-class Noises:
-    """Of a record's force, of the compressions that ultrasound sees, of the moves that cameras see and of the
-    speeds of shear waves; None where there is none.
+class RecordNoise:
+    """The noise of all that a record measures; None where that is not measured.
+
+    ``force`` is that of the force, ``layers`` of the compressions in ultrasound, ``skin`` of the moves that
+    cameras see, and ``waves`` of the speeds of shear waves.
     """
 
     force: NoiseModel
@@ -40,16 +42,17 @@ class Noises:
     waves: NoiseModel | None = None
 
     @classmethod
-    def of(
+    def from_sds(
         cls,
         force: NoiseModel,
         ultrasound_sd_mm: float | None = None,
         surface_sd_mm: float | None = None,
         shear_waves_sd_m_s: float | None = None,
-    ) -> Noises:
-        """One reading at each point of comparison; the model errs by the same share as of the force.
+    ) -> RecordNoise:
+        """Build it from the standard deviations of one reading at each point of comparison.
 
-        Speeds of a place are off together by as much as each is by itself.
+        The misfit of the model is the same share as of the force. The speeds of a place have a common error
+        as large as each one's own.
         """
         layers, skin, waves = (
             None if sd is None else replace(force, sensor_N=sd)
@@ -58,15 +61,15 @@ class Noises:
         return cls(force, layers, skin, None if waves is None else replace(waves, bias_N=waves.sensor_N))
 
     @property
-    def sees_more(self) -> bool:
-        """Whether there is anything beside the force."""
+    def has_secondary(self) -> bool:
+        """True if anything is measured beside the force."""
         return any(one is not None for one in (self.layers, self.skin, self.waves))
 
-    def of_force(self, force: SiteResponse, parameters: Array) -> Array:
-        """Information (p, p) of a record's force."""
-        return information_of(force, parameters, self.force)
+    def compute_force_information(self, force: SiteResponse, parameters: Array) -> Array:
+        """Return the information (p, p) of a record's force."""
+        return compute_information(force, parameters, self.force)
 
-    def of_all(
+    def compute_information(
         self,
         force: SiteResponse,
         values: Array,
@@ -74,38 +77,41 @@ class Noises:
         parts: tuple[int, Array, float],
         parameters: Array,
     ) -> Array:
-        """Information (p, p) of a record with ``values`` (g, n) beside its force, ``slopes`` (g, n, p).
+        """Return the information (p, p) of a record with ``values`` (g, n) beside its force, ``slopes`` (g,
+        n, p).
 
-        ``parts``: how many of the values are of layers; then come three components of each of the points
-        (k, 3) mm on the skin; then speeds, of which there are so many readings.
+        ``parts`` says what the values are: first so many of layers, then three components of each of the
+        points (k, 3) mm on the skin, then speeds, of which there are so many readings.
         """
         layers, points_mm, readings = parts
-        found, waves = self.of_force(force, parameters), layers + 3 * len(points_mm)
+        information, waves = self.compute_force_information(force, parameters), layers + 3 * len(points_mm)
         if self.layers is not None:
-            found = found + _of_each(values[:layers], slopes[:layers], parameters, self.layers)
+            information = information + _sum_information(
+                values[:layers], slopes[:layers], parameters, self.layers
+            )
         if self.skin is not None and len(points_mm):
             components = np.tile(range(3), len(points_mm))
-            alike = alike_on_skin(np.repeat(points_mm, 3, axis=0), components)
+            similarity = compute_skin_similarity(np.repeat(points_mm, 3, axis=0), components)
             skin = values[layers:waves], slopes[layers:waves]
-            found = found + information_of_field(*skin, alike, parameters, self.skin)
+            information = information + compute_field_information(*skin, similarity, parameters, self.skin)
         if self.waves is not None:
             fewer = np.sqrt(max(values.shape[1] / readings, 1.0))  # than points of comparison
             noise = replace(self.waves, sensor_N=fewer * self.waves.sensor_N)
-            found = found + _of_each(values[waves:], slopes[waves:], parameters, noise)
-        return found
+            information = information + _sum_information(values[waves:], slopes[waves:], parameters, noise)
+        return information
 
 
-def _of_each(values: Array, slopes: Array, parameters: Array, noise: NoiseModel) -> Array:
-    """Information (p, p) of several curves (g, n)."""
+def _sum_information(values: Array, slopes: Array, parameters: Array, noise: NoiseModel) -> Array:
+    """Return the information (p, p) of several curves (g, n) together."""
     found = np.zeros((len(parameters), len(parameters)))
     for value, slope in zip(values, slopes, strict=True):
-        found += information_of(SiteResponse(value, slope), parameters, noise)
+        found += compute_information(SiteResponse(value, slope), parameters, noise)
     return found
 
 
 @dataclass(frozen=True)
-class Option:
-    """A record that could be made: ``information`` (d, p, p) on log(parameters) at each draw.
+class RecordOption:
+    """A record that could be made: ``information`` (d, p, p) on log(parameters) at each sample of tissue.
 
     ``place`` is what is prepared for it, a site with an indenter; records at one place share that time. The
     site's tissue may be stiffer as a whole, for all of its records, by a share with standard deviation
@@ -120,19 +126,19 @@ class Option:
 
 @dataclass(frozen=True)
 class Budget:
-    """Time of a session: ``seconds`` in all, ``setup_s`` for each place."""
+    """The time of a session: ``seconds`` in all, ``setup_s`` for each place."""
 
     seconds: float
     setup_s: float
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What is to be determined: ``rows`` (k, p) times log(parameters); ``prior`` (p, p) information is given.
+class DesignTarget:
+    """What is to be determined: ``rows`` (k, p) times log(parameters), with ``prior`` information (p, p).
 
-    Rows of the unit matrix are parameters; others are what follows from them, such as a pressure's logarithm.
-    ``stiffness`` (p,) is 1 for parameters that are moduli: how they change where a site is stiffer. None: no
-    site is.
+    Rows of the unit matrix are parameters; others are quantities that follow from them, such as a pressure's
+    logarithm. ``stiffness`` (p,) is 1 for parameters that are moduli, which change if a site is stiffer;
+    None: no site is.
     """
 
     prior: Array
@@ -140,117 +146,123 @@ class Wanted:
     criterion: Criterion = "D"
     stiffness: Array | None = None
 
-    def covariances(self, options: Sequence[Option], chosen: Sequence[int], draws: int) -> Array:
-        """Of log(parameters) (d, p, p) at each of the draws.
+    def compute_covariances(
+        self, options: Sequence[RecordOption], chosen: Sequence[int], draws: int
+    ) -> Array:
+        """Return the covariance of log(parameters) (d, p, p) at each of the samples of tissue.
 
-        What the records of a site tell together is less by what its own stiffness takes away, which they
-        share: the information with that as one more parameter, of known spread, that is then left out.
+        The records of a site share its own stiffness, so they tell less together: that stiffness is one more
+        parameter with a known spread, which is then marginalised.
         """
         total = np.repeat(self.prior[None], draws, axis=0)
-        sites: dict[str, list[Option]] = {}
+        sites: dict[str, list[RecordOption]] = {}
         for i in chosen:
             sites.setdefault(options[i].place[0], []).append(options[i])
         for own in sites.values():
-            told = np.array([one.information for one in own])
-            total = total + told.sum(axis=0)
+            informations = np.array([one.information for one in own])
+            total = total + informations.sum(axis=0)
             if self.stiffness is None:
                 continue
             share = np.array([one.site_share for one in own])
-            along = np.einsum("r,rdij,j->di", share, told, self.stiffness)
-            alone = 1.0 + np.einsum("r,rdij,i,j->d", share**2, told, self.stiffness, self.stiffness)
+            along = np.einsum("r,rdij,j->di", share, informations, self.stiffness)
+            alone = 1.0 + np.einsum("r,rdij,i,j->d", share**2, informations, self.stiffness, self.stiffness)
             total = total - along[:, :, None] * along[:, None, :] / alone[:, None, None]
         return np.asarray(np.linalg.inv(total))
 
-    def of_wanted(self, covariances: Array) -> Array:
-        """The covariance (d, k, k) of what is wanted, from that of log(parameters) (d, p, p)."""
+    def project(self, covariances: Array) -> Array:
+        """Return the covariance (d, k, k) of the target from that of log(parameters) (d, p, p)."""
         return np.asarray(self.rows @ covariances @ self.rows.T)
 
-    def cost(self, covariances: Array) -> float:
-        """What the best protocol has least of."""
-        part = self.of_wanted(covariances)
+    def compute_cost(self, covariances: Array) -> float:
+        """Return the criterion, which the best protocol makes smallest."""
+        part = self.project(covariances)
         if self.criterion == "A":
             return float(np.trace(part, axis1=1, axis2=2).mean())
         return float(np.linalg.slogdet(part)[1].mean())
 
 
-def drawn(known: Unknowns, centre: Array, draws: int, seed: int) -> Array:
-    """Tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
+def sample_tissues(unknowns: Unknowns, centre: Array, draws: int, seed: int) -> Array:
+    """Sample tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
 
-    A parameter with a prior scatters by its factor, another by half of what its bounds leave. A Latin
-    hypercube spreads few draws well.
+    A parameter with a prior scatters by the prior's factor, another by half of what its bounds allow. A Latin
+    hypercube spreads few samples well.
     """
-    spread = 0.5 * np.log(known.upper / known.lower) / np.sqrt(12.0)
-    for prior in known.priors:
-        spread[known.names.index(prior.name)] = np.log(prior.factor)
+    spread = 0.5 * np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
+    for prior in unknowns.priors:
+        spread[unknowns.names.index(prior.name)] = np.log(prior.factor)
     others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
     scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
-    return np.vstack([centre, np.exp(np.clip(scattered, np.log(known.lower), np.log(known.upper)))])
+    return np.vstack([centre, np.exp(np.clip(scattered, np.log(unknowns.lower), np.log(unknowns.upper)))])
 
 
-def factors_95(covariances: Array) -> Array:
-    """(d, p) the factor f of the expected 95 % interval [value / f, value x f] at each draw."""
+def compute_factors_95(covariances: Array) -> Array:
+    """Return (d, p) the factor f of the expected 95 % interval [value / f, value x f] at each sample."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
-    return np.asarray(np.exp(NORMAL_95 * np.sqrt(np.minimum(variances, _LARGEST_VARIANCE))))
+    return np.asarray(np.exp(NORMAL_95 * np.sqrt(np.minimum(variances, _MAX_VARIANCE))))
 
 
-def seconds_of(options: Sequence[Option], chosen: Sequence[int], budget: Budget) -> float:
-    """How long a protocol takes."""
+def compute_duration_s(options: Sequence[RecordOption], chosen: Sequence[int], budget: Budget) -> float:
+    """Return how long a protocol takes."""
     places = {options[i].place for i in chosen}
     return sum(options[i].seconds for i in chosen) + budget.setup_s * len(places)
 
 
-def plan(options: Sequence[Option], budget: Budget, wanted: Wanted) -> tuple[int, ...]:
-    """The records to make: added by gain in their time, then exchanged as long as that helps.
+def plan_records(options: Sequence[RecordOption], budget: Budget, target: DesignTarget) -> tuple[int, ...]:
+    """Plan the records to make: added by gain in their time, then exchanged as long as that helps.
 
     Raises
     ------
     CalibrationError
-        Where no record fits into the time.
+        If no record fits into the time.
     """
-    if not options or all(seconds_of(options, [i], budget) > budget.seconds for i in range(len(options))):
+    if not options or all(
+        compute_duration_s(options, [i], budget) > budget.seconds for i in range(len(options))
+    ):
         raise CalibrationError("no record fits into the time")
     draws = len(options[0].information)
 
     def cost(chosen: Sequence[int]) -> float:
-        return wanted.cost(wanted.covariances(options, chosen, draws))
+        return target.compute_cost(target.compute_covariances(options, chosen, draws))
 
-    starts = [_filled([], options, budget, cost, by_time=by_time) for by_time in (True, False)]
-    best = min((_exchanged(start, options, budget, cost) for start in starts), key=cost)
+    starts = [_fill_budget([], options, budget, cost, by_time=by_time) for by_time in (True, False)]
+    best = min((_improve_by_exchange(start, options, budget, cost) for start in starts), key=cost)
     return tuple(sorted(best))
 
 
 Cost = Callable[[Sequence[int]], float]
 
 
-def _filled(
-    chosen: Sequence[int], options: Sequence[Option], budget: Budget, cost: Cost, *, by_time: bool
+def _fill_budget(
+    chosen: Sequence[int], options: Sequence[RecordOption], budget: Budget, cost: Cost, *, by_time: bool
 ) -> list[int]:
-    """The choice with what tells most, for its time or at all, added until nothing more fits."""
-    found = list(chosen)
+    """Add the record that tells most, for its time or at all, until nothing more fits."""
+    filled = list(chosen)
     while True:
-        now, spent, best, gain = cost(found), seconds_of(options, found, budget), -1, 0.0
+        now, spent, best, gain = cost(filled), compute_duration_s(options, filled, budget), -1, 0.0
         for i in range(len(options)):
-            seconds = seconds_of(options, [*found, i], budget)
-            if i in found or seconds > budget.seconds:
+            seconds = compute_duration_s(options, [*filled, i], budget)
+            if i in filled or seconds > budget.seconds:
                 continue
-            told = (now - cost([*found, i])) / (seconds - spent if by_time else 1.0)
-            if told > gain:
-                best, gain = i, told
+            gain_rate = (now - cost([*filled, i])) / (seconds - spent if by_time else 1.0)
+            if gain_rate > gain:
+                best, gain = i, gain_rate
         if best < 0:
-            return found
-        found.append(best)
+            return filled
+        filled.append(best)
 
 
-def _exchanged(start: Sequence[int], options: Sequence[Option], budget: Budget, cost: Cost) -> list[int]:
-    """The choice with one record left out and the time filled anew, as long as that is better."""
+def _improve_by_exchange(
+    start: Sequence[int], options: Sequence[RecordOption], budget: Budget, cost: Cost
+) -> list[int]:
+    """Leave one record out and fill the time again, as long as that is better."""
     found, least = list(start), cost(start)
     while True:
         trials = []
         for out in found:
             rest = [i for i in found if i != out]
             without = options[out]
-            others = [option if option is not without else _nothing(option) for option in options]
-            trials += [_filled(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
+            others = [option if option is not without else _exclude_option(option) for option in options]
+            trials += [_fill_budget(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
         best = min(trials, key=cost, default=found)
         now = cost(best)
         if not now < least - 1e-9 * abs(least):
@@ -258,6 +270,6 @@ def _exchanged(start: Sequence[int], options: Sequence[Option], budget: Budget, 
         found, least = best, now
 
 
-def _nothing(option: Option) -> Option:
-    """A record that takes longer than any session: it is not chosen again."""
+def _exclude_option(option: RecordOption) -> RecordOption:
+    """Return a record that takes longer than any session, so that it is not chosen again."""
     return replace(option, seconds=float("inf"))

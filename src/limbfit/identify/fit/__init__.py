@@ -1,1 +1,1 @@
-"""The search: parameters, residuals, least squares, stages, several starts, two meshes."""
+"""The search: parameters, residuals, least squares in stages, several starts, corrections by fine meshes."""

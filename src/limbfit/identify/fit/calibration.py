@@ -1,8 +1,8 @@
-"""The identification: stages of bounded least squares on a simulation that is handed in.
+"""The calibration: stages of bounded least squares on a simulation that is handed in.
 
 ``calibrate`` knows no study, no mesh and no solver. It calls ``simulate(parameters)``, which returns force
-and derivatives per site, and it can be stopped after any accepted iterate and taken up again from its
-``state`` with the same answer.
+and derivatives of every site. It can be stopped after any accepted iterate, and continues from its ``state``
+with the same answer.
 """
 
 from __future__ import annotations
@@ -14,27 +14,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError, ProblemError
-from .objective import Measured, Simulate, SiteResponse, check_responses, new_doubts, residuals
-from .parameters import Grouping, Space, Unknowns, search_space, two_stages
-from .prediction import error_percent
+from .objective import (
+    MeasuredCurve,
+    Simulate,
+    SiteResponse,
+    check_responses,
+    compute_residuals,
+    find_new_warnings,
+)
+from .parameters import Grouping, SearchSpace, Unknowns, build_search_space, stage_groupings
+from .prediction import compute_error_percent
 from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
-from .trust_region import FIRST_RADIUS, Point, SearchStep, minimise
+from .trust_region import FIRST_RADIUS, SearchPoint, SearchStep, minimise
 
 Array = NDArray[np.float64]
 
 # Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
-_RESTARTS = (0.0, 0.0, 0.1, 0.25, 0.5)
-_RATIOS = (1.0, 0.5, 0.0)  # of the tissues' own starts, put on the start of the next stage until it completes
+_START_SHIFTS = (0.0, 0.0, 0.1, 0.25, 0.5)
+_RATIO_SHARES = (
+    1.0,
+    0.5,
+    0.0,
+)  # of the tissues' own starts, put on the start of the next stage until it completes
 _PAPER_CHANGE = 0.01
-_PATIENCE = 4  # steps
-_TRIES = 3  # of a simulation that completed before
-EITHER = ("slipped", "folded")
-_FOLDS = 3  # trials of a stage that fold anew are refused; more are taken for what they are
+_VALLEY_STEPS = 4  # steps
+_MAX_TRIES = 3  # of a simulation that completed before
+START_WARNINGS = ("slipped", "folded")
+_MAX_FOLD_REFUSALS = 3  # trials of a stage that fold anew are refused; more are taken for what they are
 
 
 def calibrate(
     simulate: Simulate,
-    measured: Sequence[Measured],
+    measured: Sequence[MeasuredCurve],
     unknowns: Unknowns,
     settings: CalibrationSettings | None = None,
     *,
@@ -46,61 +57,61 @@ def calibrate(
 
     Parameters
     ----------
-    simulate : from full parameters (p,) to one response per site, in the order of ``measured``. A response
-    that
-        is not completed, or not finite, makes the trial step fail: a shorter one is tried. So does one that
-        slipped where it did not before the step, and the first three of a stage that fold anew.
-    measured : the records, at the times at which ``simulate`` gives the force.
+    simulate : takes full parameters (p,) and returns one response per site, in the order of ``measured``. If
+        a response is not completed or not finite, the trial fails and a shorter step is tried. The same holds
+        if a simulation slipped that did not slip before the step, and for the first three trials of a stage
+        in which elements fold that did not fold before.
+    measured : the measured curves, at the times at which ``simulate`` gives the force.
     unknowns : names, start and bounds of the full parameters.
-    stages : groupings (see ``search_space``), each started from the end of the one before; by default
-    ``two_stages``. Where tissues have starts of their own, which a stage could not tell apart, the next one
-    puts the same ratios on its start.
-    on_iterate : called after every accepted iterate with the state to be kept.
-    state : go on from here; one evaluation at its parameters is repeated and not counted.
+    stages : groupings (see ``build_search_space``), by default ``stage_groupings``. Each stage starts from
+        the end of the one before. If tissues have different starts, which a stage with one material cannot
+        represent, the next stage begins with the same ratios between the tissues.
+    on_iterate : called after every accepted iterate with the state from which the search can continue.
+    state : continue from here. One evaluation at its parameters is repeated and not counted.
 
     Raises
     ------
     CalibrationError
-        Where no first simulation completes.
+        If no first simulation completes.
     ProblemError
-        For priors beside the paper's objective.
+        If priors are given together with the paper's objective.
     """
-    groupings = tuple(stages) or two_stages(unknowns.names)
+    groupings = tuple(stages) or stage_groupings(unknowns.names)
     if unknowns.priors and settings is not None and settings.objective == "paper":
         raise ProblemError("the paper's objective has no place for priors", remedy="use pointwise")
-    run = _Run(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)
-    for current in run.states(state):
+    run = _Search(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)
+    for current in run.iterate_states(state):
         if on_iterate:
             on_iterate(current)
-    return run.result(current)
+    return run.build_result(current)
 
 
-def iterate_at(
+def evaluate_state(
     simulate: Simulate,
-    measured: Sequence[Measured],
+    measured: Sequence[MeasuredCurve],
     unknowns: Unknowns,
     settings: CalibrationSettings,
     groupings: Sequence[Grouping],
     state: SearchState,
 ) -> Iterate:
-    """The iterate that a state stands at as ``simulate`` sees it now; it is not counted as an evaluation.
+    """Return the iterate at a state, simulated by ``simulate`` and not counted as an evaluation.
 
     Raises
     ------
     CalibrationError
-        Where it cannot be simulated.
+        If it cannot be simulated.
     """
-    run = _Run(simulate, tuple(measured), unknowns, settings, tuple(groupings))
-    return run.iterate(state.stage, run.again(state))
+    run = _Search(simulate, tuple(measured), unknowns, settings, tuple(groupings))
+    return run.build_iterate(state.stage, run.restore(state))
 
 
-class _Run:
-    """One calibration under way: counts evaluations and keeps the responses of the last accepted point."""
+class _Search:
+    """A calibration in progress: counts evaluations and keeps the responses of the last accepted point."""
 
     def __init__(
         self,
         simulate: Simulate,
-        measured: tuple[Measured, ...],
+        measured: tuple[MeasuredCurve, ...],
         unknowns: Unknowns,
         settings: CalibrationSettings,
         stages: tuple[Grouping, ...],
@@ -109,72 +120,75 @@ class _Run:
         self.settings, self.stages = settings, stages
         self.evaluations = self.failures = 0
         self.failure = ""  # why the last one failed
-        self.folds = 0  # trials of this stage that were refused for what folds in them
-        self._here: tuple[SiteResponse, ...] = ()  # at the last accepted point
-        self._responses: dict[bytes, tuple[SiteResponse, ...]] = {}
+        self.fold_refusals = 0  # trials of this stage that were refused for what folds in them
+        self._accepted: tuple[SiteResponse, ...] = ()  # at the last accepted point
+        self._stored: dict[bytes, tuple[SiteResponse, ...]] = {}
 
-    def space(self, stage: int) -> Space:
-        return search_space(self.unknowns, self.stages[stage])
+    def build_space(self, stage: int) -> SearchSpace:
+        return build_search_space(self.unknowns, self.stages[stage])
 
-    def evaluate(self, space: Space, z: Array, bear: tuple[str, ...] = ()) -> Point | None:
-        """The point at z, simulated unless its responses are at hand; None where a simulation failed.
+    def evaluate(self, space: SearchSpace, z: Array, tolerated: tuple[str, ...] = ()) -> SearchPoint | None:
+        """Return the point at z, simulated unless its responses are stored; None if a simulation failed.
 
-        ``bear``: kinds of doubt that are no failure.
+        ``tolerated`` are the kinds of warnings that do not count as a failure.
         """
         parameters = space.expand(z)
-        responses = self._responses.get(parameters.tobytes())
+        responses = self._stored.get(parameters.tobytes())
         if responses is None:
             self.evaluations += 1
             responses = tuple(self.simulate(parameters))
             self.failure = check_responses(responses, self.measured, len(parameters))
             if not self.failure:
-                self.failure = self._doubt(responses, bear)
+                self.failure = self._find_refusal(responses, tolerated)
             if self.failure:
                 self.failures += 1
                 return None
-            self._responses[parameters.tobytes()] = responses
-        residual, jacobian = residuals(self.settings.objective, responses, self.measured)
-        rows, target = self.unknowns.prior_rows()
+            self._stored[parameters.tobytes()] = responses
+        residual, jacobian = compute_residuals(self.settings.objective, responses, self.measured)
+        rows, target = self.unknowns.build_prior_rows()
         scale = self.settings.force_error_percent / 100
-        known = scale * (rows @ space.logarithms(z) - target)
+        known = scale * (rows @ space.to_logarithms(z) - target)
         jacobian = np.concatenate([space.pull_back(jacobian, parameters), scale * rows @ space.tie])
-        return Point(z, np.concatenate([residual, known]), jacobian)
+        return SearchPoint(z, np.concatenate([residual, known]), jacobian)
 
-    def _doubt(self, responses: tuple[SiteResponse, ...], bear: tuple[str, ...]) -> str:
-        """Why a trial counts as failed though it completed, or empty.
+    def _find_refusal(self, responses: tuple[SiteResponse, ...], tolerated: tuple[str, ...]) -> str:
+        """Return why a completed trial counts as failed, or an empty text.
 
-        A slip is the force of another equilibrium.  Folds come by and by: long steps into them are refused,
-        but no optimum is given up for them, nor does the search zigzag along their border.
+        A simulation that slipped gives the force of another equilibrium. Elements fold gradually: long steps
+        into folding are refused, but no optimum is given up for it, and the search must not zigzag along its
+        border.
         """
-        slipped, folded = new_doubts(responses, self._here, self.measured)
-        if slipped and "slipped" not in bear:
+        slipped, folded = find_new_warnings(responses, self._accepted, self.measured)
+        if slipped and "slipped" not in tolerated:
             return slipped
-        if not folded or "folded" in bear or self.folds >= _FOLDS:
+        if not folded or "folded" in tolerated or self.fold_refusals >= _MAX_FOLD_REFUSALS:
             return ""
-        self.folds += 1
+        self.fold_refusals += 1
         return folded
 
-    def responses(self, parameters: Array) -> tuple[SiteResponse, ...]:
-        return self._responses[parameters.tobytes()]
+    def responses_at(self, parameters: Array) -> tuple[SiteResponse, ...]:
+        return self._stored[parameters.tobytes()]
 
     def accept(self, parameters: Array) -> None:
-        """Keep the responses of an accepted point alone; what is doubtful there may be so after it."""
-        self._here = self.responses(parameters)
-        self._responses = {parameters.tobytes(): self._here}
+        """Keep only the responses of an accepted point; its warnings are no longer new."""
+        self._accepted = self.responses_at(parameters)
+        self._stored = {parameters.tobytes(): self._accepted}
 
-    def first(self) -> tuple[SearchState, Point]:
-        """The start, or a place between it and the middle of the bounds where all simulations complete.
+    def find_start(self) -> tuple[SearchState, SearchPoint]:
+        """Find a first point at which all simulations complete, at the start or towards the middle of the
+        bounds.
 
-        One where none slips is preferred; folded elements may be the mesh's doing, and are told.
+        A point at which nothing slips is preferred. Folded elements may come from the mesh and are only
+        reported.
         """
-        space = self.space(0)
+        space = self.build_space(0)
         start, middle = space.reduce(np.log(self.unknowns.start)), (space.lower + space.upper) / 2
-        found: Point | None = None
-        for share in _RESTARTS:
-            point = self.evaluate(space, start + share * (middle - start), EITHER)
+        found: SearchPoint | None = None
+        for share in _START_SHIFTS:
+            point = self.evaluate(space, start + share * (middle - start), START_WARNINGS)
             if point is None:
                 continue
-            if not any(one.slipped for one in self.responses(space.expand(point.z))):
+            if not any(one.slipped for one in self.responses_at(space.expand(point.z))):
                 found = point
                 break
             found = found or point
@@ -182,46 +196,46 @@ class _Run:
             raise CalibrationError(f"no simulation completes near the start parameters: {self.failure}")
         self.accept(space.expand(found.z))
         state = SearchState(0, tuple(found.z.tolist()), FIRST_RADIUS, self.evaluations)
-        return replace(state, history=(self.iterate(0, found),)), found
+        return replace(state, history=(self.build_iterate(0, found),)), found
 
-    def iterate(self, stage: int, point: Point) -> Iterate:
-        parameters = self.space(stage).expand(point.z)
+    def build_iterate(self, stage: int, point: SearchPoint) -> Iterate:
+        parameters = self.build_space(stage).expand(point.z)
         errors = tuple(
-            error_percent(response.force_N, site.force_N)
-            for response, site in zip(self.responses(parameters), self.measured)
+            compute_error_percent(response.force_N, site.force_N)
+            for response, site in zip(self.responses_at(parameters), self.measured)
         )
         return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations, self.failures)
 
-    def states(self, state: SearchState | None) -> Iterator[SearchState]:
-        """The first or resumed state, then one for every accepted step, finished stage and new stage."""
-        state, point = self.first() if state is None else (state, self.again(state))
+    def iterate_states(self, state: SearchState | None) -> Iterator[SearchState]:
+        """Yield the first or continued state, then one after every accepted step and at each new stage."""
+        state, point = self.find_start() if state is None else (state, self.restore(state))
         yield state
         while True:
-            space = self.space(state.stage)
+            space = self.build_space(state.stage)
             steps = () if len(state.stages) > state.stage else self._steps(space, point, state)
             for step in steps:
                 point = step.point
                 self.accept(space.expand(point.z))
-                state = self._after(state, step)
+                state = self._advance(state, step)
                 yield state
             if len(state.stages) == len(self.stages):
                 return
-            state, point = self._next_stage(state, space.logarithms(point.z))
+            state, point = self._begin_stage(state, space.to_logarithms(point.z))
             yield state
 
-    def again(self, state: SearchState) -> Point:
-        """The point at which a run was interrupted; its evaluation was counted then."""
-        space = self.space(state.stage)
-        for _ in range(_TRIES):
-            point = self.evaluate(space, np.array(state.z), EITHER)
+    def restore(self, state: SearchState) -> SearchPoint:
+        """Evaluate the point at which a run was interrupted; this evaluation was counted before."""
+        space = self.build_space(state.stage)
+        for _ in range(_MAX_TRIES):
+            point = self.evaluate(space, np.array(state.z), START_WARNINGS)
             self.evaluations, self.failures = state.evaluations, state.history[-1].failures
             if point is not None:
                 self.accept(space.expand(point.z))
-                self.folds = state.folds
+                self.fold_refusals = state.folds
                 return point
         raise CalibrationError(f"the simulation of the stored iterate fails now: {self.failure}")
 
-    def _steps(self, space: Space, point: Point, state: SearchState) -> Iterator[SearchStep]:
+    def _steps(self, space: SearchSpace, point: SearchPoint, state: SearchState) -> Iterator[SearchStep]:
         done = sum(1 for iterate in state.history if iterate.stage == state.stage) - 1
         paper = self.settings.stopping == "paper"
         pointwise = self.settings.objective == "pointwise" and not paper
@@ -235,86 +249,93 @@ class _Run:
             change=0.25 * self.settings.relative_tolerance * norm if pointwise else 0.0,
             radius=state.radius,
             max_iterations=max(self.settings.max_iterations - done, 1),
-            stop=self._paper_rule(space) if paper else self._valley_rule(state),
+            stop=self._make_paper_rule(space) if paper else self._make_valley_rule(state),
         )
 
-    def _after(self, state: SearchState, step: SearchStep) -> SearchState:
-        """The state after an accepted step, the stage closed where it was the last."""
+    def _advance(self, state: SearchState, step: SearchStep) -> SearchState:
+        """Return the state after an accepted step, which closes the stage if it was its last."""
         history = state.history
         if tuple(step.point.z.tolist()) != state.z:
-            history = (*history, self.iterate(state.stage, step.point))
+            history = (*history, self.build_iterate(state.stage, step.point))
         stages = state.stages
         if step.reason:
-            mine = [iterate for iterate in history if iterate.stage == state.stage]
+            iterates = [iterate for iterate in history if iterate.stage == state.stage]
             counted = self.evaluations - sum(stage.evaluations for stage in stages)
-            stages = (*stages, self._stage_result(state.stage, mine, counted, step))
+            stages = (*stages, self._build_stage_result(state.stage, iterates, counted, step))
         return SearchState(
             state.stage, tuple(step.point.z.tolist()), step.radius, self.evaluations, history, stages,
-            self.folds,
+            self.fold_refusals,
         )  # fmt: skip
 
-    def _stage_result(self, stage: int, mine: list[Iterate], counted: int, step: SearchStep) -> StageResult:
-        last = mine[-1]
+    def _build_stage_result(
+        self, stage: int, iterates: list[Iterate], counted: int, step: SearchStep
+    ) -> StageResult:
+        last = iterates[-1]
         reason = step.reason if step.converged or not self.failure else f"{step.reason} ({self.failure})"
         return StageResult(
-            self.stages[stage], last.parameters, last.cost, len(mine) - 1, counted, step.converged, reason
+            self.stages[stage], last.parameters, last.cost, len(iterates) - 1, counted, step.converged, reason
         )
 
-    def _next_stage(self, state: SearchState, logarithms: Array) -> tuple[SearchState, Point]:
-        """The same parameters in the next space, in the ratios of the tissues' own starts.
+    def _begin_stage(self, state: SearchState, logarithms: Array) -> tuple[SearchState, SearchPoint]:
+        """Take the same parameters into the next stage, with the ratios of the tissues' own starts.
 
-        Where all tissues start alike, nothing is simulated unless the bounds forbid the parameters.
+        If all tissues start alike, nothing is simulated unless the bounds exclude the parameters.
         """
         stage = state.stage + 1
-        before, space = self.space(state.stage), self.space(stage)
+        before, space = self.build_space(state.stage), self.build_space(stage)
         start = np.log(self.unknowns.start)
-        own = start - before.logarithms(before.reduce(start))
+        own = start - before.to_logarithms(before.reduce(start))
         own[np.abs(own) < 1e-12] = 0.0  # rounding of the mean must not cost a simulation
-        for share in _RATIOS if own.any() else (0.0,):
+        for share in _RATIO_SHARES if own.any() else (0.0,):
             z = space.reduce(logarithms + share * own)
-            point = self.evaluate(space, z, ("folded",) if share else EITHER)
+            point = self.evaluate(space, z, ("folded",) if share else START_WARNINGS)
             if point is not None:
                 self.accept(space.expand(z))
                 break
         else:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
-        self.folds = 0
-        history = (*state.history, self.iterate(stage, point))
+        self.fold_refusals = 0
+        history = (*state.history, self.build_iterate(stage, point))
         return SearchState(
             stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages
         ), point
 
-    def _valley_rule(self, state: SearchState) -> Callable[[Point, Point], str]:
-        """Ends a creep along a valley in which the data cannot tell one place from another."""
-        mine = [iterate for iterate in state.history if iterate.stage == state.stage]
-        track = [(iterate.cost, iterate.failures) for iterate in mine]
-        least = 1 - _PATIENCE * self.settings.relative_tolerance
+    def _make_valley_rule(self, state: SearchState) -> Callable[[SearchPoint, SearchPoint], str]:
+        """Build the rule that ends slow progress along a valley that the data leave open."""
+        iterates = [iterate for iterate in state.history if iterate.stage == state.stage]
+        track = [(iterate.cost, iterate.failures) for iterate in iterates]
+        least = 1 - _VALLEY_STEPS * self.settings.relative_tolerance
 
-        def stop(before: Point, after: Point) -> str:
+        def stop(before: SearchPoint, after: SearchPoint) -> str:
             track.append((after.cost, self.failures))
-            (cost, failures), (now, failed) = track[-1 - _PATIENCE :][0], track[-1]
+            (cost, failures), (now, failed) = track[-1 - _VALLEY_STEPS :][0], track[-1]
             # Small steps after failures tell of the failures, not of the data.
-            if len(track) > _PATIENCE and now > least * cost and failed == failures:
-                return f"{_PATIENCE} steps hardly lowered the error: the data do not separate the parameters"
+            if len(track) > _VALLEY_STEPS and now > least * cost and failed == failures:
+                return (
+                    f"{_VALLEY_STEPS} steps hardly lowered the error: the data do not separate the parameters"
+                )
             return ""
 
         return stop
 
-    def _paper_rule(self, space: Space) -> Callable[[Point, Point], str]:
-        def stop(before: Point, after: Point) -> str:
+    def _make_paper_rule(self, space: SearchSpace) -> Callable[[SearchPoint, SearchPoint], str]:
+        def stop(before: SearchPoint, after: SearchPoint) -> str:
             if np.abs(space.expand(after.z) - space.expand(before.z)).max() < _PAPER_CHANGE:
                 return "no parameter changed by more than 0.01"
-            if np.abs(self._equation_8(space, after) - self._equation_8(space, before)).max() < _PAPER_CHANGE:
+            if (
+                np.abs(self._compute_equation_8(space, after) - self._compute_equation_8(space, before)).max()
+                < _PAPER_CHANGE
+            ):
                 return "no entry of the objective changed by more than 0.01"
             return ""
 
         return stop
 
-    def _equation_8(self, space: Space, point: Point) -> Array:
-        """The paper's objective (sites,) N^2, whatever the objective that is followed."""
-        return residuals("paper", self.responses(space.expand(point.z)), self.measured)[0]
+    def _compute_equation_8(self, space: SearchSpace, point: SearchPoint) -> Array:
+        """Return the paper's objective (sites,) in N^2, whatever objective the search follows."""
+        return compute_residuals("paper", self.responses_at(space.expand(point.z)), self.measured)[0]
 
-    def result(self, state: SearchState) -> Calibration:
+    def build_result(self, state: SearchState) -> Calibration:
         parameters = np.array(state.history[-1].parameters)
         return Calibration(
             names=self.unknowns.names,
@@ -324,5 +345,46 @@ class _Run:
             history=state.history,
             evaluations=state.evaluations,
             settings=self.settings,
-            responses=self.responses(parameters),
+            responses=self.responses_at(parameters),
         )
+
+
+def move_answer(
+    found: Calibration,
+    parameters: Array,
+    measured: Sequence[MeasuredCurve],
+    responses: Sequence[SiteResponse],
+    unknowns: Unknowns,
+) -> Calibration | str:
+    """Return the calibration with its last stage moved to ``parameters`` (p,), whose ``responses`` are given.
+
+    If a simulation failed there, the reason is returned instead.
+    """
+    if failure := check_responses(responses, measured, len(parameters)):
+        return failure
+    left, _ = compute_residuals(found.settings.objective, responses, measured)
+    rows, target = unknowns.build_prior_rows()
+    known = found.settings.force_error_percent / 100 * (rows @ np.log(parameters) - target)
+    cost, before, last = 0.5 * float(left @ left + known @ known), found.history[-1], found.stages[-1]
+    errors = tuple(
+        compute_error_percent(one.force_N, site.force_N)
+        for one, site in zip(responses, measured, strict=True)
+    )
+    end = tuple(map(float, parameters))
+    iterate = Iterate(before.stage, end, cost, errors, before.evaluations + 1, before.failures)
+    stage = replace(
+        last,
+        parameters=end,
+        cost=cost,
+        iterations=last.iterations + 1,
+        evaluations=last.evaluations + 1,
+        reason=f"{last.reason}; then moved from the least squares to what is most probable",
+    )
+    return replace(
+        found,
+        parameters=np.array(end),
+        stages=(*found.stages[:-1], stage),
+        history=(*found.history, iterate),
+        evaluations=found.evaluations + 1,
+        responses=tuple(responses),
+    )

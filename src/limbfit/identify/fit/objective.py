@@ -1,9 +1,10 @@
-"""What is compared: forces simulated and measured, as a vector of residuals and its derivatives.
+"""The objective: simulated minus measured forces as a vector of residuals, with its derivatives.
 
-Two objectives. ``pointwise`` takes every force difference, over the site's largest measured force and the
-root of its number of points, so that each site counts alike whatever its stiffness or sampling; what a
-doubtful touch-down does to a record counts for less (generalised least squares on that one shape). ``paper``
-takes equation 8 as printed, one mean squared difference per site, which least squares then squares again.
+There are two objectives. ``pointwise`` takes every difference of force, divided by the site's largest
+measured force and by the root of the number of points, so that all sites count alike whatever their stiffness
+or sampling. A deviation that an uncertain touch-down explains counts less (generalised least squares on that
+one shape). ``paper`` is equation 8 as printed: one mean squared difference per site, which least squares then
+squares again.
 """
 
 from __future__ import annotations
@@ -20,23 +21,24 @@ from ...errors import CalibrationError, TraceError
 Array = NDArray[np.float64]
 Objective = Literal["pointwise", "paper"]
 
-_EXACT = 1e-4  # of the largest force: where all residuals vanish, equation 8 squared has no curvature
+_MIN_ERROR_SHARE = (
+    1e-4  # of the largest force: where all residuals vanish, equation 8 squared has no curvature
+)
 
 
-def largest(values: Array) -> float:
-    """The largest of values (n,) without its sign."""
+def largest_magnitude(values: Array) -> float:
+    """Return the largest absolute value of values (n,)."""
     return float(np.abs(values).max())
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A record at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost.
+class MeasuredCurve:
+    """A measured curve at the times of its simulation: ``force_N`` (n,); ``weight`` scales its cost.
 
-    ``site`` is where it is from, the same for all records of a site; by default its own. Under a stated
-    force the depth is compared: ``force_N`` is that, and ``unit`` mm; so are lengths that are seen beside the
-    force, of either sign. ``doubt_N`` (n,) is one standard
-    deviation of what its touch-down may have done to it, beside which it may be off by ``error_share`` of its
-    largest force throughout.
+    All curves of one place have the same ``site``; by default a curve is a site of its own. Where a force
+    drives the indenter, or where lengths are seen beside the force, ``force_N`` holds lengths and ``unit`` is
+    mm. ``touch_down_sd_N`` (n,) is the effect of one standard deviation of the touch-down. Beside it the
+    model may be off everywhere by ``error_share`` of the largest force.
     """
 
     name: str
@@ -44,7 +46,7 @@ class Measured:
     weight: float = 1.0
     site: str = ""
     unit: str = "N"
-    doubt_N: Array | None = None
+    touch_down_sd_N: Array | None = None
     error_share: float = 0.01
 
     def __post_init__(self) -> None:
@@ -53,49 +55,50 @@ class Measured:
 
     @property
     def peak_N(self) -> float:
-        """The largest force, or whatever is compared, without its sign."""
-        return largest(self.force_N) if self.unit == "mm" else float(self.force_N.max())
+        """The largest force; the largest magnitude where lengths are compared."""
+        return largest_magnitude(self.force_N) if self.unit == "mm" else float(self.force_N.max())
 
     @property
-    def where(self) -> str:
-        """What records of one site have in common."""
+    def site_name(self) -> str:
+        """The name that all curves of one site share."""
         return self.site or self.name
 
     @property
     def scale(self) -> float:
-        """1 / (largest force x sqrt(n)), times the root of the weight."""
+        """One over (largest force x sqrt(n)), times the root of the weight."""
         return float(np.sqrt(self.weight / self.force_N.size) / self.peak_N)
 
-    def discounted(self, rows: Array, power: float = 0.5) -> Array:
-        """Rows (n, ...) times a power of the inverse covariance that the touch-down's doubt alone gives."""
-        if self.doubt_N is None or not (size := float(np.linalg.norm(self.doubt_N))):
+    def discount_touch_down(self, rows: Array, power: float = 0.5) -> Array:
+        """Multiply rows (n, ...) by a power of the inverse covariance of the touch-down alone."""
+        if self.touch_down_sd_N is None or not (size := float(np.linalg.norm(self.touch_down_sd_N))):
             return rows
-        shape = self.doubt_N / size
+        shape = self.touch_down_sd_N / size
         variance = 1.0 + (size / self.peak_N / self.error_share) ** 2 / self.force_N.size
         return np.asarray(rows - np.multiply.outer(shape, (1.0 - variance**-power) * (shape @ rows)))
 
-    def curvature(self, objective: Objective, difference_N: Array) -> Array:
-        """Second derivative (n, n) of its cost with respect to the simulated force (n,).
+    def compute_cost_curvature(self, objective: Objective, difference_N: Array) -> Array:
+        """Return the second derivative (n, n) of the cost with respect to the simulated force (n,).
 
-        ``difference_N`` (n,) is that force less the measured one. Half the square of the residuals is the
-        cost. With derivatives J of the force, its gradient changes by ``-J' W`` times a change of the record
-        and, but for the force's own second derivatives, by ``J' W J`` times a step; W is this matrix.
+        ``difference_N`` (n,) is that force less the measured one. The cost is half the square of the
+        residuals. With W this matrix and J the derivatives of the force, the gradient of the cost changes by
+        ``-J' W`` times a change of the record and, apart from the second derivatives of the force, by ``J' W
+        J`` times a step.
         """
         n = difference_N.size
         if objective == "pointwise":
-            return self.scale**2 * self.discounted(np.eye(n), power=1.0)
-        square = max(float(difference_N @ difference_N), n * (_EXACT * self.peak_N) ** 2)
+            return self.scale**2 * self.discount_touch_down(np.eye(n), power=1.0)
+        square = max(float(difference_N @ difference_N), n * (_MIN_ERROR_SHARE * self.peak_N) ** 2)
         both = square * np.eye(n) + 2 * np.outer(difference_N, difference_N)
         return np.asarray(2 * (self.weight / n) ** 2 * both)
 
 
 @dataclass(frozen=True)
 class SiteResponse:
-    """What a simulation gives: force (n,) N and its derivatives (n, p); ``reason`` where it failed.
+    """The result of a simulation: force (n,) in N and its derivatives (n, p); ``reason`` says why it failed.
 
-    ``site``: its name, where it is known; ``doubts``: what is doubtful about a completed one, among it why it
-    ``slipped`` or ``folded``, or empty.  One that slipped has lost its equilibrium, and its force is that of
-    another one; one with folded elements has lost stiffness by and by.
+    ``site`` is the name of the record where it is known. ``warnings`` are those of a completed simulation.
+    ``slipped`` or ``folded`` repeats the one among them that says why, or is empty: a simulation that slipped
+    lost its equilibrium, and its force belongs to another one; folded elements lose stiffness gradually.
     """
 
     force_N: Array
@@ -103,7 +106,7 @@ class SiteResponse:
     completed: bool = True
     reason: str = ""
     site: str = ""
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     slipped: str = ""
     folded: str = ""
 
@@ -111,13 +114,15 @@ class SiteResponse:
 Simulate = Callable[[Array], Sequence[SiteResponse]]
 
 
-def check_responses(responses: Sequence[SiteResponse], measured: Sequence[Measured], parameters: int) -> str:
-    """Why an evaluation cannot be used, or an empty text.
+def check_responses(
+    responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve], parameters: int
+) -> str:
+    """Return why an evaluation cannot be used, or an empty text.
 
     Raises
     ------
     CalibrationError
-        Where a completed simulation has the wrong shape: a fault of the caller, not of the physics.
+        Where a completed simulation has the wrong shape: an error of the caller, not of the physics.
     """
     if len(responses) != len(measured):
         raise CalibrationError(f"{len(responses)} responses for {len(measured)} sites")
@@ -132,10 +137,13 @@ def check_responses(responses: Sequence[SiteResponse], measured: Sequence[Measur
     return ""
 
 
-def new_doubts(
-    responses: Sequence[SiteResponse], before: Sequence[SiteResponse], measured: Sequence[Measured]
+def find_new_warnings(
+    responses: Sequence[SiteResponse], before: Sequence[SiteResponse], measured: Sequence[MeasuredCurve]
 ) -> tuple[str, str]:
-    """What slipped, and what folded, that did not at the responses ``before`` (none: nowhere); or empty."""
+    """Return the first slip and the first fold that are not in the responses ``before``, or empty texts.
+
+    If ``before`` is empty, every slip and fold is new.
+    """
 
     def first(kind: str) -> str:
         known = [getattr(one, kind) for one in before] or [""] * len(measured)
@@ -146,26 +154,28 @@ def new_doubts(
     return first("slipped"), first("folded")
 
 
-def residuals(
-    objective: Objective, responses: Sequence[SiteResponse], measured: Sequence[Measured]
+def compute_residuals(
+    objective: Objective, responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve]
 ) -> tuple[Array, Array]:
-    """Residual vector (N,) and its derivatives with respect to the full parameters (N, p)."""
-    rows = _pointwise if objective == "pointwise" else _mean_squares
+    """Return the residuals (N,) and their derivatives (N, p) with respect to the full parameters."""
+    rows = _pointwise_residuals if objective == "pointwise" else _mean_square_residuals
     pairs = [rows(response, site) for response, site in zip(responses, measured, strict=True)]
     return np.concatenate([r for r, _ in pairs]), np.concatenate([j for _, j in pairs])
 
 
-def _pointwise(response: SiteResponse, site: Measured) -> tuple[Array, Array]:
+def _pointwise_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
     difference = response.force_N - site.force_N
-    return site.discounted(difference) * site.scale, site.discounted(response.jacobian) * site.scale
+    return site.discount_touch_down(difference) * site.scale, site.discount_touch_down(
+        response.jacobian
+    ) * site.scale
 
 
-def _mean_squares(response: SiteResponse, site: Measured) -> tuple[Array, Array]:
-    """Equation 8's entry R of a site, and its whole second derivative in first derivatives of the force.
+def _mean_square_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
+    """Equation 8's entry R of a site, with rows that complete the second derivative of the objective.
 
-    Least squares takes R's slope g alone, as g g'. There is one entry per site, fewer than parameters, so the
-    rest of the Hessian, R times the second derivative of R, decides where the minimum is; its part
-    ``2 w R J'J / n`` comes as rows whose residual is zero.
+    Least squares would take the slope g of R alone, as g g'. There is only one entry per site, fewer than
+    there are parameters, so the rest of the Hessian, R times the second derivative of R, decides where the
+    minimum is. Its part ``2 w R J'J / n`` is added as rows whose residual is zero.
     """
     difference = response.force_N - site.force_N
     value = site.weight * float(np.mean(difference**2))

@@ -1,7 +1,7 @@
-"""Which parameters move, how they are scaled, and between which bounds.
+"""The parameters of the search: which ones move together, how they are scaled, and their bounds.
 
-The solver of the inverse problem sees ``z``, the logarithms of the groups that move; a simulation sees the
-full vector of positive parameters. Steps in ``z`` are relative changes, so kPa and seconds need no weights.
+A simulation sees the full vector of positive parameters. The search sees ``z``, the logarithms of the groups
+of parameters that move together. A step in ``z`` is a relative change, so kPa and seconds need no weights.
 """
 
 from __future__ import annotations
@@ -18,42 +18,42 @@ Array = NDArray[np.float64]
 Grouping = tuple[int, ...]
 
 FIXED = -1
-_EDGE = 1e-3  # nearer to a bound, in logarithms, is at it
+_BOUND_TOLERANCE_LOG = 1e-3  # nearer to a bound, in logarithms, is at it
 
 
-def shared(names: Sequence[str]) -> Grouping:
-    """One material: parameters ``<tissue>.<name>`` of one name move together, whatever their tissue."""
+def group_by_kind(names: Sequence[str]) -> Grouping:
+    """Group the parameters ``<tissue>.<name>`` of one name, so that all tissues are one material."""
     kinds = [name.rpartition(".")[2] for name in names]
     first = list(dict.fromkeys(kinds))
     return tuple(first.index(kind) for kind in kinds)
 
 
-def separate(names: Sequence[str]) -> Grouping:
-    """Every tissue its own material."""
+def group_separately(names: Sequence[str]) -> Grouping:
+    """Put every parameter in a group of its own, so that every tissue is its own material."""
     return tuple(range(len(names)))
 
 
-def two_stages(names: Sequence[str]) -> tuple[Grouping, ...]:
-    """One material for all tissues, then each its own (paper, section 2.3, figure 5).
+def stage_groupings(names: Sequence[str]) -> tuple[Grouping, ...]:
+    """Return the groupings of the stages: one material, then one per tissue (paper, section 2.3).
 
-    A single tissue has one stage: the second would repeat it.
+    A single tissue has one stage, because the second would repeat the first.
     """
-    first, second = shared(names), separate(names)
+    first, second = group_by_kind(names), group_separately(names)
     return (first,) if first == second else (first, second)
 
 
-def constrained(
+def constrain_grouping(
     grouping: Sequence[int],
     names: Sequence[str],
     fixed: Sequence[str] = (),
     tied: Sequence[Sequence[str]] = (),
 ) -> Grouping:
-    """``grouping`` with the parameters of each set of ``tied`` in one group, and those of ``fixed`` in none.
+    """Return ``grouping`` with each set of ``tied`` parameters in one group and the ``fixed`` ones in none.
 
     Raises
     ------
     ProblemError
-        For an unknown name, a tie of unlike parameters, or one that is fixed too.
+        For an unknown name, for a tie of parameters of different kinds, or for one that is also fixed.
     """
     for name in (*fixed, *(name for group in tied for name in group)):
         if name not in names:
@@ -72,7 +72,10 @@ def constrained(
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a parameter beforehand: lognormal, its logarithm's standard deviation ln(factor)."""
+    """What is known of a parameter before the fit: a lognormal distribution.
+
+    The standard deviation of the logarithm is ``ln(factor)``.
+    """
 
     name: str
     median: float
@@ -88,7 +91,7 @@ class Prior:
 class Unknowns:
     """The full parameter vector: ``names``, ``start``, ``lower`` and ``upper``, each (p,), all positive.
 
-    ``priors`` of some of them count beside the forces.
+    ``priors`` of some of the parameters count in the fit beside the forces.
     """
 
     names: tuple[str, ...]
@@ -107,17 +110,17 @@ class Unknowns:
                 what = f"needs 0 < lower <= start <= upper, has {low:g}, {start:g}, {high:g}"
                 raise ProblemError(what, place=name, remedy="give positive bounds around the start")
 
-    def from_start(self, start: Array) -> Unknowns:
-        """The same, started elsewhere."""
+    def with_start(self, start: Array) -> Unknowns:
+        """Return the same unknowns with another start, which is clipped to the bounds."""
         return replace(self, start=np.clip(start, self.lower, self.upper))
 
-    def at_bound(self, parameters: Array) -> NDArray[np.bool_]:
-        """Which of the parameters (p,) lie at one of their bounds."""
+    def is_at_bound(self, parameters: Array) -> NDArray[np.bool_]:
+        """Return (p,) True for each parameter that lies at one of its bounds."""
         low, high = np.log(parameters / self.lower), np.log(self.upper / parameters)
-        return np.asarray(np.minimum(low, high) < _EDGE)
+        return np.asarray(np.minimum(low, high) < _BOUND_TOLERANCE_LOG)
 
-    def prior_rows(self) -> tuple[Array, Array]:
-        """``(A, b)``: ``A @ log(parameters) - b`` is how many standard deviations off each prior is."""
+    def build_prior_rows(self) -> tuple[Array, Array]:
+        """Return ``(A, b)``: ``A @ log(parameters) - b`` is each prior's deviation in standard deviations."""
         rows = np.zeros((len(self.priors), len(self.names)))
         target = np.zeros(len(self.priors))
         for i, prior in enumerate(self.priors):
@@ -127,40 +130,40 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
-class Space:
-    """The search space of one stage: ``log(parameters) = fixed + tie @ z`` with ``lower <= z <= upper``.
+class SearchSpace:
+    """The search space of one stage: ``log(parameters) = fixed_log + tie @ z`` with ``lower <= z <= upper``.
 
-    ``fixed`` is (p,), ``tie`` (p, k) of zeros and ones, ``lower`` and ``upper`` (k,). ``stated`` (p,) are the
-    values of parameters that do not move, which they keep to the last digit.
+    ``fixed_log`` is (p,), ``tie`` (p, k) of zeros and ones, ``lower`` and ``upper`` (k,). Parameters that do
+    not move keep ``fixed_values`` (p,) to the last digit.
     """
 
-    fixed: Array
+    fixed_log: Array
     tie: Array
     lower: Array
     upper: Array
-    stated: Array
+    fixed_values: Array
 
-    def logarithms(self, z: Array) -> Array:
-        """Logarithms (p,) of the full parameters at z (k,)."""
-        return self.fixed + self.tie @ z
+    def to_logarithms(self, z: Array) -> Array:
+        """Return the logarithms (p,) of the full parameters at z (k,)."""
+        return self.fixed_log + self.tie @ z
 
     def expand(self, z: Array) -> Array:
-        """The full parameters (p,) at z (k,)."""
-        return np.where(self.tie.any(axis=1), np.exp(self.logarithms(z)), self.stated)
+        """Return the full parameters (p,) at z (k,)."""
+        return np.where(self.tie.any(axis=1), np.exp(self.to_logarithms(z)), self.fixed_values)
 
     def reduce(self, logarithms: Array) -> Array:
-        """z (k,) of logarithms (p,): group members are averaged, and clipped to the bounds."""
+        """Return z (k,) for logarithms (p,): the mean of each group's members, clipped to the bounds."""
         return np.clip(self.tie.T @ logarithms / self.tie.sum(axis=0), self.lower, self.upper)
 
     def pull_back(self, jacobian: Array, parameters: Array) -> Array:
-        """Derivatives with respect to z, (n, k), from those with respect to the parameters, (n, p)."""
+        """Return derivatives with respect to z (n, k) from those with respect to the parameters (n, p)."""
         return (jacobian * parameters) @ self.tie
 
 
-def search_space(unknowns: Unknowns, grouping: Sequence[int]) -> Space:
-    """The space of a stage: parameters with equal numbers move together, those with -1 stay at their start.
+def build_search_space(unknowns: Unknowns, grouping: Sequence[int]) -> SearchSpace:
+    """Build the space of a stage, in which parameters of equal group number move together (-1: not at all).
 
-    A group keeps to the bounds of all its members.
+    A group stays within the bounds of all its members.
     """
     if len(grouping) != len(unknowns.names):
         raise ProblemError(f"{len(grouping)} group numbers for {len(unknowns.names)} parameters")
@@ -172,4 +175,4 @@ def search_space(unknowns: Unknowns, grouping: Sequence[int]) -> Space:
     if not groups or np.any(lower >= upper):
         raise ProblemError("no parameter is left to move", remedy="check the groups and their bounds")
     fixed = np.where(members == FIXED, np.log(unknowns.start), 0.0)
-    return Space(fixed, tie, lower, upper, unknowns.start)
+    return SearchSpace(fixed, tie, lower, upper, unknowns.start)

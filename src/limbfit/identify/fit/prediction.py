@@ -1,4 +1,4 @@
-"""How far simulated forces are from measured ones, and how far they may be."""
+"""Errors of simulated forces, and the intervals of predicted ones."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from .objective import SiteResponse, largest
+from .objective import SiteResponse, largest_magnitude
 
 Array = NDArray[np.float64]
 
 
-def error_percent(simulated_N: Array, measured_N: Array) -> float:
-    """Mean absolute error over the trace over the largest measured force, in percent (paper, table 2).
+def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
+    """Return the mean absolute error over the largest measured force, in percent (paper, table 2).
 
-    Of lengths, which may be negative, over the largest without its sign.
+    Measured lengths may be negative; their largest magnitude is taken.
     """
-    return float(100 * np.mean(np.abs(simulated_N - measured_N)) / largest(measured_N))
+    return float(100 * np.mean(np.abs(simulated_N - measured_N)) / largest_magnitude(measured_N))
 
 
 @dataclass(frozen=True)
-class Summary:
+class ErrorSummary:
     """Mean and standard deviation (n - 1) of errors in percent; nan where there are too few sites."""
 
     sites: int
@@ -33,37 +33,39 @@ class Summary:
     largest_percent: float
 
 
-def summarise(errors_percent: Sequence[float]) -> Summary:
-    """Errors of a group of sites in short."""
+def summarise_errors(errors_percent: Sequence[float]) -> ErrorSummary:
+    """Summarise the errors of a group of sites."""
     errors = np.asarray(errors_percent, dtype=float)
     if errors.size == 0:
-        return Summary(0, np.nan, np.nan, np.nan)
+        return ErrorSummary(0, np.nan, np.nan, np.nan)
     sd = float(errors.std(ddof=1)) if errors.size > 1 else np.nan
-    return Summary(errors.size, float(errors.mean()), sd, float(errors.max()))
+    return ErrorSummary(errors.size, float(errors.mean()), sd, float(errors.max()))
 
 
-def prediction_sd(
+def compute_prediction_sd(
     jacobian: Array, parameters: Array, covariance_log: Array, noise_N: Array | float = 0.0
 ) -> Array:
-    """Standard deviation (n,) N of a predicted force, linearised.
+    """Return the standard deviation (n,) in N of a predicted force by linear theory.
 
     Parameters
     ----------
     jacobian : (n, p) derivatives of the force with respect to the parameters.
     covariance_log : (p, p) covariance of the logarithms of the parameters (``Uncertainty.covariance``).
-    noise_N : standard deviation, (n,) or one, of what a new record adds: noise, and the model's misfit.
+    noise_N : standard deviation, (n,) or scalar, of what a new record adds: noise and the misfit of the
+        model.
     """
     scaled = jacobian * parameters
     return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
 
 
 @dataclass(frozen=True)
-class Known:
+class PredictionModel:
     """What a prediction interval needs of a stored uncertainty (``Uncertainty``, ``ResidualModel.to_dict``).
 
-    ``sites`` are noise and misfit of the fitted sites; ``known_scale`` the independent residuals on which the
-    size of the misfit rests; ``site_factor`` how much farther than expected whole sites are off.
-    ``most_probable`` (p,): parameters that are so, which those of the least error need not be.
+    ``sites`` holds noise and misfit of the fitted records, and ``known_scale`` the number of independent
+    residuals from which the size of the misfit is known. ``site_factor`` is the deviation of whole sites over
+    the expected one. ``most_probable`` (p,) are the most probable parameters, which may differ from those of
+    least error.
     """
 
     covariance_log: Array
@@ -74,8 +76,8 @@ class Known:
     site_factor: float = 1.0
 
     @classmethod
-    def of(cls, uncertainty: dict[str, Any]) -> Known:
-        """From the part ``uncertainty`` of ``calibration.json``."""
+    def from_stored(cls, uncertainty: dict[str, Any]) -> PredictionModel:
+        """Build the model from the part ``uncertainty`` of ``calibration.json``."""
         residuals = uncertainty["residuals"]
         return cls(
             np.array(uncertainty["covariance_log"]),
@@ -86,11 +88,11 @@ class Known:
             float(residuals.get("site_factor") or 1.0),
         )
 
-    def residual(self, site: str, unit: str = "N") -> tuple[float, float]:
-        """Noise (N) and misfit (over the largest force) of a site; of a typical one where not fitted.
+    def find_residual_sd(self, site: str, unit: str = "N") -> tuple[float, float]:
+        """Return the noise (N) and the misfit (over the largest force) of a record.
 
-        Where no fitted record compares what this one does (``unit``: forces, or depths in mm), its noise is
-        not known, and none.
+        A record that was not fitted has the median noise of the others of its unit, and the misfit that is
+        expected elsewhere.
         """
         if site in self.sites:
             return self.sites[site]["compared_noise_sd_N"], self.sites[site]["misfit_share"]
@@ -98,7 +100,7 @@ class Known:
         noise = [found["compared_noise_sd_N"] for found in alike]
         return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
-    def interval_95(
+    def compute_interval_95(
         self,
         response: SiteResponse,
         parameters: Array,
@@ -106,17 +108,18 @@ class Known:
         unit: str = "N",
         site_N: Array | float = 0.0,
     ) -> tuple[Array, Array]:
-        """The 95 % interval (n,) N of a new record at a site: parameters, misfit of the model, noise.
+        """Return the 95 % interval of a new record, two arrays (n,) in N.
 
-        Of a ``response`` at the ``parameters`` (p,) and of that at the most probable ones. In mm for a record
-        that compares depths (``unit``). As few residuals as the misfit is known from widen it (Student;
-        Satterthwaite's freedom). ``site_N`` (n,) is one standard deviation of what is expected of the
-        stiffness of a site that was not fitted.
+        It counts the uncertainty of the parameters, misfit and noise. The interval covers ``response``,
+        simulated at the ``parameters`` (p,), and its linearised value at the most probable parameters. It is
+        in mm for a record that compares depths (``unit``). The misfit is known from few residuals only, so
+        the interval takes Student's quantile with Satterthwaite's degrees of freedom. ``site_N`` (n,) is one
+        standard deviation of the stiffness that is expected of a site that was not fitted.
         """
-        noise_N, misfit = self.residual(name, unit)
-        misfit_N = misfit * largest(response.force_N)
+        noise_N, misfit = self.find_residual_sd(name, unit)
+        misfit_N = misfit * largest_magnitude(response.force_N)
         own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
-        sd = prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
+        sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
         freedom = np.clip(self.known_scale / np.maximum(share, 1e-3) ** 2, 3.0, 1e6)
         half, off = stdtrit(freedom, 0.975) * sd, np.log(self.most_probable / parameters)

@@ -1,4 +1,4 @@
-"""How parameters are searched for, the state of the search after every accepted iterate, and its end."""
+"""Settings, state and result of a calibration."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How parameters are found.
+    """Settings of the search.
 
-    ``stopping="paper"`` ends where no parameter or no objective entry changed by more than 0.01, absolute
-    (section 2.3); ``relative_tolerance`` is a relative change of parameters (see ``trust_region.minimise``),
-    and the fall of the squared error per step below which a stage ends after four such steps; a stage also
-    ends where the forces would change by less than a quarter of it, of their largest, in the root mean
-    square.
-    ``max_iterations`` counts accepted steps, per stage.  ``force_error_percent`` sets forces against priors:
-    a prior that is one standard deviation off costs as much as the force of one site that is off by this, in
-    percent of its largest, throughout.
+    Parameters
+    ----------
+    stopping : ``"paper"`` ends where no parameter or no objective entry changed by more than 0.01, absolute
+        (section 2.3).
+    relative_tolerance : a stage ends where no parameter would change by more than this share (see
+        ``trust_region.minimise``), where four steps in a row lowered the squared error by less than this
+        share on average, or where the forces would change by less than a quarter of it, in the root mean
+        square over their largest.
+    max_iterations : limit of accepted steps in each stage.
+    force_error_percent : weighs forces against priors. A prior that is off by one standard deviation costs as
+        much as the force of one site that is off everywhere by this percentage of its largest.
     """
 
     objective: Objective = "pointwise"
@@ -37,9 +40,9 @@ class CalibrationSettings:
 
 @dataclass(frozen=True)
 class Iterate:
-    """An accepted point: full parameters, cost, force error in percent per site.
+    """An accepted point: full parameters, cost, and the force error of each site in percent.
 
-    ``evaluations`` and, among them, ``failures`` are counted from the beginning.
+    ``evaluations`` and the ``failures`` among them are counted from the beginning.
     """
 
     stage: int
@@ -65,11 +68,10 @@ class StageResult:
 
 @dataclass(frozen=True)
 class SearchState:
-    """All that is needed to go on: the current stage, its parameters and trust radius, and what went before.
+    """The state from which a search continues: the current stage, its parameters, trust radius and history.
 
-    ``folds``: trials of the stage that were refused for folded elements.
-
-    ``parameters`` are exact: a run taken up again repeats the interrupted one to the last bit.
+    ``folds`` counts the trials of the stage that were refused because elements folded. The parameters are
+    exact: a continued run repeats the interrupted one to the last bit.
     """
 
     stage: int
@@ -83,10 +85,9 @@ class SearchState:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The answer: ``parameters`` (p,) by ``names``, each stage, every accepted iterate, and the final
-    responses.
+    """The answer: ``parameters`` (p,) by ``names``, the stages, all accepted iterates, the final responses.
 
-    ``responses`` (force and derivatives per site at the answer) are what ``uncertainty`` works on.
+    ``responses`` (force and derivatives per site at the answer) are the input of ``estimate_uncertainty``.
     """
 
     names: tuple[str, ...]

@@ -1,1 +1,1 @@
-"""What the data cannot tell: noise and misfit, intervals, samples, profiles, other sources."""
+"""What the records leave open: noise and misfit, intervals, samples, profiles, comparison of models."""

@@ -1,12 +1,13 @@
-"""What is wrong with the model: a smooth misfit of its own at every site, told apart from noise.
+"""The misfit of the model: a smooth error of its own at every site, separated from noise.
 
-The residuals of a good fit are mostly the model's: they wander along the record instead of scattering. Each
-site gets a Gaussian process of its own (Kennedy and O'Hagan 2001; Matern 3/2), with a standard deviation in
-shares of its largest force and a correlation in shares of the record, common to all sites. Both are found by
-restricted maximum likelihood (Patterson and Thompson 1971), which counts what the parameters have absorbed.
+The residuals of a good fit come mostly from the model: they drift along the record instead of scattering.
+Each site has a Gaussian process of its own (Kennedy and O'Hagan 2001; Matern 3/2). Its standard deviation is
+a share of the largest force, and its correlation length, common to all sites, a share of the record. Both are
+estimated by restricted maximum likelihood (Patterson and Thompson 1971), which counts what the parameters
+have absorbed.
 
-A site as a whole may be off as well: its tissue differs, its surfaces are not where the image shows them.
-That is a random effect of every site on the stiffness of all its tissue, whose size is estimated, too.
+A site as a whole may be off as well, because its tissue differs or its surfaces are not where the image shows
+them. That is a random effect of every site on the stiffness of all its tissue, whose size is estimated, too.
 """
 
 from __future__ import annotations
@@ -24,15 +25,22 @@ from .noise import SiteNoise
 
 Array = NDArray[np.float64]
 
-CORRELATIONS = (0.04, 0.07, 0.12, 0.2, 0.35, 0.6)  # of a record; longer ones cannot be told from an offset
-_LEAST, _MOST = 1e-5, 1.0  # of the largest force
-_FACTOR_SD = np.log(2.0)  # of the log of how far sites are off, over what was expected
-_FACTORS = (0.2, 10.0)
-_ALIKE = 0.5  # sd of log(sd) between sites: a site with a lucky fit is not trusted beyond its fellows
+CORRELATION_LENGTHS = (
+    0.04,
+    0.07,
+    0.12,
+    0.2,
+    0.35,
+    0.6,
+)  # of a record; longer ones cannot be told from an offset
+_MIN_MISFIT, _MAX_MISFIT = 1e-5, 1.0  # of the largest force
+_SITE_FACTOR_SD_LOG = np.log(2.0)  # of the log of how far sites are off, over what was expected
+_SITE_FACTOR_BOUNDS = (0.2, 10.0)
+_MISFIT_SD_LOG = 0.5  # sd of log(sd) between sites: a site with a lucky fit is not trusted beyond its fellows
 
 
-def matern(times_s: Array, correlation: float) -> Array:
-    """Matern 3/2 correlation (n, n); ``correlation`` is its length over the length of the record.
+def compute_matern(times_s: Array, correlation: float) -> Array:
+    """Return the Matern 3/2 correlation (n, n); ``correlation`` is its length over the length of the record.
 
     Times that are all the same are fully correlated.
     """
@@ -43,14 +51,14 @@ def matern(times_s: Array, correlation: float) -> Array:
 
 @dataclass(frozen=True)
 class ResidualModel:
-    """Covariance of the residuals: noise of each record, its misfit of the model, and what records share.
+    """Covariance of the residuals: the noise of each record, the misfit of the model, and what records share.
 
-    ``mesh_N`` (n,) per record is one standard deviation of the mesh's error, none where it was not measured:
-    records of one site (`SiteNoise.where`) have one mesh, whose error is one deviation of them all.
-    ``site_N`` (n,) is the same for the stiffness of a site's tissue, as it was expected to differ, and
-    ``site_factor`` how many times as much it does; none: it is left out.
-    ``misfit`` (records,) is the standard deviation of the misfit over the largest force ``peaks_N``
-    (records,). ``known_scale`` is the number of independent residuals on which the size of the misfit rests.
+    ``mesh_N`` (n,) per record is one standard deviation of the mesh's error; it is empty if it was not
+    measured. Records of one site (`SiteNoise.site_name`) have one mesh, whose error is one deviation of them
+    all. ``site_N`` (n,) is the same for the expected difference of a site's stiffness, and ``site_factor``
+    the estimated difference over the expected one; empty: it is left out. ``misfit`` (records,) is the
+    standard deviation of the misfit over the largest force ``peaks_N`` (records,). ``known_scale`` is the
+    number of independent residuals from which the size of the misfit is known.
     """
 
     noise: tuple[SiteNoise, ...]
@@ -67,20 +75,20 @@ class ResidualModel:
     def misfit_elsewhere(self) -> float:
         """Misfit to expect at a site that was not fitted, over its largest force: root mean square.
 
-        Of records of forces, where there are any: depths may be small, and as much the larger is their share.
+        Only records of forces count if there are any: small depths have a large relative misfit.
         """
         of_force = np.array([noise.unit == "N" for noise in self.noise])
         return float(np.sqrt(np.mean(self.misfit[of_force if of_force.any() else ~of_force] ** 2)))
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like values; forces in N (depths of a record under force in mm), misfits over the largest."""
+        """Return JSON-like values: forces in N (depths under force in mm), misfits over the largest force."""
         return {
             "sites": {
                 noise.name: {
                     "unit": noise.unit,
                     "noise_sd_N": noise.sd_N,
                     "noise_autocorrelation": noise.autocorrelation,
-                    "touch_down_sd_mm": noise.touch_down_mm,
+                    "touch_down_sd_mm": noise.touch_down_sd_mm,
                     "compared_noise_sd_N": float(np.sqrt(np.trace(noise.covariance) / len(noise.times_s))),
                     "misfit_sd_N": float(misfit * peak),
                     "misfit_share": float(misfit),
@@ -97,37 +105,37 @@ class ResidualModel:
         }
 
     def _share(self, sd_N: Sequence[Array], i: int) -> float | None:
-        """Root mean square over the largest force of record i; None where there is nothing."""
+        """Root mean square over the largest force of record i; None if nothing is given."""
         return float(np.sqrt(np.mean(sd_N[i] ** 2)) / self.peaks_N[i]) if sd_N else None
 
     @property
-    def places(self) -> tuple[str, ...]:
+    def sites(self) -> tuple[str, ...]:
         """The sites, each once."""
-        return tuple(dict.fromkeys(noise.where for noise in self.noise))
+        return tuple(dict.fromkeys(noise.site_name for noise in self.noise))
 
     @property
-    def shared(self) -> tuple[Array, ...]:
-        """What records have in common, per record (n, q): one standard deviation of each of q deviations.
+    def shared_deviations(self) -> tuple[Array, ...]:
+        """Per record (n, q): one standard deviation of each of the q deviations that records have in common.
 
-        First those of the meshes, then those of the sites, each as many as there are `places` or none.
+        First come those of the meshes, then those of the sites, each as many as there are `sites`, or none.
         """
         kinds = [(self.mesh_N, 1.0), (self.site_N, self.site_factor)]
         kinds = [(rows, factor) for rows, factor in kinds if rows]
-        found = [np.zeros((len(noise.times_s), len(kinds), len(self.places))) for noise in self.noise]
+        found = [np.zeros((len(noise.times_s), len(kinds), len(self.sites))) for noise in self.noise]
         for k, (rows, factor) in enumerate(kinds):
             for row, noise, columns in zip(rows, self.noise, found, strict=True):
-                columns[:, k, self.places.index(noise.where)] = factor * row
+                columns[:, k, self.sites.index(noise.site_name)] = factor * row
         return tuple(columns.reshape(len(columns), -1) for columns in found)
 
-    def own(self, i: int) -> Array:
+    def own_covariance(self, i: int) -> Array:
         """Covariance (n, n) of what record i shares with no other: its noise and its misfit."""
-        return self.noise[i].covariance + self.discrepancy(i)
+        return self.noise[i].covariance + self.misfit_covariance(i)
 
     def solve(self, rows: Sequence[Array]) -> list[Array]:
-        """The inverse of the covariance of all records times ``rows`` (n, k) of each, record by record."""
-        factors = [cho_factor(self.own(i)) for i in range(len(self.noise))]
+        """Return the inverse covariance of all records times ``rows`` (n, k) of each, record by record."""
+        factors = [cho_factor(self.own_covariance(i)) for i in range(len(self.noise))]
         found = [cho_solve(factor, one) for factor, one in zip(factors, rows, strict=True)]
-        shared = self.shared
+        shared = self.shared_deviations
         if not shared[0].shape[1]:
             return found
         known = [cho_solve(factor, one) for factor, one in zip(factors, shared)]
@@ -135,23 +143,19 @@ class ResidualModel:
         amount = np.linalg.solve(inner, sum(E.T @ one for E, one in zip(shared, found)))
         return [one - K @ amount for one, K in zip(found, known)]
 
-    def discrepancy(self, i: int) -> Array:
+    def misfit_covariance(self, i: int) -> Array:
         """Covariance (n, n) of the misfit of record i."""
         noise = self.noise[i]
-        shape = matern(noise.times_s, self.correlation)
-        shape = shape if noise.alike is None else shape * noise.alike
+        shape = compute_matern(noise.times_s, self.correlation)
+        shape = shape if noise.similarity is None else shape * noise.similarity
         return (self.misfit[i] * self.peaks_N[i]) ** 2 * shape
 
     def covariance(self, i: int) -> Array:
         """Covariance (n, n) of the residuals of record i."""
-        return self.own(i) + self.shared[i] @ self.shared[i].T
-
-    def at(self, times_s: Array, peak_N: float) -> Array:
-        """Covariance (n, n) of the misfit at another site."""
-        return (self.misfit_elsewhere * peak_N) ** 2 * matern(times_s, self.correlation)
+        return self.own_covariance(i) + self.shared_deviations[i] @ self.shared_deviations[i].T
 
     def effective_samples(self) -> float:
-        """How many independent residuals there are: n^2 / ||R||^2 of the correlations R, summed."""
+        """The number of independent residuals: n^2 / ||R||^2 of the correlations R, summed over records."""
         total = 0.0
         for i in range(len(self.noise)):
             C = self.covariance(i)
@@ -159,9 +163,12 @@ class ResidualModel:
             total += len(C) ** 2 / float(np.sum((C / np.outer(sd, sd)) ** 2))
         return total
 
-    def spectra(self) -> tuple[Spectrum, ...]:
-        """Of each record, without what it shares with others."""
-        return tuple(Spectrum.of(noise.covariance, self.discrepancy(i)) for i, noise in enumerate(self.noise))
+    def compute_spectra(self) -> tuple[Spectrum, ...]:
+        """Return the spectrum of each record, without what it shares with others."""
+        return tuple(
+            Spectrum.from_covariances(noise.covariance, self.misfit_covariance(i))
+            for i, noise in enumerate(self.noise)
+        )
 
 
 @dataclass(frozen=True)
@@ -173,7 +180,7 @@ class Spectrum:
     log_determinant: float  # of the noise
 
     @classmethod
-    def of(cls, noise: Array, misfit: Array) -> Spectrum:
+    def from_covariances(cls, noise: Array, misfit: Array) -> Spectrum:
         L = cholesky(noise, lower=True)
         inner = solve_triangular(L, solve_triangular(L, misfit, lower=True).T, lower=True)
         values, vectors = eigh((inner + inner.T) / 2)
@@ -190,30 +197,29 @@ def estimate_discrepancy(
     mesh_N: Sequence[Array] = (),
     site_N: Sequence[Array] = (),
 ) -> ResidualModel:
-    """Size and correlation of the misfit from residuals (n,) and derivatives (n, p) per record.
+    """Estimate size and correlation of the misfit from residuals (n,) and derivatives (n, p) per record.
 
-    Derivatives are with respect to the logarithms of the parameters, ``precision`` (p, p) is what is known of
-    them beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one site have in
-    common, ``site_N`` (n,) what is expected of the site's own stiffness.
-    Misfits are alike, and sites as far off as expected, within a factor of about two unless residuals say
-    otherwise.
+    The derivatives are with respect to the logarithms of the parameters. ``precision`` (p, p) is what is
+    known of these beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one site
+    have in common, and ``site_N`` (n,) what is expected of the site's own stiffness. Misfits are similar, and
+    sites as far off as expected, within a factor of about two unless the residuals say otherwise.
     """
-    best: tuple[float, Array, float, _Rows] | None = None
+    best: tuple[float, Array, float, _RestrictedLikelihood] | None = None
     unit = np.ones(len(noise))
     model = ResidualModel(
         tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0,
         mesh_N=tuple(mesh_N), site_N=tuple(site_N),
     )  # fmt: skip
-    start = np.array([_first_guess(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
-    bounds = [(np.log(_LEAST), np.log(_MOST))] * len(start)
+    start = np.array([_guess_misfit(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
+    bounds = [(np.log(_MIN_MISFIT), np.log(_MAX_MISFIT))] * len(start)
     if site_N:
-        start, bounds = np.append(start, 0.0), [*bounds, tuple(np.log(_FACTORS))]
-    for correlation in CORRELATIONS:
-        rows = _Rows(residuals, jacobians, replace(model, correlation=correlation), precision)
-        found = minimize(rows.criterion, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        if best is None or found.fun < best[0]:
-            best = float(found.fun), found.x, correlation, rows
-        start = found.x
+        start, bounds = np.append(start, 0.0), [*bounds, tuple(np.log(_SITE_FACTOR_BOUNDS))]
+    for correlation in CORRELATION_LENGTHS:
+        rows = _RestrictedLikelihood(residuals, jacobians, replace(model, correlation=correlation), precision)
+        optimum = minimize(rows.criterion, start, jac=True, method="L-BFGS-B", bounds=bounds)
+        if best is None or optimum.fun < best[0]:
+            best = float(optimum.fun), optimum.x, correlation, rows
+        start = optimum.x
     assert best is not None
     value, logs, correlation, rows = best
     return replace(
@@ -226,30 +232,31 @@ def estimate_discrepancy(
     )
 
 
-def _first_guess(residual: Array, noise: SiteNoise, peak: float) -> float:
+def _guess_misfit(residual: Array, noise: SiteNoise, peak: float) -> float:
     excess = max(float(np.mean(residual**2) - np.trace(noise.covariance) / residual.size), 0.0)
-    return float(np.log(np.clip(np.sqrt(excess) / peak, 10 * _LEAST, 0.5)))
+    return float(np.log(np.clip(np.sqrt(excess) / peak, 10 * _MIN_MISFIT, 0.5)))
 
 
-class _Rows:
-    """All records in coordinates in which ``unit``, with misfits of the largest forces, is diagonal.
+class _RestrictedLikelihood:
+    """All records in coordinates in which the misfit of ``unit``, of the size of the largest forces, is
+    diagonal.
 
-    What records share counts as further unknowns, known beforehand to one standard deviation. The logarithms
-    are those of the misfits, and last, where sites may be off as a whole, that of the factor on how far.
+    What records share are further unknowns, known beforehand to one standard deviation. The logarithms are
+    those of the misfits and last, if sites may be off as a whole, that of the site factor.
     """
 
     def __init__(
         self, residuals: Sequence[Array], jacobians: Sequence[Array], unit: ResidualModel, precision: Array
     ) -> None:
-        spectra = unit.spectra()
+        spectra = unit.compute_spectra()
         self.records = len(spectra)
         self.site = np.concatenate([np.full(len(s.values), i) for i, s in enumerate(spectra)])
         self.values = np.concatenate([s.values for s in spectra])
         self.residual = np.concatenate([s.transform @ r for s, r in zip(spectra, residuals)])
-        both = [np.hstack([J, E]) for J, E in zip(jacobians, unit.shared, strict=True)]
+        both = [np.hstack([J, E]) for J, E in zip(jacobians, unit.shared_deviations, strict=True)]
         self.jacobian = np.concatenate([s.transform @ J for s, J in zip(spectra, both)])
-        self.known = block_diag(precision, np.eye(unit.shared[0].shape[1]))
-        self.places = len(unit.places) if unit.site_N else 0  # the last unknowns
+        self.known = block_diag(precision, np.eye(unit.shared_deviations[0].shape[1]))
+        self.places = len(unit.sites) if unit.site_N else 0  # the last unknowns
 
     def variances(self, logs: Array) -> Array:
         return 1.0 + np.exp(2 * logs[: self.records])[self.site] * self.values
@@ -263,7 +270,7 @@ class _Rows:
         return found
 
     def criterion(self, logs: Array) -> tuple[float, Array]:
-        """Minus twice the restricted log-likelihood, with what keeps sites alike; its gradient."""
+        """Return minus twice the restricted log-likelihood with the prior on sites, and its gradient."""
         variances, precision = self.variances(logs), self.precision(logs)
         share = (variances - 1) / variances
         J = self.jacobian / variances[:, None]
@@ -278,19 +285,19 @@ class _Rows:
         value = (
             float(fit.sum() + step @ precision @ step + np.log(variances).sum())
             + float(np.linalg.slogdet(A)[1])
-            + float(from_mean @ from_mean) / _ALIKE**2
+            + float(from_mean @ from_mean) / _MISFIT_SD_LOG**2
         )
         slope = 2 * np.bincount(self.site, share * (1 - fit - leverage), minlength=self.records)
-        slope = slope + 2 * from_mean / _ALIKE**2
+        slope = slope + 2 * from_mean / _MISFIT_SD_LOG**2
         if not self.places:
             return value, slope
         moved = step[-self.places :] ** 2 + np.diag(inverse)[-self.places :]
-        value += 2 * self.places * logs[-1] + (logs[-1] / _FACTOR_SD) ** 2
-        of_sites = 2 * (self.places - np.exp(-2 * logs[-1]) * moved.sum() + logs[-1] / _FACTOR_SD**2)
+        value += 2 * self.places * logs[-1] + (logs[-1] / _SITE_FACTOR_SD_LOG) ** 2
+        of_sites = 2 * (self.places - np.exp(-2 * logs[-1]) * moved.sum() + logs[-1] / _SITE_FACTOR_SD_LOG**2)
         return value, np.append(slope, of_sites)
 
     def known_scale(self, logs: Array) -> float:
-        """Twice the information on the logarithm of the misfit's variance (Satterthwaite's freedom)."""
+        """Twice the information on the log of the misfit's variance (Satterthwaite's degrees of freedom)."""
         variances = self.variances(logs)
         share = (variances - 1) / variances
         half = self.jacobian / np.sqrt(variances)[:, None]
@@ -299,8 +306,3 @@ class _Rows:
         solved = np.linalg.solve(A, inner)
         double = np.linalg.solve(A, half.T @ (share[:, None] ** 2 * half))
         return float(np.sum(share**2) - 2 * np.trace(double) + np.trace(solved @ solved))
-
-
-def scaled(model: ResidualModel, factor: float) -> ResidualModel:
-    """The same model with a misfit that is ``factor`` times as large."""
-    return replace(model, misfit=factor * model.misfit)

@@ -1,11 +1,11 @@
-"""A cheap stand-in for the solver: forces over the logarithms of the parameters, from runs already made.
+"""An emulator: forces over the logarithms of the parameters, from simulations that were already made.
 
 Every simulation brings its exact derivatives, so k runs of p parameters are k (p + 1) observations of each
 point of each curve. A Gaussian process with a polynomial trend interpolates values and derivatives together
 (gradient-enhanced universal kriging: Morris, Mitchell and Ylvisaker 1993). It works on ``asinh(F / s)`` with
-s a share of the site's force: a logarithm that also takes no force, and close to a polynomial. One kernel
-matrix serves all points of all curves; its length is the one that predicts each run best from the others
-(Dubrule 1983).
+s a share of the site's force: a logarithm that also takes a force of zero, and that is close to a polynomial.
+One kernel matrix serves all points of all curves; its length is the one that predicts each run best from the
+others (Dubrule 1983).
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CalibrationError
-from ..fit.objective import SiteResponse, largest
-from ..fit.prediction import error_percent
+from ..fit.objective import SiteResponse, largest_magnitude
+from ..fit.prediction import compute_error_percent
 
 Array = NDArray[np.float64]
 
 _LENGTHS = (1.0, 2.0, 4.0, 8.0)  # of the kernel, in half-widths of the points
 _NUGGETS = (1e-9, 1e-7, 1e-5)  # variance that the solver's own tolerances add, over that of the kernel
 _TRUSTED_CONDITION = 1e6
-_ROUNDING = 1e-9  # of half a width: runs and questions may both lie on a bound
-_STRONGEST = 50.0  # asinh of a force over s: far outside of its runs the trend would pass any number
-_SMALLEST_WIDTH = 0.02  # of the points, in the logarithm
+_ROUNDING_SHARE = 1e-9  # of half a width: runs and questions may both lie on a bound
+_MAX_SOFT_FORCE = 50.0  # asinh of a force over s: far outside of its runs the trend would pass any number
+_MIN_WIDTH = 0.02  # of the points, in the logarithm
 
 
 @dataclass(frozen=True)
 class Emulator:
-    """Forces and derivatives at any parameters; itself a ``Simulate``.
+    """Forces and derivatives at any parameters; calling it simulates (see ``Simulate``).
 
-    ``points`` (k, p) are the parameters of the runs it knows; ``loo_percent`` (k, sites) is the force error
-    at each run when it is left out; ``length`` and ``nugget`` are those of the kernel. It interpolates within
-    ``lower`` and ``upper``, the box of its points; ``error_percent`` says what to expect anywhere.
+    ``points`` (k, p) are the parameters of its runs; ``loo_percent`` (k, sites) is the force error at each
+    run when it is left out; ``length`` and ``nugget`` are those of the kernel. It interpolates within
+    ``lower`` and ``upper``, the box of its points; ``expected_error_percent`` says what to expect anywhere.
     """
 
     names: tuple[str, ...]
@@ -65,36 +65,36 @@ class Emulator:
         *,
         softening: float = 0.3,
     ) -> Emulator:
-        """From k runs: ``points`` (k, p), all positive, and their responses per site.
+        """Fit the emulator to k runs: ``points`` (k, p), all positive, and their responses per site.
 
-        Runs of which a site failed are left out.
+        Runs in which a site failed are left out.
 
         Parameters
         ----------
-        softening : s over the middle of a site's largest forces. Above s the scale is logarithmic, as suits
-            forces that change manifold between the points; far above 1 it is the force itself.
+        softening : s over the median of a site's largest forces. Above s the scale is logarithmic, which
+            suits forces that differ manifold between the points; far above 1 it is the force itself.
 
         Raises
         ------
         CalibrationError
-            Where fewer than two complete runs are left.
+            If fewer than two complete runs are left.
         """
-        whole = [i for i, run in enumerate(responses) if all(r.completed and _finite(r) for r in run)]
+        whole = [i for i, run in enumerate(responses) if all(r.completed and _is_finite(r) for r in run)]
         points = np.atleast_2d(np.asarray(points, dtype=float))[whole]
         if len(points) < 2:
             raise CalibrationError(f"an emulator needs two complete simulations, has {len(points)}")
         runs = [responses[i] for i in whole]
         forces = np.array([np.concatenate([r.force_N for r in run]) for run in runs])
         slopes = np.array([np.concatenate([r.jacobian for r in run]) for run in runs])
-        sites = _slices([r.force_N.size for r in runs[0]])
-        peaks = np.array([[largest(f[s]) for s in sites] for f in forces])
+        sites = _build_slices([r.force_N.size for r in runs[0]])
+        peaks = np.array([[largest_magnitude(f[s]) for s in sites] for f in forces])
         middle = softening * np.maximum(np.median(peaks, axis=0), 1e-9)
         soft = np.concatenate([np.full(s.stop - s.start, v) for s, v in zip(sites, middle)])
-        centre, width = _box(np.log(points))
+        centre, width = _find_box(np.log(points))
         unit = (np.log(points) - centre) / width
         scaled = slopes * (points * width)[:, None, :] / np.hypot(forces, soft)[:, :, None]
         observed = np.hstack([np.arcsinh(forces / soft)[:, None, :], scaled.transpose(0, 2, 1)])
-        chosen = _choose(unit, observed.reshape(-1, forces.shape[1]), forces, soft, sites, peaks)
+        chosen = _choose_kernel(unit, observed.reshape(-1, forces.shape[1]), forces, soft, sites, peaks)
         return cls(
             names=tuple(names),
             points=points,
@@ -116,26 +116,28 @@ class Emulator:
         return self.points.max(axis=0)
 
     def __call__(self, parameters: Array) -> tuple[SiteResponse, ...]:
-        """Force (n,) and derivatives (n, p) of every site at parameters (p,)."""
+        """Return force (n,) and derivatives (n, p) of every site at parameters (p,)."""
         parameters = np.asarray(parameters, dtype=float)
         at = self._to_unit(parameters)
-        rows = np.vstack([_cross(at, self._unit, self.length, self._quadratic, order) for order in (0, 1)])
+        rows = np.vstack(
+            [_build_cross_rows(at, self._unit, self.length, self._quadratic, order) for order in (0, 1)]
+        )
         found = rows @ self._weights
-        found[0] = np.clip(found[0], -_STRONGEST, _STRONGEST)
+        found[0] = np.clip(found[0], -_MAX_SOFT_FORCE, _MAX_SOFT_FORCE)
         force = self._soft * np.sinh(found[0])
         slope = self._soft * np.cosh(found[0])
         jacobian = slope[:, None] * found[1:].T / (parameters * self._width)
         return tuple(SiteResponse(force[s], jacobian[s]) for s in self._sites)
 
-    def forces(self, parameters: Array) -> Array:
-        """Forces (m, N) of all sites, one after the other, at parameters (m, p)."""
+    def predict_forces(self, parameters: Array) -> Array:
+        """Return the forces (m, N) of all sites, one after the other, at parameters (m, p)."""
         at = self._to_unit(np.atleast_2d(parameters))
-        return self._forces_of(_cross(at, self._unit, self.length, self._quadratic, 0))
+        return self._forces_of(_build_cross_rows(at, self._unit, self.length, self._quadratic, 0))
 
-    def forces_and_doubt(self, parameters: Array) -> tuple[Array, Array]:
-        """``forces`` (m, N), and the emulator's own expected error there: one sd (m, sites) in N."""
+    def predict_forces_and_sd(self, parameters: Array) -> tuple[Array, Array]:
+        """Return the forces (m, N), and the emulator's own expected error: one sd (m, sites) in N."""
         at = self._to_unit(np.atleast_2d(parameters))
-        rows = _cross(at, self._unit, self.length, self._quadratic, 0)
+        rows = _build_cross_rows(at, self._unit, self.length, self._quadratic, 0)
         force = self._forces_of(rows)
         variance = np.maximum(1.0 - np.einsum("mi,mi->m", rows @ self._inverse, rows), 0.0)
         spread = self._spread * np.hypot(force, self._soft)
@@ -143,57 +145,61 @@ class Emulator:
         return force, np.sqrt(variance)[:, None] * sd
 
     def _forces_of(self, rows: Array) -> Array:
-        return self._soft * np.sinh(np.clip(rows @ self._weights, -_STRONGEST, _STRONGEST))
+        return self._soft * np.sinh(np.clip(rows @ self._weights, -_MAX_SOFT_FORCE, _MAX_SOFT_FORCE))
 
-    def error_percent(self, parameters: Array) -> Array:
+    def expected_error_percent(self, parameters: Array) -> Array:
         """Expected error of the emulator itself (sites,), in percent of the largest force: one sd."""
-        force, doubt = (found[0] for found in self.forces_and_doubt(np.asarray(parameters)))
-        return np.array([100 * sd / max(largest(force[s]), 1e-12) for sd, s in zip(doubt, self._sites)])
+        force, doubt = (found[0] for found in self.predict_forces_and_sd(np.asarray(parameters)))
+        return np.array(
+            [100 * sd / max(largest_magnitude(force[s]), 1e-12) for sd, s in zip(doubt, self._sites)]
+        )
 
-    def inside(self, parameters: Array, margin: float = 0.1) -> bool:
-        """Whether the parameters (p,) lie in the box of the points, widened by a share of its width."""
-        return bool(np.all(np.abs(self._to_unit(np.asarray(parameters))) <= 1 + 2 * margin + _ROUNDING))
+    def is_inside(self, parameters: Array, margin: float = 0.1) -> bool:
+        """True if the parameters (p,) lie in the box of the points, widened by a share of its width."""
+        return bool(np.all(np.abs(self._to_unit(np.asarray(parameters))) <= 1 + 2 * margin + _ROUNDING_SHARE))
 
-    def check(self, parameters: Array, responses: Sequence[SiteResponse]) -> Array:
-        """Error (sites,) of the emulated force at a simulation that it may not know, in percent."""
+    def compute_errors_percent(self, parameters: Array, responses: Sequence[SiteResponse]) -> Array:
+        """Return the error (sites,) of the emulated force at a simulation of the solver, in percent."""
         found = self(parameters)
-        return np.array([error_percent(ours.force_N, run.force_N) for ours, run in zip(found, responses)])
+        return np.array(
+            [compute_error_percent(ours.force_N, run.force_N) for ours, run in zip(found, responses)]
+        )
 
     def _to_unit(self, parameters: Array) -> Array:
         return (np.log(parameters) - self._centre) / self._width
 
 
-def _finite(response: SiteResponse) -> bool:
+def _is_finite(response: SiteResponse) -> bool:
     return bool(np.isfinite(response.force_N).all() and np.isfinite(response.jacobian).all())
 
 
-def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
+def _build_slices(sizes: Sequence[int]) -> tuple[slice, ...]:
     ends = np.cumsum([0, *sizes])
     return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
 
 
-def _box(logs: Array) -> tuple[Array, Array]:
-    """Middle and half-width of the points."""
+def _find_box(logs: Array) -> tuple[Array, Array]:
+    """Return middle and half-width of the points."""
     low, high = logs.min(axis=0), logs.max(axis=0)
-    return (low + high) / 2, np.maximum((high - low) / 2, _SMALLEST_WIDTH)
+    return (low + high) / 2, np.maximum((high - low) / 2, _MIN_WIDTH)
 
 
-def _choose(
+def _choose_kernel(
     unit: Array, observed: Array, forces: Array, soft: Array, sites: Sequence[slice], peaks: Array
 ) -> dict:
-    """The kernel that predicts each run best from the others, and its weights."""
+    """Choose the kernel that predicts each run best from the others; return it with its weights."""
     k, p = unit.shape
-    quadratic = _determined(_trend(unit, True))
-    border = _trend(unit, quadratic)
+    quadratic = _is_determined(_build_trend(unit, True))
+    border = _build_trend(unit, quadratic)
     best: tuple[float, dict] | None = None
     for length in _LENGTHS:
-        K = _kernel(unit, unit, length)
+        K = _build_kernel(unit, unit, length)
         for nugget in _NUGGETS:
             n, b = len(K), border.shape[1]
             bordered = np.block([[K + nugget * np.eye(n), border], [border.T, np.zeros((b, b))]])
             inverse = np.linalg.pinv(bordered, rcond=1e-14, hermitian=True)
             weights = inverse[:, :n] @ observed
-            left_out = _leave_out(inverse[:n, :n], weights[:n], observed, k, p)
+            left_out = _predict_left_out(inverse[:n, :n], weights[:n], observed, k, p)
             errors = np.abs(soft * np.sinh(left_out) - forces)
             loo = 100 * np.stack([errors[:, s].mean(axis=1) for s in sites], axis=1) / peaks
             score = float(np.median(loo) + 0.1 * np.sqrt(np.mean(np.minimum(loo, 1e3) ** 2)))
@@ -215,8 +221,8 @@ def _choose(
     return best[1]
 
 
-def _leave_out(inverse: Array, weights: Array, observed: Array, k: int, p: int) -> Array:
-    """Predictions (k, outputs) of each run's values from all other runs (Dubrule 1983)."""
+def _predict_left_out(inverse: Array, weights: Array, observed: Array, k: int, p: int) -> Array:
+    """Return predictions (k, outputs) of each run's values from all other runs (Dubrule 1983)."""
     found = []
     for i in range(k):
         block = slice(i * (p + 1), (i + 1) * (p + 1))
@@ -225,48 +231,48 @@ def _leave_out(inverse: Array, weights: Array, observed: Array, k: int, p: int) 
     return np.clip(np.array(found), -20.0, 20.0)
 
 
-def _determined(trend: Array) -> bool:
-    """Whether the observations fix all coefficients of the trend, with some to spare."""
+def _is_determined(trend: Array) -> bool:
+    """True if the observations fix all coefficients of the trend, with some to spare."""
     if trend.shape[0] < 1.2 * trend.shape[1]:
         return False
     values = np.linalg.svd(trend, compute_uv=False)
     return bool(values[0] < _TRUSTED_CONDITION * values[-1])
 
 
-def _monomials(at: Array, quadratic: bool) -> Array:
-    """1, x_i and, where quadratic, x_i x_j at points (m, p): (m, features)."""
+def _evaluate_monomials(at: Array, quadratic: bool) -> Array:
+    """Return 1, x_i and, if quadratic, x_i x_j at points (m, p): (m, features)."""
     columns = [np.ones(len(at)), *at.T]
     if quadratic:
-        columns += [at[:, i] * at[:, j] for i, j in _pairs(at.shape[1])]
+        columns += [at[:, i] * at[:, j] for i, j in _list_pairs(at.shape[1])]
     return np.stack(columns, axis=1)
 
 
-def _monomial_slopes(at: Array, quadratic: bool) -> Array:
-    """Their derivatives, (m, p, features)."""
+def _differentiate_monomials(at: Array, quadratic: bool) -> Array:
+    """Return the derivatives of the monomials, (m, p, features)."""
     m, p = at.shape
     eye = np.eye(p)
     columns = [np.zeros((m, p)), *(np.tile(row, (m, 1)) for row in eye)]
     if quadratic:
-        columns += [at[:, [i]] * eye[j] + at[:, [j]] * eye[i] for i, j in _pairs(p)]
+        columns += [at[:, [i]] * eye[j] + at[:, [j]] * eye[i] for i, j in _list_pairs(p)]
     return np.stack(columns, axis=2)
 
 
-def _pairs(p: int) -> list[tuple[int, int]]:
+def _list_pairs(p: int) -> list[tuple[int, int]]:
     return list(combinations_with_replacement(range(p), 2))
 
 
-def _trend(unit: Array, quadratic: bool) -> Array:
-    """Values and derivatives of the trend at every point, (k (p + 1), features)."""
+def _build_trend(unit: Array, quadratic: bool) -> Array:
+    """Return values and derivatives of the trend at every point, (k (p + 1), features)."""
     both = np.concatenate(
-        [_monomials(unit, quadratic)[:, None, :], _monomial_slopes(unit, quadratic)], axis=1
+        [_evaluate_monomials(unit, quadratic)[:, None, :], _differentiate_monomials(unit, quadratic)], axis=1
     )
     return both.reshape(-1, both.shape[2])
 
 
-def _kernel(a: Array, b: Array, length: float) -> Array:
-    """Squared-exponential covariance of values and derivatives at a (m, p) and b (k, p).
+def _build_kernel(a: Array, b: Array, length: float) -> Array:
+    """Return the squared-exponential covariance of values and derivatives at a (m, p) and b (k, p).
 
-    (m (p + 1), k (p + 1)), each point's value first, then its derivatives.
+    Its shape is (m (p + 1), k (p + 1)); each point's value comes first, then its derivatives.
     """
     m, p = a.shape
     k = len(b)
@@ -281,16 +287,16 @@ def _kernel(a: Array, b: Array, length: float) -> Array:
     return K.reshape(m * (p + 1), k * (p + 1))
 
 
-def _cross(at: Array, unit: Array, length: float, quadratic: bool, order: int) -> Array:
-    """Covariances and trend of new points with all observations.
+def _build_cross_rows(at: Array, unit: Array, length: float, quadratic: bool, order: int) -> Array:
+    """Return covariances and trend of new points with all observations.
 
-    order 0: of the values at ``at`` (m, p), (m, n); order 1: of the derivatives at one point, (p, n).
+    Order 0 is of the values at ``at`` (m, p), (m, n); order 1 of the derivatives at one point, (p, n).
     """
     at = np.atleast_2d(at)
     if order == 1:
-        K = _kernel(at, unit, length)[1:]
-        return np.hstack([K, _monomial_slopes(at, quadratic)[0]])
+        K = _build_kernel(at, unit, length)[1:]
+        return np.hstack([K, _differentiate_monomials(at, quadratic)[0]])
     difference = (at[:, None, :] - unit[None, :, :]) / length**2
     value = np.exp(-0.5 * length**2 * np.sum(difference**2, axis=2))
     K = np.concatenate([value[:, :, None], value[:, :, None] * difference], axis=2)
-    return np.hstack([K.reshape(len(at), -1), _monomials(at, quadratic)])
+    return np.hstack([K.reshape(len(at), -1), _evaluate_monomials(at, quadratic)])

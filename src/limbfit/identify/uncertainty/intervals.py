@@ -1,10 +1,10 @@
-"""Intervals and verdicts from what a calibration simulated anyway: an emulator of it, and a sample on that.
+"""Intervals and verdicts from the simulations of a calibration: an emulator of them, and a sample on that.
 
-The records leave the answer open along a valley that is bent, and the calibration, which weighs all points
-of a record alike, ends somewhere along it: a linearisation there is too sure. The simulations that led there
-know the bend. An emulator through their forces and derivatives stands in for the solver, and a few further
-simulations are made where noise and misfit say that the parameters are most probable. Where the emulator
-knows little its own expected error counts as misfit, so that intervals are wider there.
+The records leave the answer open along a bent valley. The calibration, which weighs all points of a record
+alike, ends somewhere along it, and a linearisation there is too narrow. The simulations of the search know
+the bend. An emulator of their forces and derivatives replaces the solver, and a few further simulations are
+made at the parameters that are most probable by noise and misfit. The expected error of the emulator counts
+as misfit, so intervals are wider where it knows little.
 """
 
 from __future__ import annotations
@@ -15,205 +15,207 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fit.objective import Measured, Simulate, SiteResponse
-from ..fit.parameters import Space, Unknowns
-from ..fit.prediction import error_percent
+from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
+from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.prediction import compute_error_percent
 from .emulator import Emulator
 from .likelihood import Likelihood
-from .posterior import Posterior, principal_axes, sample_posterior, weigh_posterior
-from .uncertainty import GIVEN, SAMPLED, Combination, Uncertainty, product_text, verdict_of
+from .posterior import Posterior, compute_principal_axes, sample_by_importance, sample_posterior
+from .uncertainty import GIVEN, SAMPLED, Combination, Uncertainty, choose_verdict, format_product
 
 Array = NDArray[np.float64]
 
-_FURTHER_SIMULATIONS = 10  # of single records
-_MOST_EVALUATIONS = 2  # of all records: further ones hardly changed an interval
-_NEAR, _NEAR_PERCENT = 4.0, 3.0  # runs are used whose error is at most so many times the least, plus this
-_MOST_RUNS = 24
-_STEPS = 1500  # of the sampler, where weighed draws do not do
-_THINNED = 8  # draws among which the most probable is looked for
-_SAME = 1e-6  # in logarithms: the same point
+_MAX_FURTHER_SIMULATIONS = 10  # of single records
+_MAX_FURTHER_EVALUATIONS = 2  # of all records: further ones hardly changed an interval
+_NEAR_FACTOR, _NEAR_PERCENT = (
+    4.0,
+    3.0,
+)  # runs are used whose error is at most so many times the least, plus this
+_MAX_EVALUATIONS = 24
+_WALK_STEPS = 1500  # of the sampler, where weighed samples do not do
+_THINNING = 8  # samples among which the most probable is looked for
+_SAME_POINT_LOG = 1e-6  # in logarithms: the same point
 
 
 @dataclass
-class KeptRuns:
-    """Complete simulations of all sites: ``points`` (p,) and the ``responses`` there."""
+class EvaluationStore:
+    """Complete evaluations of all sites: ``points`` (p,) and the ``responses`` there."""
 
     points: list[Array] = field(default_factory=list)
     responses: list[Sequence[SiteResponse]] = field(default_factory=list)
 
     def add(self, parameters: Array, responses: Sequence[SiteResponse]) -> bool:
-        """Whether all sites' simulations completed: what failed is not kept."""
+        """Store an evaluation if all its simulations completed, and return True if they did."""
         if not all(response.completed and np.isfinite(response.force_N).all() for response in responses):
             return False
-        if not any(np.abs(np.log(parameters / point)).max() < _SAME for point in self.points):
+        if not any(np.abs(np.log(parameters / point)).max() < _SAME_POINT_LOG for point in self.points):
             self.points.append(np.array(parameters))
             self.responses.append(tuple(responses))
         return True
 
-    def of(self, simulate: Simulate) -> Simulate:
-        """The same simulation, whose answers are kept."""
-
-        def keeping(parameters: Array) -> Sequence[SiteResponse]:
-            found = simulate(parameters)
-            self.add(parameters, found)
-            return found
-
-        return keeping
-
-    def near(self, measured: Sequence[Measured]) -> KeptRuns:
-        """Those whose forces came near the records, the nearest first."""
+    def select_near(self, measured: Sequence[MeasuredCurve]) -> EvaluationStore:
+        """Return the evaluations whose forces came near the records, the nearest first."""
         errors = [
-            float(np.mean([error_percent(r.force_N, site.force_N) for r, site in zip(run, measured)]))
+            float(np.mean([compute_error_percent(r.force_N, site.force_N) for r, site in zip(run, measured)]))
             for run in self.responses
         ]
-        order = [i for i in np.argsort(errors) if errors[i] <= _NEAR * min(errors) + _NEAR_PERCENT]
-        chosen = order[:_MOST_RUNS]
-        return KeptRuns([self.points[i] for i in chosen], [self.responses[i] for i in chosen])
+        order = [i for i in np.argsort(errors) if errors[i] <= _NEAR_FACTOR * min(errors) + _NEAR_PERCENT]
+        chosen = order[:_MAX_EVALUATIONS]
+        return EvaluationStore([self.points[i] for i in chosen], [self.responses[i] for i in chosen])
 
 
-def further_evaluations(records: int, spent: int) -> int:
-    """How many evaluations of all records may follow ``spent`` simulations: two where ten suffice, else one.
+def count_further_evaluations(records: int, spent: int) -> int:
+    """Return how many evaluations of all records may follow ``spent`` simulations: one or two.
 
-    Without any the emulator may never have seen where noise and misfit say that the answer is.
+    Without any, the emulator may never have seen the parameters that are most probable by noise and misfit.
     """
-    return int(np.clip((_FURTHER_SIMULATIONS - spent) // records, 1, _MOST_EVALUATIONS))
+    return int(np.clip((_MAX_FURTHER_SIMULATIONS - spent) // records, 1, _MAX_FURTHER_EVALUATIONS))
 
 
-def sampled_uncertainty(
-    known: Uncertainty,
-    measured: Sequence[Measured],
+def sample_uncertainty(
+    linearised: Uncertainty,
+    measured: Sequence[MeasuredCurve],
     unknowns: Unknowns,
-    space: Space,
-    kept: KeptRuns,
+    space: SearchSpace,
+    evaluations: EvaluationStore,
     simulate: Simulate,
-    evaluations: int = _MOST_EVALUATIONS,
+    further: int = _MAX_FURTHER_EVALUATIONS,
     seed: int = 0,
-    moves: bool = False,
+    move_answer: bool = False,
 ) -> Uncertainty:
-    """``known`` with sampled intervals, combinations, verdicts and correlations.
-
-    Of the least squares; or of what is most probable, to which the answer ``moves``.
+    """Replace intervals, combinations, verdicts and correlations of a linearised uncertainty by sampled ones.
 
     Parameters
     ----------
-    known : linearised (``estimate_uncertainty``); its covariance of the residuals is used, and that of the
-        answer, or of what is most probable.
+    linearised : of ``estimate_uncertainty``. Its covariance of the residuals is used, and that of the answer,
+        or of the most probable parameters.
     space : of the calibration's last stage.
-    kept : what the calibration simulated.
-    simulate : for so many further ``evaluations``; one that fails is tried again half-way.
+    evaluations : of the calibration.
+    simulate : called for at most ``further`` more evaluations; one that fails is tried again half-way.
+    move_answer : True if the answer moves from the least squares to the most probable parameters.
 
     Notes
     -----
-    Where not even two evaluations completed ``known`` itself comes back, and says that it is linearised.
+    If not even two evaluations completed, ``linearised`` itself is returned; its ``method`` says so.
     """
-    runs = kept.near(measured)
+    runs = evaluations.select_near(measured)
     if len(runs.points) < 2:
-        _learn(runs, simulate, known.centre)
+        _add_evaluation(runs, simulate, linearised.centre)
     if len(runs.points) < 2:
-        return known
+        return linearised
 
     def likelihood() -> Likelihood:
         emulator = Emulator.fit(unknowns.names, np.array(runs.points), runs.responses)
-        model, doubting = known.residual_model, emulator.forces_and_doubt
-        return Likelihood(emulator, measured, model, unknowns, space, doubting)
+        model, forces_and_sd = linearised.residual_model, emulator.predict_forces_and_sd
+        return Likelihood(emulator, measured, model, unknowns, space, forces_and_sd)
 
-    for _ in range(evaluations):
+    for _ in range(further):
         now = likelihood()
-        _learn(runs, simulate, _most_probable(now, _sample(now, runs, seed)))
+        _add_evaluation(runs, simulate, _find_most_probable(now, _sample(now, runs, seed)))
     posterior = _sample(likelihood(), runs, seed, last=True)
-    if moves:
-        known = moved(known, unknowns, space.expand(space.reduce(np.log(posterior.median))))
-    found = both_readings(known, posterior, unknowns, space)
-    return replace(found, centre=known.parameters) if moves else found
+    if move_answer:
+        linearised = move_uncertainty(
+            linearised, unknowns, space.expand(space.reduce(np.log(posterior.median)))
+        )
+    sampled = pool_linearised_samples(linearised, posterior, unknowns, space)
+    return replace(sampled, centre=linearised.parameters) if move_answer else sampled
 
 
-def _sample(likelihood: Likelihood, runs: KeptRuns, seed: int, last: bool = False) -> Posterior:
-    """From the most probable run on; where weighed draws miss much of the last sample, by a longer walk."""
+def _sample(likelihood: Likelihood, runs: EvaluationStore, seed: int, last: bool = False) -> Posterior:
+    """Sample from the most probable evaluation on, the ``last`` time by a longer walk if it needs one."""
     z = np.array([likelihood.space.reduce(np.log(point)) for point in runs.points])
-    best = z[int(np.argmin(likelihood.minus_2_log(z)))]
-    covariance = likelihood.covariance(best)
-    found = weigh_posterior(likelihood, best, covariance, seed=seed)
+    best = z[int(np.argmin(likelihood.compute_minus_2_log(z)))]
+    covariance = likelihood.compute_covariance(best)
+    found = sample_by_importance(likelihood, best, covariance, seed=seed)
     if found.long_enough or not last:
         return found
-    return sample_posterior(likelihood, best, covariance, steps=_STEPS, seed=seed)
+    return sample_posterior(likelihood, best, covariance, steps=_WALK_STEPS, seed=seed)
 
 
-def _most_probable(likelihood: Likelihood, posterior: Posterior) -> Array:
-    """Parameters (p,) from the draws on; least squares knows nothing of doubt, so it may lead astray."""
+def _find_most_probable(likelihood: Likelihood, posterior: Posterior) -> Array:
+    """Return the most probable parameters (p,), from the samples on.
+
+    Least squares alone does not know the emulator's expected error, so it may lead astray.
+    """
     tie = likelihood.space.tie
-    z = np.log(posterior.draws[::_THINNED]) @ (tie / tie.sum(axis=0))
-    drawn = z[int(np.argmin(likelihood.minus_2_log(z)))]
-    candidates = np.array([drawn, np.median(z, axis=0), likelihood.optimum(drawn).z])
-    return likelihood.space.expand(candidates[int(np.argmin(likelihood.minus_2_log(candidates)))])
+    z = np.log(posterior.samples[::_THINNING]) @ (tie / tie.sum(axis=0))
+    drawn = z[int(np.argmin(likelihood.compute_minus_2_log(z)))]
+    candidates = np.array([drawn, np.median(z, axis=0), likelihood.find_optimum(drawn).z])
+    return likelihood.space.expand(candidates[int(np.argmin(likelihood.compute_minus_2_log(candidates)))])
 
 
-def _learn(runs: KeptRuns, simulate: Simulate, point: Array) -> None:
-    """Simulate at a point; once more half-way to the best that completed where that fails."""
-    point = _six_digits(point)
+def _add_evaluation(runs: EvaluationStore, simulate: Simulate, point: Array) -> None:
+    """Simulate at a point; if that fails, once more half-way to the best evaluation."""
+    point = _round_to_six_digits(point)
     if not runs.add(point, simulate(point)):
         half = np.sqrt(point * runs.points[0])
         runs.add(half, simulate(half))
 
 
-def moved(known: Uncertainty, unknowns: Unknowns, parameters: Array) -> Uncertainty:
-    """``known`` about the most probable ``parameters`` (p,), in six digits."""
-    answer = _six_digits(parameters)
-    at_bound = tuple(map(bool, unknowns.at_bound(answer)))
-    return replace(known, parameters=answer, covariance=known.about_centre, at_bound=at_bound)
+def move_uncertainty(linearised: Uncertainty, unknowns: Unknowns, parameters: Array) -> Uncertainty:
+    """Return the linearised uncertainty about the most probable ``parameters`` (p,), in six digits."""
+    answer = _round_to_six_digits(parameters)
+    at_bound = tuple(map(bool, unknowns.is_at_bound(answer)))
+    return replace(linearised, parameters=answer, covariance=linearised.about_centre, at_bound=at_bound)
 
 
-def _six_digits(point: Array) -> Array:
-    """A point that a run taken up again comes to as well."""
+def _round_to_six_digits(point: Array) -> Array:
+    """Round a point, so that a continued run comes to the same one."""
     return np.array([float(f"{value:.6g}") for value in point])
 
 
-def both_readings(
-    known: Uncertainty, posterior: Posterior, unknowns: Unknowns, space: Space, seed: int = 0
+def pool_linearised_samples(
+    linearised: Uncertainty, posterior: Posterior, unknowns: Unknowns, space: SearchSpace, seed: int = 0
 ) -> Uncertainty:
-    """``known`` with what two readings of the same records say together, one as likely as the other.
+    """Pool the posterior with samples of the linearised answer: two readings of the same records, equally
+    likely.
 
     The posterior weighs the records by noise and misfit, and follows the bend; the linearised answer weighs
-    all points alike. Details of the records tell of the mesh too, which only the first believes: an interval
-    must not say more than the two agree on.
+    all points alike. Details of the records also contain errors of the mesh, which only the posterior
+    believes. An interval must not say more than both readings agree on.
     """
-    linear = np.random.default_rng(seed).multivariate_normal(
-        np.log(known.parameters), known.covariance, len(posterior.draws), method="eigh"
+    drawn = np.random.default_rng(seed).multivariate_normal(
+        np.log(linearised.parameters), linearised.covariance, len(posterior.samples), method="eigh"
     )
-    linear = np.clip(linear, *np.log([unknowns.lower, unknowns.upper]))
-    pooled = np.vstack([posterior.draws, np.exp(linear)])
-    return restated(known, replace(posterior, draws=pooled), unknowns, space)
+    drawn = np.clip(drawn, *np.log([unknowns.lower, unknowns.upper]))
+    pooled = np.vstack([posterior.samples, np.exp(drawn)])
+    return restate_from_samples(linearised, replace(posterior, samples=pooled), unknowns, space)
 
 
-def restated(known: Uncertainty, posterior: Posterior, unknowns: Unknowns, space: Space) -> Uncertainty:
-    """``known`` with what draws of the parameters say in place of its linearisation."""
-    logs = np.log(posterior.draws)
+def restate_from_samples(
+    uncertainty: Uncertainty, posterior: Posterior, unknowns: Unknowns, space: SearchSpace
+) -> Uncertainty:
+    """Return the uncertainty with what samples of the parameters say in place of its linearisation."""
+    logs = np.log(posterior.samples)
     prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
     covariance, intervals = posterior.covariance, posterior.intervals_95
     sd = np.sqrt(np.diag(covariance))
     factors = np.sqrt(intervals[:, 1] / intervals[:, 0])
     verdicts = [
-        GIVEN if before == GIVEN else verdict_of(float(factor), float(share))
-        for before, factor, share in zip(known.verdicts, factors, sd / prior_sd)
+        GIVEN if before == GIVEN else choose_verdict(float(factor), float(share))
+        for before, factor, share in zip(uncertainty.verdicts, factors, sd / prior_sd)
     ]
     moved = np.where(sd > 0, sd, 1.0)
     return replace(
-        known,
+        uncertainty,
         method=SAMPLED,
         centre=posterior.median,
         correlation=covariance / np.outer(moved, moved),
         intervals_95=intervals,
         verdicts=tuple(verdicts),
         combinations=tuple(
-            _combination(weights, logs @ weights, prior_sd, known.names)
-            for weights in principal_axes(posterior, space)
+            _summarise_combination(weights, logs @ weights, prior_sd, uncertainty.names)
+            for weights in compute_principal_axes(posterior, space)
         ),
     )
 
 
-def _combination(weights: Array, drawn: Array, prior_sd: Array, names: tuple[str, ...]) -> Combination:
-    """A product of powers whose logarithm was drawn (m,)."""
+def _summarise_combination(
+    weights: Array, drawn: Array, prior_sd: Array, names: tuple[str, ...]
+) -> Combination:
+    """Summarise a product of powers from samples (m,) of its logarithm."""
     low, high = np.quantile(drawn, [0.025, 0.975])
     sd, factor = float(drawn.std()), float(np.exp((high - low) / 2))
-    verdict = verdict_of(factor, sd / float(np.linalg.norm(weights * prior_sd)))
-    text = product_text(weights, names)
+    verdict = choose_verdict(factor, sd / float(np.linalg.norm(weights * prior_sd)))
+    text = format_product(weights, names)
     return Combination(weights, float(low + high) / 2, sd, factor, text, verdict)

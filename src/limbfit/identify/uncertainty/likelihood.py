@@ -1,7 +1,7 @@
-"""How probable parameters are, given the records: one function that posterior, profiles and evidence share.
+"""The likelihood of parameters, given the records, which posterior, profiles and model comparison share.
 
-The residuals have the covariance of ``discrepancy``. The size of the misfit is not known exactly, so it stays
-an unknown of its own: a factor on all misfits, 1 where it was estimated.
+The residuals have the covariance of ``discrepancy``. The size of the misfit is not known exactly, so a factor
+on all misfits remains an unknown of its own; it is 1 where the misfit was estimated.
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fit.objective import Measured, SiteResponse
-from ..fit.parameters import Space, Unknowns
-from ..fit.trust_region import Point, minimise
+from ..fit.objective import MeasuredCurve, SiteResponse
+from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.trust_region import SearchPoint, minimise
 from .discrepancy import ResidualModel
 
 Array = NDArray[np.float64]
 
-_ITERATIONS = 60
+_MAX_ITERATIONS = 60
 _TOLERANCE = 1e-5
-FACTORS = (0.2, 5.0)  # of the misfit
+MISFIT_FACTOR_BOUNDS = (0.2, 5.0)  # of the misfit
 
 
-class StandIn(Protocol):
-    """What answers fast enough for thousands of questions: an `Emulator`, or what is made of one."""
+class ForceSurrogate(Protocol):
+    """A model fast enough to be asked thousands of times: an `Emulator`, or one that is made of it."""
 
     def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
-        """Force (n,) and derivatives (n, p) of every site at parameters (p,)."""
+        """Return force (n,) and derivatives (n, p) of every site at parameters (p,)."""
         ...
 
-    def forces(self, parameters: Array) -> Array:
-        """Forces (m, N) of all sites, one after the other, at parameters (m, p)."""
+    def predict_forces(self, parameters: Array) -> Array:
+        """Return the forces (m, N) of all sites, one after the other, at parameters (m, p)."""
         ...
 
 
-Doubting = Callable[[Array], tuple[Array, Array]]
-_LEAST_MISFIT = 1e-7  # over the largest force: much less than any noise
+ForcesAndSd = Callable[[Array], tuple[Array, Array]]
+_MIN_MISFIT = 1e-7  # over the largest force: much less than any noise
 
 
 @dataclass(frozen=True)
@@ -51,85 +51,91 @@ class Optimum:
 
 
 class Likelihood:
-    """The records' likelihood over a search space, with the emulator in place of the solver.
+    """The likelihood of the records over a search space, with the emulator in place of the solver.
 
-    Coordinates ``z`` (k,) are those of ``space``. Stated priors of ``unknowns`` count as data; bounds hold.
-    ``doubting`` gives forces (m, N) and their expected error (m, sites), one sd in N, at parameters (m, p):
-    it counts as misfit that grows away from what was simulated (Kennedy and O'Hagan 2001).
+    The coordinates ``z`` (k,) are those of ``space``. Stated priors of ``unknowns`` count as data; bounds
+    hold. ``forces_and_sd`` returns forces (m, N) and their expected error (m, sites), one sd in N, at
+    parameters (m, p). That error counts as misfit that grows away from the simulated points (Kennedy and
+    O'Hagan 2001).
     """
 
     def __init__(
         self,
-        emulator: StandIn,
-        measured: Sequence[Measured],
+        emulator: ForceSurrogate,
+        measured: Sequence[MeasuredCurve],
         model: ResidualModel,
         unknowns: Unknowns,
-        space: Space,
-        doubting: Doubting | None = None,
+        space: SearchSpace,
+        forces_and_sd: ForcesAndSd | None = None,
     ) -> None:
-        self.doubting = doubting
-        if doubting is not None:  # an expected error has the shape of misfit, which none would not have
-            model = replace(model, misfit=np.maximum(model.misfit, _LEAST_MISFIT))
+        self.forces_and_sd = forces_and_sd
+        if forces_and_sd is not None:  # an expected error has the shape of misfit, which none would not have
+            model = replace(model, misfit=np.maximum(model.misfit, _MIN_MISFIT))
         self.emulator, self.measured, self.model = emulator, tuple(measured), model
         self.unknowns, self.space = unknowns, space
-        spectra = model.spectra()
+        spectra = model.compute_spectra()
         sizes = np.cumsum([0, *(len(s.values) for s in spectra)])
         self._sites = tuple(
             (spectrum.transform, slice(a, b)) for spectrum, a, b in zip(spectra, sizes[:-1], sizes[1:])
         )
         self._misfit = np.concatenate([s.values for s in spectra])
         self._site = np.repeat(np.arange(len(spectra)), np.diff(sizes))
-        unit = model.misfit * model.peaks_N if doubting is not None else np.ones(len(spectra))
+        unit = model.misfit * model.peaks_N if forces_and_sd is not None else np.ones(len(spectra))
         self._per_N2 = self._misfit / unit[self._site] ** 2
         self._constant = sum(s.log_determinant for s in spectra) + sizes[-1] * np.log(2 * np.pi)
-        self._shared = self._whiten(np.concatenate(model.shared))
+        self._shared = self._whiten(np.concatenate(model.shared_deviations))
         self._target = self._whiten(np.concatenate([site.force_N for site in measured]))
-        self._rows, self._known = unknowns.prior_rows()
+        self._rows, self._known = unknowns.build_prior_rows()
 
     @property
     def has_misfit(self) -> bool:
-        """Whether the size of the misfit makes any difference."""
+        """True if the size of the misfit makes a difference."""
         return bool(self._misfit.max(initial=0.0) > 1e-6)
 
     def _whiten(self, forces: Array) -> Array:
-        """Forces of all sites (N, ...) where noise has variance 1 and misfit is diagonal."""
+        """Transform forces of all sites (N, ...) so that noise has variance 1 and misfit is diagonal."""
         return np.concatenate([transform @ forces[where] for transform, where in self._sites])
 
-    def parameters(self, z: Array) -> Array:
-        """The full parameters (m, p) at z (m, k)."""
-        return np.exp(self.space.fixed + np.atleast_2d(z) @ self.space.tie.T)
+    def to_parameters(self, z: Array) -> Array:
+        """Return the full parameters (m, p) at z (m, k)."""
+        return np.exp(self.space.fixed_log + np.atleast_2d(z) @ self.space.tie.T)
 
-    def minus_2_log(self, z: Array, factor: Array | float = 1.0) -> Array:
-        """Minus twice the log-likelihood (m,) at z (m, k), with the misfit ``factor`` (m,) times as large.
+    def compute_minus_2_log(self, z: Array, factor: Array | float = 1.0) -> Array:
+        """Return minus twice the log-likelihood (m,) at z (m, k), with the misfit ``factor`` (m,) times as
+        large.
 
-        Infinite outside the bounds.
+        It is infinite outside the bounds.
         """
         z = np.atleast_2d(z)
-        p = self.parameters(z)
-        if self.doubting is None:
-            forces, doubt = self.emulator.forces(p), np.zeros((1, len(self.measured)))
+        p = self.to_parameters(z)
+        if self.forces_and_sd is None:
+            forces, sd_N = self.emulator.predict_forces(p), np.zeros((1, len(self.measured)))
         else:
-            forces, doubt = self.doubting(p)
+            forces, sd_N = self.forces_and_sd(p)
         residual = self._whiten(forces.T).T - self._target
         variances = 1.0 + np.atleast_1d(factor)[:, None] ** 2 * self._misfit
-        beliefs = np.log(p) @ self._rows.T - self._known
+        prior_deviations = np.log(p) @ self._rows.T - self._known
         with np.errstate(over="ignore", invalid="ignore"):  # far from all runs: not finite, so infinite
-            variances = variances + doubt[:, self._site] ** 2 * self._per_N2
-            found = self._told(residual, variances) + np.sum(beliefs**2, axis=1)
+            variances = variances + sd_N[:, self._site] ** 2 * self._per_N2
+            found = self._whitened_minus_2_log(residual, variances) + np.sum(prior_deviations**2, axis=1)
         found = np.where(np.isfinite(found), found, np.inf) + self._constant
         outside = np.any((z < self.space.lower - 1e-9) | (z > self.space.upper + 1e-9), axis=1)
         return np.where(outside, np.inf, found)
 
-    def at_responses(self, responses: Sequence[SiteResponse], parameters: Array) -> float:
-        """The same with the forces of the solver, to check the emulator by."""
+    def minus_2_log_of(self, responses: Sequence[SiteResponse], parameters: Array) -> float:
+        """Return the same for forces of the solver, to check the emulator."""
         forces = np.concatenate([response.force_N for response in responses])
         residual = self._whiten(forces) - self._target
         variances = 1.0 + self._misfit
-        beliefs = self._rows @ np.log(parameters) - self._known
-        return float(self._told(residual[None], variances[None])[0] + beliefs @ beliefs + self._constant)
+        prior_deviations = self._rows @ np.log(parameters) - self._known
+        return float(
+            self._whitened_minus_2_log(residual[None], variances[None])[0]
+            + prior_deviations @ prior_deviations
+            + self._constant
+        )
 
-    def _told(self, residual: Array, variances: Array) -> Array:
-        """Minus twice the logarithm of the likelihood (m,) of whitened residuals (m, N), but for a constant.
+    def _whitened_minus_2_log(self, residual: Array, variances: Array) -> Array:
+        """Return minus twice the log-likelihood (m,) of whitened residuals (m, N), up to a constant.
 
         What records share is integrated out (Woodbury).
         """
@@ -142,9 +148,9 @@ class Likelihood:
         explained = np.einsum("mi,mi->m", amount, np.linalg.solve(inner, amount[..., None])[..., 0])
         return np.asarray(found - explained + np.linalg.slogdet(inner)[1])
 
-    def point(self, z: Array, factor: float = 1.0) -> Point | None:
-        """Residuals of unit variance and their derivatives at z (k,), for least squares."""
-        parameters = self.parameters(z)[0]
+    def linearise(self, z: Array, factor: float = 1.0) -> SearchPoint | None:
+        """Return residuals of unit variance and their derivatives at z (k,), for least squares."""
+        parameters = self.to_parameters(z)[0]
         responses = self.emulator(parameters)
         sd = np.sqrt(1.0 + factor**2 * self._misfit)
         axes, sizes, _ = np.linalg.svd(self._shared / sd[:, None], full_matrices=False)
@@ -160,37 +166,39 @@ class Likelihood:
         if not (np.isfinite(forces).all() and np.isfinite(slopes).all()):
             return None
         residual = scaled(self._whiten(forces) - self._target)
-        beliefs = self._rows @ np.log(parameters) - self._known
+        prior_deviations = self._rows @ np.log(parameters) - self._known
         jacobian = np.concatenate([scaled(self._whiten(slopes)), self._rows @ self.space.tie])
-        return Point(z, np.concatenate([residual, beliefs]), jacobian)
+        return SearchPoint(z, np.concatenate([residual, prior_deviations]), jacobian)
 
-    def optimum(self, start: Array, held: int | None = None, factor: float = 1.0) -> Optimum:
-        """The most probable z from ``start`` (k,), where ``held`` names an entry that stays."""
-        free = np.arange(len(start)) != (-1 if held is None else held)
+    def find_optimum(self, start: Array, fixed_entry: int | None = None, factor: float = 1.0) -> Optimum:
+        """Find the most probable z from ``start`` (k,); the entry ``fixed_entry`` stays as it is."""
+        free = np.arange(len(start)) != (-1 if fixed_entry is None else fixed_entry)
 
-        def evaluate(part: Array) -> Point | None:
+        def evaluate(part: Array) -> SearchPoint | None:
             z = start.copy()
             z[free] = part
-            point = self.point(z, factor)
-            return point and Point(part, point.residual, point.jacobian[:, free])
+            point = self.linearise(z, factor)
+            return point and SearchPoint(part, point.residual, point.jacobian[:, free])
 
         z = start.copy()
         first = evaluate(start[free])
         if first is not None and free.any():
             lower, upper = self.space.lower[free], self.space.upper[free]
-            steps = minimise(evaluate, first, lower, upper, tolerance=_TOLERANCE, max_iterations=_ITERATIONS)
+            steps = minimise(
+                evaluate, first, lower, upper, tolerance=_TOLERANCE, max_iterations=_MAX_ITERATIONS
+            )
             for step in steps:
                 z[free] = step.point.z
-        return Optimum(z, self.parameters(z)[0], float(self.minus_2_log(z, factor)[0]))
+        return Optimum(z, self.to_parameters(z)[0], float(self.compute_minus_2_log(z, factor)[0]))
 
-    def best(self, starts: Sequence[Array]) -> Optimum:
-        """The most probable of the optima from several full parameters (p,)."""
-        found = [self.optimum(self.space.reduce(np.log(start))) for start in starts]
+    def find_best(self, starts: Sequence[Array]) -> Optimum:
+        """Return the most probable of the optima from several full parameters (p,)."""
+        found = [self.find_optimum(self.space.reduce(np.log(start))) for start in starts]
         return min(found, key=lambda one: one.minus_2_log)
 
-    def covariance(self, z: Array) -> Array:
-        """Of z (k,) there, linearised (k, k); what the bounds say keeps it finite."""
-        point = self.point(z)
+    def compute_covariance(self, z: Array) -> Array:
+        """Return the linearised covariance (k, k) at z (k,); the bounds keep it finite."""
+        point = self.linearise(z)
         assert point is not None
         bounds = np.diag(12.0 / (self.space.upper - self.space.lower) ** 2)
         return np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)

@@ -1,8 +1,8 @@
-"""What a record adds to the force: sensor noise as its own scatter shows it, and the doubt about touch-down.
+"""The noise of a record: sensor noise, estimated from its own scatter, and the uncertain touch-down.
 
 The forces compared are a smoothed record at a few points. Slow noise passes the smoothing unchanged, fast
-noise does not. So the compared points are given the covariance that means of their share of the samples have,
-which keeps what the smoothing keeps and claims no knowledge of what it removed.
+noise does not. Therefore the compared points have the covariance that means of their share of the samples
+have. It keeps what the smoothing keeps, and claims no knowledge of what the smoothing removed.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from ...autoregressive import block_covariance, lag_one
 from ...phases import find_phases
-from ..fit.objective import Measured, SiteResponse
+from ..fit.objective import MeasuredCurve, SiteResponse
 
 Array = NDArray[np.float64]
 
-ALIKE_MM = 10.0  # over which a misfit of the skin's moves goes from one point to the next
-_LEAST_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
+SKIN_CORRELATION_MM = 10.0  # over which a misfit of the skin's moves goes from one point to the next
+_MIN_NOISE_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class SiteNoise:
     """Noise of a site's record at the n times of comparison.
 
     ``covariance`` (n, n) N^2; ``sd_N`` and ``autocorrelation`` of neighbours are those of the samples as
-    recorded; ``touch_down_mm`` is the standard deviation of the touch-down that is part of the covariance.
-    ``unit`` is mm, and all of it, where depths are compared. ``site``: where the record is from, by default
-    its own. ``alike`` (n, n) is how far a misfit of the model is the same for values of one time, as of
-    points that are near each other; none: all the same.
+    recorded; ``touch_down_sd_mm`` is the standard deviation of the touch-down, which is part of the
+    covariance. If depths are compared, ``unit`` is mm and so are all numbers. ``site`` is where the record is
+    from; by default a record is a site of its own. ``similarity`` (n, n) is the correlation of the model's
+    misfit between values of one time, such as points that are near each other; None: all are the same.
     """
 
     name: str
@@ -39,27 +39,27 @@ class SiteNoise:
     covariance: Array
     sd_N: float
     autocorrelation: float
-    touch_down_mm: float = 0.0
+    touch_down_sd_mm: float = 0.0
     unit: str = "N"
     site: str = ""
-    alike: Array | None = None
+    similarity: Array | None = None
 
     @property
-    def where(self) -> str:
-        """What records of one site have in common."""
+    def site_name(self) -> str:
+        """The name that all records of one site share."""
         return self.site or self.name
 
 
-def alike_on_skin(points_mm: Array, components: NDArray[np.int64]) -> Array:
-    """`SiteNoise.alike` of moves of ``points_mm`` (n, 3) along ``components`` (n,): within `ALIKE_MM`.
+def compute_skin_similarity(points_mm: Array, components: NDArray[np.int64]) -> Array:
+    """Return `SiteNoise.similarity` of moves of ``points_mm`` (n, 3) along ``components`` (n,).
 
-    Each component has a misfit of its own.
+    It falls over `SKIN_CORRELATION_MM`; each component has a misfit of its own.
     """
     apart = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
-    return np.asarray(np.exp(-apart / ALIKE_MM) * (components[:, None] == components[None]))
+    return np.asarray(np.exp(-apart / SKIN_CORRELATION_MM) * (components[:, None] == components[None]))
 
 
-def record_noise(
+def estimate_record_noise(
     name: str,
     times_s: Array,
     residual_N: Array,
@@ -68,58 +68,62 @@ def record_noise(
     touch_down_sd_mm: float = 0.0,
     smoothing: Array | None = None,
 ) -> SiteNoise:
-    """Noise of a record with ``residual_N`` (samples,), raw minus smoothed force.
+    """Estimate the noise of a record from ``residual_N`` (samples,), raw minus smoothed force.
 
     Parameters
     ----------
-    times_s, force_N, displacement_mm : the compared curve (n,); no displacement where that is what is
-        compared, in place of the force: a wrong touch-down is then off by the same everywhere.
-    touch_down_sd_mm : a depth counted from elsewhere moves the whole curve along its own slope.
+    times_s, force_N, displacement_mm : the compared curve (n,). The displacement is None if it is compared
+        itself, in place of the force: a wrong touch-down then shifts it everywhere by the same.
+    touch_down_sd_mm : an error of the touch-down moves the whole curve along its own slope.
     smoothing : (n, n) of the curve, which that slope passes too; by default none.
     """
     residual = residual_N - residual_N.mean()
     sd = float(residual.std())
     lag = lag_one(residual)
-    samples = _samples_of_points(times_s, residual.size)
+    samples = _count_samples(times_s, residual.size)
     slope = touch_down_sd_mm * (
-        np.ones(len(times_s)) if displacement_mm is None else depth_slope(times_s, displacement_mm, force_N)
+        np.ones(len(times_s))
+        if displacement_mm is None
+        else compute_depth_slope(times_s, displacement_mm, force_N)
     )
     slope = slope if smoothing is None else smoothing @ slope
-    floor = (_LEAST_SHARE * force_N.max()) ** 2
+    floor = (_MIN_NOISE_SHARE * force_N.max()) ** 2
     covariance = block_covariance(sd, lag, samples) + np.outer(slope, slope)
     covariance += floor * np.eye(len(times_s))
     unit = "mm" if displacement_mm is None else "N"
     return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm, unit)
 
 
-def curve_noise(responses: Sequence[SiteResponse], measured: Sequence[Measured]) -> tuple[SiteNoise, ...]:
-    """White noise of curves that were never smoothed, from how neighbouring residuals scatter.
+def estimate_curve_noise(
+    responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve]
+) -> tuple[SiteNoise, ...]:
+    """Estimate white noise of curves that were never smoothed from the scatter of neighbouring residuals.
 
-    Second differences take what is smooth out of them.
+    Second differences remove what is smooth.
     """
     found = []
     for response, curve in zip(responses, measured, strict=True):
         differences = np.diff(response.force_N - curve.force_N, 2)
         sd = float(np.sqrt(np.mean(differences**2) / 6.0)) if differences.size else 0.0
-        sd = float(np.hypot(sd, _LEAST_SHARE * curve.force_N.max()))
+        sd = float(np.hypot(sd, _MIN_NOISE_SHARE * curve.force_N.max()))
         n = curve.force_N.size
         found.append(SiteNoise(curve.name, np.arange(float(n)), sd**2 * np.eye(n), sd, 0.0, site=curve.site))
     return tuple(found)
 
 
-def _samples_of_points(times_s: Array, samples: int) -> NDArray[np.int64]:
-    """How many of the samples (n,) belong to each point: its share of the time, and one at least."""
+def _count_samples(times_s: Array, samples: int) -> NDArray[np.int64]:
+    """Return how many of the samples belong to each point (n,): its share of the time, and at least one."""
     steps = np.diff(times_s)
     widths = np.r_[steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]]
     return np.maximum(np.round(samples * widths / widths.sum()).astype(np.int64), 1)
 
 
-def depth_slope(times_s: Array, displacement_mm: Array, force_N: Array) -> Array:
-    """dF/dd (n,) N/mm at every point.
+def compute_depth_slope(times_s: Array, displacement_mm: Array, force_N: Array) -> Array:
+    """Return dF/dd (n,) in N/mm at every point.
 
-    Where the indenter goes deeper than before it is the slope of the curve itself. In a hold, on the way out
-    and in later cycles it is that of the same depth when it was new, as much smaller as the force is, and
-    none where the tissue has let go.
+    Where the indenter goes deeper than before, it is the slope of the curve itself. In a hold, on the way out
+    and in later cycles it is the slope at the same depth when that was new, scaled by the force over the
+    force then. It is zero where the tissue has lost contact.
     """
     slope, new = np.zeros_like(force_N), np.zeros(len(force_N), dtype=bool)
     deepest = -np.inf

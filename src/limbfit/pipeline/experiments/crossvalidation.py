@@ -20,18 +20,18 @@ from ...errors import StudyError
 from ...identify.checks.crossvalidation import (
     Choice,
     Fold,
-    by_site,
-    choices_of,
+    average_by_site,
     cross_validate,
-    errors_by_site,
-    expanded,
-    standing,
-    without_regions,
+    expand_to_records,
+    list_choices,
+    list_choices_without_regions,
+    rank_fold,
+    spread_points,
+    summarise_errors_by_site,
 )
-from ...identify.checks.spread import spread_points
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...identify.fit.prediction import error_percent
+from ...identify.fit.prediction import compute_error_percent
 from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
 from ..shared.artefacts import write_json, write_table
@@ -69,8 +69,8 @@ def run_crossvalidate(
     )
     bench = _Bench(context, laboratory, seed, runs)
     own_choice = tuple(i for i, site in enumerate(recorded) if site.fitted)
-    chosen = choices_of(len(recorded), size, choices, seed)
-    regions = without_regions([site.region for site in recorded])
+    chosen = list_choices(len(recorded), size, choices, seed)
+    regions = list_choices_without_regions([site.region for site in recorded])
     first = bench.validate(own_choice, chosen, {})
     checks = bench.check(first.spread(_CHECKED), 1)
     found = bench.validate(own_choice, chosen, regions)
@@ -102,11 +102,11 @@ class _Bench:
         study = context.study
         stored = context.stored("calibrate", "calibration.json")
         self.best = study.vector(stored["stages"][-1]["parameters"])
-        self.bounds = unknowns(study).from_start(self.best)
+        self.bounds = unknowns(study).with_start(self.best)
         self.measured = laboratory.measured
         of_site: dict[str, list[int]] = {}
         for i, one in enumerate(self.measured):
-            of_site.setdefault(one.where, []).append(i)
+            of_site.setdefault(one.site_name, []).append(i)
         self.sites, self.groups = tuple(of_site), tuple(map(tuple, of_site.values()))
         covariance = np.array(stored["uncertainty"]["covariance_log"])
         # Where nothing is known, fits go anywhere; the emulator must not.
@@ -149,10 +149,10 @@ class _Bench:
         def fitted(
             choices: dict[str, Choice], told: Callable[[int, int], None] = lambda done, total: None
         ) -> tuple[Fold, ...]:
-            records = {label: expanded(choice, self.groups) for label, choice in choices.items()}
+            records = {label: expand_to_records(choice, self.groups) for label, choice in choices.items()}
             folds = cross_validate(*given, records, settings, told)
             pairs = zip(folds, choices.values(), strict=True)
-            return tuple(by_site(fold, choice, self.groups) for fold, choice in pairs)
+            return tuple(average_by_site(fold, choice, self.groups) for fold, choice in pairs)
 
         (alone,) = fitted({"": own})
         numbered = fitted({str(i): choice for i, choice in enumerate(chosen)}, tell)
@@ -168,10 +168,10 @@ class _Bench:
                 continue
             held = [self.groups[site] for site in fold.heldout]
             solved = [
-                np.mean([error_percent(run[i].force_N, self.measured[i].force_N) for i in of_site])
+                np.mean([compute_error_percent(run[i].force_N, self.measured[i].force_N) for i in of_site])
                 for of_site in held
             ]
-            away = [error_percent(cheap[i].force_N, run[i].force_N) for i in range(len(run))]
+            away = [compute_error_percent(cheap[i].force_N, run[i].force_N) for i in range(len(run))]
             rows.append(
                 {
                     "round": number,
@@ -196,8 +196,8 @@ def _content(
     """What ``crossvalidate.json`` holds."""
     names, sites = bench.bounds.names, bench.sites
     regions = {site.name: site.region for site in context.study.sites}
-    place = standing(found.own, found.folds)
-    by_site = errors_by_site(found.folds, len(sites))
+    place = rank_fold(found.own, found.folds)
+    by_site = summarise_errors_by_site(found.folds, len(sites))
     return {
         "fitted_sites": size,
         "choices": len(found.folds),

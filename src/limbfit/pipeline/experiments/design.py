@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError, StudyError
-from ...identify.checks.design import Candidate, Design, NoiseModel, candidate, choose, efficiency, evaluate
-from ...identify.checks.design import prior_information as bounds_information
+from ...identify.checks.design import (
+    Candidate,
+    Design,
+    NoiseModel,
+    build_candidate,
+    choose_design,
+    compute_bounds_information,
+    compute_efficiency,
+    evaluate_design,
+)
 from ...identify.fit.objective import SiteResponse
 from ...indentation import Parameters, SiteModel
 from ...study import Study
@@ -64,7 +72,9 @@ def run_design(
             left_out.append(f"site {model.name} at {depth:.1f} mm: {simulation.reason}")
             continue
         response = SiteResponse(simulation.force_N, simulation.jacobian)
-        found.append((candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max()))
+        found.append(
+            (build_candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max())
+        )
     content = _content(context, found, sites, vector, left_out)
     content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
     write_json(folder / "design.json", content)
@@ -114,12 +124,15 @@ def _content(
     if len({one.site for one in every}) < sites:
         raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
     bounds = unknowns(study)
-    prior = bounds_information(bounds)
-    designs = {"D-optimal": choose(every, sites, prior, "D"), "A-optimal": choose(every, sites, prior, "A")}
+    prior = compute_bounds_information(bounds)
+    designs = {
+        "D-optimal": choose_design(every, sites, prior, "D"),
+        "A-optimal": choose_design(every, sites, prior, "A"),
+    }
     own = _own_choice(study, every)
     if own:
-        designs["the study's own"] = evaluate(every, own, prior)
-    designs["all sites"] = evaluate(every, _deepest(every), prior)
+        designs["the study's own"] = evaluate_design(every, own, prior)
+    designs["all sites"] = evaluate_design(every, _deepest(every), prior)
     best_d, best_a = designs["D-optimal"], designs["A-optimal"]
     rows = []
     for name, design in designs.items():
@@ -128,8 +141,8 @@ def _content(
             {
                 "design": name,
                 "sites": [{"site": one.site, "depth_mm": one.depth_mm} for one in chosen],
-                "d_efficiency": efficiency(design, best_d, "D"),
-                "a_efficiency": efficiency(design, best_a, "A"),
+                "d_efficiency": compute_efficiency(design, best_d, "D"),
+                "a_efficiency": compute_efficiency(design, best_a, "A"),
                 "factor_95": dict(zip(bounds.names, design.factors_95.tolist(), strict=True)),
                 "exhaustive": design.exhaustive,
             }
@@ -175,7 +188,7 @@ def _verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     words = []
     own = designs.get("the study's own")
     if own is not None and len(own.chosen) == len(best.chosen):
-        share = efficiency(own, best, "D")
+        share = compute_efficiency(own, best, "D")
         told = "the study's own choice is as good as the best" if share > 0.95 else (
             f"the study's own choice is worth {100 * share:.0f} % of the data of the best"
         )  # fmt: skip

@@ -14,9 +14,17 @@ from numpy.typing import NDArray
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError, RunError
-from ...identify.checks.design import NoiseModel
-from ...identify.checks.design import prior_information as bounds_information
-from ...identify.checks.protocol import Budget, Noises, Option, Wanted, drawn, factors_95, plan, seconds_of
+from ...identify.checks.design import NoiseModel, compute_bounds_information
+from ...identify.checks.protocol import (
+    Budget,
+    DesignTarget,
+    RecordNoise,
+    RecordOption,
+    compute_duration_s,
+    compute_factors_95,
+    plan_records,
+    sample_tissues,
+)
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...indentation import (
@@ -73,16 +81,18 @@ def run_protocol(
     known = unknowns(study)
     which = _named(known, determine)
     rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
-    tissues = drawn(known, study.vector(parameters), draws, seed)
-    noises = Noises.of(NoiseModel(**noise), **seen)
+    tissues = sample_tissues(known, study.vector(parameters), draws, seed)
+    noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
     planned, left_out = _planned(context, speeds_mm_s, holds_s, depths_mm, noises)
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     budget = Budget(60.0 * minutes, setup_s)
     stiffness = is_modulus(study).astype(np.float64)
-    wanted = Wanted(bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness)
-    plans, told_by = _plans_told(found, options, blind if noises.sees_more else None, budget, wanted)
+    wanted = DesignTarget(
+        compute_bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness
+    )
+    plans, told_by = _plans_told(found, options, blind if noises.has_secondary else None, budget, wanted)
     told = [
         _row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
         for name, chosen in plans.items()
@@ -125,22 +135,22 @@ def _named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
 
 def _plans_told(
     found: Sequence[Planned],
-    options: Sequence[Option],
-    blind: Sequence[Option] | None,
+    options: Sequence[RecordOption],
+    blind: Sequence[RecordOption] | None,
     budget: Budget,
-    wanted: Wanted,
-) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[Option]]]:
+    wanted: DesignTarget,
+) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[RecordOption]]]:
     """The plans by name, and what their records tell; ``blind``: by force alone, if more is seen."""
     plans = _plans(found, options, budget, wanted)
     if DESIGNED not in plans:
-        least = min(seconds_of(options, [i], budget) for i in range(len(options)))
+        least = min(compute_duration_s(options, [i], budget) for i in range(len(options)))
         minutes = budget.seconds / 60.0
         raise InputError(
             f"no record fits into {minutes:g} min: the shortest takes {least / 60:.1f} min, set-up included",
             place="--minutes",
             remedy="allow more time",
         )
-    told_by: dict[str, Sequence[Option]] = dict.fromkeys(plans, options)
+    told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
     if blind is not None:
         plans[UNSEEN] = _plans(found, blind, budget, wanted)[DESIGNED]
         told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
@@ -152,7 +162,7 @@ def _planned(
     speeds_mm_s: Sequence[float],
     holds_s: Sequence[float],
     depths_mm: Sequence[float],
-    noises: Noises,
+    noises: RecordNoise,
 ) -> tuple[list[Planned], list[str]]:
     """Every site with every indenter, speed and hold, as deep as asked for, else as recorded or planned.
 
@@ -197,10 +207,10 @@ def _options(
     folder: Path,
     planned: Sequence[Planned],
     tissues: Array,
-    noise: Noises,
+    noise: RecordNoise,
     rest_s: float,
     left_out: list[str],
-) -> tuple[list[Planned], list[Option], list[Option], list[float]]:
+) -> tuple[list[Planned], list[RecordOption], list[RecordOption], list[float]]:
     """What each record would tell at each draw, and its force alone: nothing where its simulation does not
     come to its end.
 
@@ -236,25 +246,27 @@ def _options(
     seconds = [planned[k].seconds + rest_s for k in kept]
     off_mm = surface_error_mm(context)
     shares = [expected_share(planned[k].model, off_mm) for k in kept]
-    seeing, blind = (list(map(Option, places, seconds, info[kept], shares)) for info in infos)
+    seeing, blind = (list(map(RecordOption, places, seconds, info[kept], shares)) for info in infos)
     return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
 
 
-def _told_by(job: SimulationJob, simulation: Simulation, noises: Noises) -> tuple[Array, Array]:
+def _told_by(job: SimulationJob, simulation: Simulation, noises: RecordNoise) -> tuple[Array, Array]:
     """The information (p, p) of a record with what is seen beside its force, and of its force alone."""
     assert simulation.jacobian is not None
     parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
     force = SiteResponse(simulation.force_N, simulation.jacobian)
-    if not noises.sees_more:
-        return (alone := noises.of_force(force, parameters)), alone
+    if not noises.has_secondary:
+        return (alone := noises.compute_force_information(force, parameters)), alone
     assert simulation.observed_jacobian is not None
     beside = simulation.observed, simulation.observed_jacobian
     parts = len(job.model.layers), points, job.model.knots_s[-1] / READING_S
-    return noises.of_all(force, *beside, parts, parameters), noises.of_force(force, parameters)
+    return noises.compute_information(force, *beside, parts, parameters), noises.compute_force_information(
+        force, parameters
+    )
 
 
 def _plans(
-    found: Sequence[Planned], options: Sequence[Option], budget: Budget, wanted: Wanted
+    found: Sequence[Planned], options: Sequence[RecordOption], budget: Budget, wanted: DesignTarget
 ) -> dict[str, tuple[int, ...]]:
     """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
     ingredient."""
@@ -277,9 +289,9 @@ def _plans(
     plans: dict[str, tuple[int, ...]] = {}
     for name, allowed in kinds.items():
         chosen = [i for i, ok in enumerate(allowed) if ok]
-        fits = any(seconds_of(options, [i], budget) <= budget.seconds for i in chosen)
+        fits = any(compute_duration_s(options, [i], budget) <= budget.seconds for i in chosen)
         if fits and (name == DESIGNED or len(chosen) < len(found)):
-            best = plan([options[i] for i in chosen], budget, wanted)
+            best = plan_records([options[i] for i in chosen], budget, wanted)
             plans[name] = tuple(chosen[i] for i in best)
     if any(plain):
         plans[PLAIN] = tuple(i for i, ok in enumerate(plain) if ok)
@@ -289,9 +301,9 @@ def _plans(
 def _row(
     name: str,
     chosen: Sequence[int],
-    options: Sequence[Option],
+    options: Sequence[RecordOption],
     budget: Budget,
-    wanted: Wanted,
+    wanted: DesignTarget,
     parameters: tuple[Sequence[str], Sequence[int]],
     pressures: Iterable[str],
     draws: int,
@@ -301,23 +313,23 @@ def _row(
     ``parameters``: all of their names, and which are to be determined.
     """
     names, which = parameters
-    covariances = wanted.covariances(options, chosen, draws)
-    factors = factors_95(covariances)
+    covariances = wanted.compute_covariances(options, chosen, draws)
+    factors = compute_factors_95(covariances)
     middle, worst = np.median(factors, axis=0), factors.max(axis=0)
-    of_pressures = np.median(factors_95(wanted.of_wanted(covariances)), axis=0)
+    of_pressures = np.median(compute_factors_95(wanted.project(covariances)), axis=0)
     return {
         "design": name,
         "records": len(chosen),
-        "minutes": seconds_of(options, chosen, budget) / 60.0,
+        "minutes": compute_duration_s(options, chosen, budget) / 60.0,
         "factor_95": dict(zip(names, middle.tolist(), strict=True)),
         "worst_95": dict(zip(names, worst.tolist(), strict=True)),
         "pressures_95": dict(zip(pressures, of_pressures.tolist())),
         "determined": int(np.sum(middle[list(which)] <= DETERMINED)),
-        "cost": wanted.cost(covariances),
+        "cost": wanted.compute_cost(covariances),
     }
 
 
-def _record(one: Planned, option: Option, peak: float) -> dict[str, Any]:
+def _record(one: Planned, option: RecordOption, peak: float) -> dict[str, Any]:
     return {
         "site": one.site,
         "indenter": one.tool,

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, StudyError
+from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average_errors, fit_regions
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...identify.fit.regions import RegionFit, RegionRecords, fit_regions, mean_percent
 from ...identify.fit.state import Calibration
 from ...study import Site
 from ..shared.artefacts import write_json, write_table
@@ -141,8 +141,8 @@ def _row(
         "evaluations": found.evaluations,
         "converged": found.converged,
         "reason": found.reason,
-        "own_error_percent": mean_percent(fit.own_percent),
-        "whole_error_percent": mean_percent(fit.whole_percent),
+        "own_error_percent": average_errors(fit.own_percent),
+        "whole_error_percent": average_errors(fit.whole_percent),
         "own_error_percent_by_site": fit.own_percent,
         "whole_error_percent_by_site": fit.whole_percent,
     }
@@ -151,7 +151,7 @@ def _row(
 def _means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Mean error over all sites, each with its own region's model and with the whole limb's."""
     return {
-        f"mean_{which}_error_percent": mean_percent(
+        f"mean_{which}_error_percent": average_errors(
             {site: error for row in rows for site, error in row[f"{which}_error_percent_by_site"].items()}
         )
         for which in ("own", "whole")

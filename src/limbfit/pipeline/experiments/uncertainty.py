@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.fit.correction import CoarseToFine
+from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.parameters import search_space, shared
+from ...identify.fit.parameters import build_search_space, group_by_kind
 from ...identify.uncertainty.discrepancy import ResidualModel
-from ...identify.uncertainty.evidence import Evidence, candidate, compare
-from ...identify.uncertainty.explore import Explored, ExploreSettings, explore
+from ...identify.uncertainty.estimator import FitSensitivity
+from ...identify.uncertainty.exploration import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.likelihood import Likelihood
-from ...identify.uncertainty.sources import Gain
+from ...identify.uncertainty.model_comparison import ModelComparison, compare_models, fit_alternative
 from ..shared.context import Context
 from ..shared.simulations import experiment_cache
 from ..stages.deviations import site_noise
@@ -78,9 +78,11 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     sites = FittedSites(context, folder, best, earlier)
     known = linearised(context, sites.records, best, sites.at_best)
     table, grouping = study.uncertainty, groupings(study)[-1]
-    space = search_space(unknowns(study), grouping)
-    settings = ExploreSettings(table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed)
-    explored = explore(
+    space = build_search_space(unknowns(study), grouping)
+    settings = ExplorationSettings(
+        table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed
+    )
+    explored = explore_posterior(
         sites.simulate,
         sites.measured,
         unknowns(study),
@@ -88,10 +90,12 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         known,
         [np.array(point) for point in sorted(earlier)],
         settings,
-        tell=lambda text: context.tell(NAME, 0, 0, text),
+        report=lambda text: context.tell(NAME, 0, 0, text),
     )
     evidence = _evidence(context, explored, known.residual_model) if len(study.tissues) > 1 else None
-    gain = Gain.at(best, sites.at_best.responses, known.residual_model, unknowns(study), space)
+    gain = FitSensitivity.linearise(
+        best, sites.at_best.responses, known.residual_model, unknowns(study), space
+    )
     found: list[Change] = []
     if table.sources:
         wanted = variants(context, folder, sites.searched, best)
@@ -115,20 +119,20 @@ def _earlier_points(
     }
 
 
-def _evidence(context: Context, explored: Explored, model: ResidualModel) -> Evidence:
+def _evidence(context: Context, explored: Exploration, model: ResidualModel) -> ModelComparison:
     """One material against the study's own, on one emulator and covariance, and where nothing was fitted."""
     study, likelihood = context.study, explored.likelihood
-    space = search_space(unknowns(study), shared(unknowns(study).names))
+    space = build_search_space(unknowns(study), group_by_kind(unknowns(study).names))
     single = Likelihood(explored.emulator, likelihood.measured, model, unknowns(study), space)
     titles = stage_titles(study.tissues)
     calibration = context.stored("calibrate", "calibration.json")
     start = study.vector(calibration["stages"][0]["parameters"])
-    one, _ = candidate(titles[0], single, space.reduce(np.log(start)))
-    several, _ = candidate(titles[1], likelihood, explored.best.z)
+    one, _ = fit_alternative(titles[0], single, space.reduce(np.log(start)))
+    several, _ = fit_alternative(titles[1], likelihood, explored.best.z)
     rows = [row for row in context.stored("predict", "predict.json")["sites"] if not row["fitted"]]
     columns = ("error_one_material_percent", "error_percent")
     held = [row for row in rows if all(row[column] is not None for column in columns)]
-    return compare(one, several, *([row[column] for row in held] for column in columns))
+    return compare_models(one, several, *([row[column] for row in held] for column in columns))
 
 
 def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
@@ -140,7 +144,7 @@ def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
     jobs = answer_jobs(records, searched, answer)
     ends = [as_response(end) for end in sites.cache.run(jobs, context.executor)]
     n = len(records)
-    responses = ends if searched is records else CoarseToFine(ends[n:], ends[:n])(ends[n:])
+    responses = ends if searched is records else MeshCorrection(ends[n:], ends[:n])(ends[n:])
     return [
         Predicted(r, end, site_noise(study, r, end.force_N) if end.completed else None)
         for r, end in zip(searched, responses)

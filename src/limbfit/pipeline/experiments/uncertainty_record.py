@@ -13,19 +13,19 @@ from scipy.special import stdtrit
 
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...identify.uncertainty.evidence import Evidence
-from ...identify.uncertainty.explore import Explored
+from ...identify.uncertainty.estimator import FitSensitivity
+from ...identify.uncertainty.exploration import Exploration
+from ...identify.uncertainty.model_comparison import ModelComparison
 from ...identify.uncertainty.noise import SiteNoise
-from ...identify.uncertainty.posterior import principal_axes
-from ...identify.uncertainty.sources import Gain
+from ...identify.uncertainty.posterior import compute_principal_axes
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
     NORMAL_95,
     UNDETERMINED,
     Uncertainty,
-    product_text,
-    verdict_of,
+    choose_verdict,
+    format_product,
 )
 from ..shared.artefacts import write_curves, write_json, write_table
 from ..stages.records import SiteRecord
@@ -44,9 +44,9 @@ class Found:
     """All that the experiment found; see the parts for what they are."""
 
     known: Uncertainty
-    explored: Explored
-    evidence: Evidence | None
-    gain: Gain
+    explored: Exploration
+    evidence: ModelComparison | None
+    gain: FitSensitivity
     changes: tuple[Change, ...]
     unknowns: Unknowns
 
@@ -54,7 +54,7 @@ class Found:
     def source_covariance(self) -> Array:
         """Of the logarithms (p, p), by all counted sources."""
         counted = [change for change in self.changes if change.variant.counted]
-        parts = [self.gain.covariance(c.force_N, c.variant.shared, c.variant.sites) for c in counted]
+        parts = [self.gain.compute_covariance(c.force_N, c.variant.shared, c.variant.sites) for c in counted]
         return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
 
 
@@ -98,7 +98,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     _table(folder / "sources.csv", [_flat(row) for row in content["sources"]])
     _table(folder / "predictions.csv", rows)
     write_runs(folder / EMULATOR, found.known.names, explored.emulator.points, explored.runs)
-    draws = posterior.draws[:: max(len(posterior.draws) // _DRAWS, 1)]
+    draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
     write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
     _table(
         folder / "profiles.csv",
@@ -141,7 +141,7 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
                 "profile_verdict": None if profile is None else profile.verdict,
                 "profile_extrapolated": None if profile is None else list(profile.ends_extrapolated),
                 "with_sources_95": list(map(float, with_sources)),
-                "verdict": GIVEN if given else verdict_of(float(factor), more[i] / prior_sd),
+                "verdict": GIVEN if given else choose_verdict(float(factor), more[i] / prior_sd),
             }
         )
     return rows
@@ -150,10 +150,10 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
 def _combinations(found: Found) -> list[dict[str, Any]]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
     known, explored = found.known, found.explored
-    logs = np.log(explored.posterior.draws)
+    logs = np.log(explored.posterior.samples)
     prior_sd = np.log(found.unknowns.upper / found.unknowns.lower) / np.sqrt(12.0)
     rows = []
-    for weights in principal_axes(explored.posterior, explored.likelihood.space):
+    for weights in compute_principal_axes(explored.posterior, explored.likelihood.space):
         drawn = logs @ weights
         low, high = np.quantile(drawn, [0.025, 0.975])
         sd = float(drawn.std(ddof=1))
@@ -164,12 +164,12 @@ def _combinations(found: Found) -> list[dict[str, Any]]:
         wider = float(factor ** (total / max(sd, 1e-300)))
         rows.append(
             {
-                "text": product_text(weights, known.names),
+                "text": format_product(weights, known.names),
                 "weights": weights.tolist(),
                 "linearised_factor_95": float(np.exp(min(NORMAL_95 * linear, 50.0))),
                 "posterior_factor_95": factor,
                 "with_sources_factor_95": wider,
-                "verdict": verdict_of(wider, total / float(np.linalg.norm(weights * prior_sd))),
+                "verdict": choose_verdict(wider, total / float(np.linalg.norm(weights * prior_sd))),
             }
         )
     return rows
@@ -182,7 +182,7 @@ def _emulator(found: Found) -> dict[str, Any]:
         "runs": len(emulator.points),
         "needed_percent": list(explored.needed_percent),
         "good_enough": explored.good_enough,
-        "rounds": explored.rounds_record(),
+        "rounds": explored.rounds_to_dicts(),
         "lower": emulator.lower.tolist(),
         "upper": emulator.upper.tolist(),
         "kernel_length": emulator.length,
@@ -199,9 +199,9 @@ def _source(found: Found, change: Change) -> dict[str, Any]:
     names = [noise.name for noise in model.noise]
     forces = [100 * float(np.mean(np.abs(d))) / peak for d, peak in zip(change.force_N, model.peaks_N)]
     if variant.shared:
-        shift = found.gain.shift(change.force_N)
+        shift = found.gain.compute_shift(change.force_N)
     else:
-        shift = np.sqrt(np.diag(found.gain.covariance(change.force_N, False, variant.sites)))
+        shift = np.sqrt(np.diag(found.gain.compute_covariance(change.force_N, False, variant.sites)))
     return {
         "source": variant.source,
         "change": variant.change,
@@ -304,7 +304,7 @@ def _verdict(
         largest = max(
             counted,
             key=lambda c: float(
-                np.trace(found.gain.covariance(c.force_N, c.variant.shared, c.variant.sites))
+                np.trace(found.gain.compute_covariance(c.force_N, c.variant.shared, c.variant.sites))
             ),
         )
         words.append(
@@ -323,7 +323,7 @@ def _verdict(
     return words
 
 
-def _of_profiles(explored: Explored) -> list[str]:
+def _of_profiles(explored: Exploration) -> list[str]:
     """Where profiles rest on an emulator beyond its runs, and what the solver said there."""
     beyond = [one.name for one in explored.profiles if any(one.ends_extrapolated)]
     words = []

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import StudyError
-from ...identify.fit.fidelity import Round
-from ...identify.fit.multistart import Multistart, describe, multistart
+from ...identify.fit.multifidelity import CorrectionRound
+from ...identify.fit.multistart import MultistartResult, describe_starts, run_multistart
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.state import Calibration
 from ...identify.uncertainty.uncertainty import Uncertainty
@@ -35,7 +35,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
     laboratory = Laboratory(context, cache, study.records_at(*study.fitted))
     stages = groupings(study)
-    rounds_of: dict[int, tuple[Round, ...]] = {}
+    rounds_of: dict[int, tuple[CorrectionRound, ...]] = {}
 
     def run(number: int, start: Unknowns) -> Calibration:
         if number:
@@ -44,7 +44,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         return found
 
     with laboratory.meshing(folder / "coarser") as meshed:
-        tried = multistart(run, unknowns(study), table.starts, table.seed, stages[0])
+        tried = run_multistart(run, unknowns(study), table.starts, table.seed, stages[0])
         meshed()
     found, known = laboratory.uncertainty(tried.best, stages[-1], folder / "coarser")
     rounds = rounds_of[tried.number]
@@ -128,7 +128,7 @@ def _stage_record(
     }
 
 
-def _round_record(one: Round, sites: Sequence[str], study: Study) -> dict[str, Any]:
+def _round_record(one: CorrectionRound, sites: Sequence[str], study: Study) -> dict[str, Any]:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
     return {
         "stage": stage_titles(study.tissues)[one.stage] if one.stage >= 0 else "start",
@@ -140,11 +140,11 @@ def _round_record(one: Round, sites: Sequence[str], study: Study) -> dict[str, A
     }
 
 
-def _multistart_record(tried: Multistart, study: Study) -> dict[str, Any]:
+def _multistart_record(tried: MultistartResult, study: Study) -> dict[str, Any]:
     """What came of every start."""
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     return {
-        "summary": describe(tried, names),
+        "summary": describe_starts(tried, names),
         "reached": tried.reached,
         "starts": [
             {

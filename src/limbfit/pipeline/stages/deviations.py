@@ -15,9 +15,9 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
-from ...identify.checks.plausibility import layer_factor
+from ...identify.checks.plausibility import compute_layer_factor
 from ...identify.fit.objective import SiteResponse
-from ...identify.uncertainty.noise import SiteNoise, record_noise
+from ...identify.uncertainty.noise import SiteNoise, estimate_record_noise
 from ...indentation import SiteModel, contact_radius
 from ...mesh import read_vtu
 from ...study import Study
@@ -58,7 +58,7 @@ def _curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
     if record.record.forced:
         moved = trace.displacement_mm[inside] - facts["touch_down_mm"]
         residual = moved - np.interp(since[inside], smooth.time_s, smooth.displacement_mm)
-    return record_noise(
+    return estimate_record_noise(
         record.name,
         record.times_s,
         residual,
@@ -95,7 +95,9 @@ def expected_share(model: SiteModel, surface_mm: float) -> float:
 def by_thickness(radius_mm: float, thickness_mm: float) -> float:
     """``-d log F / d log h`` of a flat punch on a bonded layer."""
     ratio = radius_mm / thickness_mm
-    return float(np.log(layer_factor(ratio * _STEP) / layer_factor(ratio / _STEP)) / np.log(_STEP**2))
+    return float(
+        np.log(compute_layer_factor(ratio * _STEP) / compute_layer_factor(ratio / _STEP)) / np.log(_STEP**2)
+    )
 
 
 def surface_error_mm(context: Context) -> float:

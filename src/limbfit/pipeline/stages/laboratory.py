@@ -14,15 +14,21 @@ from numpy.typing import NDArray
 
 from ...anatomy.meshing.meshing import MeshSettings
 from ...errors import RunError
-from ...identify.fit.calibration import calibrate
-from ...identify.fit.correction import CoarseToFine
-from ...identify.fit.fidelity import FidelitySettings, Round, calibrate_corrected
-from ...identify.fit.inside import go_on
-from ...identify.fit.moving import moved
-from ...identify.fit.objective import Measured, SiteResponse
-from ...identify.fit.parameters import Grouping, Prior, Unknowns, constrained, search_space, two_stages
+from ...identify.fit.calibration import calibrate, move_answer
+from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.multifidelity import CorrectionRound, CorrectionSettings, calibrate_with_correction
+from ...identify.fit.multistart import continue_from_bound
+from ...identify.fit.objective import MeasuredCurve, SiteResponse
+from ...identify.fit.parameters import (
+    Grouping,
+    Prior,
+    Unknowns,
+    build_search_space,
+    constrain_grouping,
+    stage_groupings,
+)
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
-from ...identify.uncertainty.intervals import KeptRuns, further_evaluations, sampled_uncertainty
+from ...identify.uncertainty.intervals import EvaluationStore, count_further_evaluations, sample_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Study
@@ -81,7 +87,7 @@ class Laboratory:
         self.latest: dict[str, Simulation] = {}
         self.penalties: dict[str, float | None] = {}
         self.doubts: list[Doubted] = []
-        self.kept = KeptRuns()
+        self.kept = EvaluationStore()
         self._chain: tuple[Array, ...] = ()
         self._starts: dict[bytes, tuple[Array, ...]] = {}
 
@@ -101,7 +107,7 @@ class Laboratory:
         return [response for record, response in pairs if record.seen is None]
 
     @property
-    def measured(self) -> list[Measured]:
+    def measured(self) -> list[MeasuredCurve]:
         return [record.measured for record in self.records]
 
     def search(self, parameters: Array) -> Responses:
@@ -155,7 +161,7 @@ class Laboratory:
         """
         anchored = Anchored(found := self.search(parameters), list, ())
         if self.is_apart:
-            correction = CoarseToFine(found, self.check(parameters))
+            correction = MeshCorrection(found, self.check(parameters))
             anchored = Anchored(correction(found), correction, ())
         if self.context.study.mesh.coarse is not None:
             anchored = replace(anchored, mesh_N=self._mesh_error(parameters, found, self.records))
@@ -182,7 +188,7 @@ class Laboratory:
             anchored = replace(anchored, mesh_N=self._mesh_error(found.parameters, searched, coarser))
             spent = self.simulated
         known = linearised(self.context, self.records, found.parameters, anchored)
-        kept = KeptRuns()
+        kept = EvaluationStore()
         for point, run in zip(self.kept.points, self.kept.responses, strict=True):
             kept.add(point, anchored.as_fine(list(run)))
 
@@ -190,20 +196,20 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, "a further evaluation, for the intervals")
             return anchored.as_fine(self.search(parameters))
 
-        space = search_space(bounds := unknowns(study), grouping)
-        evaluations = further_evaluations(self.simulated, spent)
+        space = build_search_space(bounds := unknowns(study), grouping)
+        evaluations = count_further_evaluations(self.simulated, spent)
         about = known, self.measured, bounds, space, kept, simulate, evaluations
         moves = moves and is_moved(study)
-        sampled = sampled_uncertainty(*about, moves=moves)
+        sampled = sample_uncertainty(*about, move_answer=moves)
         if sampled.method == LINEARISED:
             self.context.tell(self.title, 0, 0, f"warning: {ONLY_LINEARISED}")
         if not moves or sampled.method == LINEARISED:
             return found, sampled
-        answer = moved(found, sampled.parameters, self.measured, simulate(sampled.parameters), bounds)
+        answer = move_answer(found, sampled.parameters, self.measured, simulate(sampled.parameters), bounds)
         if isinstance(answer, Calibration):
             return answer, sampled
         self.context.tell(self.title, 0, 0, f"warning: {STAYS}: {answer}")
-        return found, sampled_uncertainty(*about, moves=False)
+        return found, sample_uncertainty(*about, move_answer=False)
 
     @contextmanager
     def meshing(self, folder: Path) -> Iterator[Callable[[], None]]:
@@ -299,7 +305,9 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, f"{what}, site {simulation.site}")
         return found
 
-    def identify(self, start: Unknowns, stages: Sequence[Grouping]) -> tuple[Calibration, tuple[Round, ...]]:
+    def identify(
+        self, start: Unknowns, stages: Sequence[Grouping]
+    ) -> tuple[Calibration, tuple[CorrectionRound, ...]]:
         """The parameters of the sites' records as the study wants them found, and the corrections made.
 
         Where the last stage ends at a bound, it is searched again from inside.
@@ -307,9 +315,13 @@ class Laboratory:
         first = self._identify(start, stages)
         if self.context.study.calibration.stopping == "paper":
             return first
-        return go_on(first, start, stages, self._identify, partial(self.context.tell, self.title, 0, 0))
+        return continue_from_bound(
+            first, start, stages, self._identify, partial(self.context.tell, self.title, 0, 0)
+        )
 
-    def _identify(self, start: Unknowns, stages: Sequence[Grouping]) -> tuple[Calibration, tuple[Round, ...]]:
+    def _identify(
+        self, start: Unknowns, stages: Sequence[Grouping]
+    ) -> tuple[Calibration, tuple[CorrectionRound, ...]]:
         study, table = self.context.study, self.context.study.calibration
         titles = stage_titles(study.tissues)[-len(stages) :]
 
@@ -324,9 +336,9 @@ class Laboratory:
                 self.search, self.measured, start, settings(study), stages=stages, on_iterate=tell
             )
             return found, ()
-        corrected = calibrate_corrected(
+        corrected = calibrate_with_correction(
             self.search, self.check, self.measured, start, settings(study),
-            FidelitySettings(table.corrections, table.correction_tolerance_percent),
+            CorrectionSettings(table.corrections, table.correction_tolerance_percent),
             stages=stages, on_iterate=tell,
         )  # fmt: skip
         return corrected.calibration, corrected.rounds
@@ -375,7 +387,9 @@ def settings(study: Study) -> CalibrationSettings:
 def groupings(study: Study) -> tuple[Grouping, ...]:
     """Which parameters move together in each stage, as far as the study lets them move."""
     names = unknowns(study).names
-    made = [constrained(one, names, study.fixed, study.calibration.tied) for one in two_stages(names)]
+    made = [
+        constrain_grouping(one, names, study.fixed, study.calibration.tied) for one in stage_groupings(names)
+    ]
     return tuple(dict.fromkeys(made))
 
 

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.fit.objective import largest
-from ...identify.uncertainty.noise import SiteNoise, alike_on_skin, depth_slope
+from ...identify.fit.objective import largest_magnitude
+from ...identify.uncertainty.noise import SiteNoise, compute_depth_slope, compute_skin_similarity
 from ...indentation import Simulation
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ class Observed:
         A force counts as one whose error is ``error_share`` of its largest. Where this is off by more than
         that share of the largest value, it counts by as much less.
         """
-        return min(1.0, (error_share * largest(self.value) / self.noise_sd) ** 2)
+        return min(1.0, (error_share * largest_magnitude(self.value) / self.noise_sd) ** 2)
 
     def noise(
         self, name: str, simulated: Array, depth_mm: Array | None, touch_down_sd_mm: float
@@ -82,12 +82,12 @@ class Observed:
             covariance = covariance + np.outer(slope, slope)
         sd = self.facts["sd"]
         return SiteNoise(
-            name, self.time_s, covariance, sd, 0.0, touch_down_sd_mm, self.unit, alike=self.alike
+            name, self.time_s, covariance, sd, 0.0, touch_down_sd_mm, self.unit, similarity=self.alike
         )
 
     @property
     def alike(self) -> Array | None:
-        """See `SiteNoise.alike`."""
+        """See `SiteNoise.similarity`."""
         return None
 
     def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
@@ -112,7 +112,7 @@ class SeenLayer(Observed):
     quantity: ClassVar = "compression"
 
     def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
-        return depth_slope(self.time_s, depth_mm, simulated)
+        return compute_depth_slope(self.time_s, depth_mm, simulated)
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class SeenSurface(Observed):
 
     @property
     def alike(self) -> Array:
-        return alike_on_skin(self.points, self.components)
+        return compute_skin_similarity(self.points, self.components)
 
     def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
         """Moves of the skin are nearly in proportion to the depth."""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.checks.first_order import FirstOrder
-from ...identify.checks.outliers import Exchange, as_driven, find_outliers
-from ...identify.checks.plausibility import explained
-from ...identify.fit.correction import CoarseToFine
+from ...identify.checks.leave_one_out import LogLinearModel
+from ...identify.checks.outliers import Exchange, approximate_response, find_outliers
+from ...identify.checks.plausibility import explain_warnings
+from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob
 from ..shared.context import Context
@@ -31,7 +31,7 @@ def outlier_record(
     best: Array,
     one: Array,
     searched: Sequence[SiteRecord],
-    correction: CoarseToFine | None,
+    correction: MeshCorrection | None,
 ) -> dict[str, Any]:
     """What ``predict.json`` holds of flags: on the records themselves, and on those that the model misses.
 
@@ -52,7 +52,7 @@ def outlier_record(
         if np.array_equal(parameters, best):
             return known
         found = _run(context, cache, [record.job(parameters, starts=[best]) for record in searched])
-        found = found if correction is None else correction.of(whole)(found)
+        found = found if correction is None else correction.select(whole)(found)
         failed.extend(f"site {r.site}, one material: {r.reason}" for r in found if not r.completed)
         return found
 
@@ -73,19 +73,19 @@ def outlier_record(
     )
     left_out = [{**asdict(entry), "standardised": entry.standardised} for entry in found.left_out]
     flags = [flag.to_dict() | {"found": "in the record"} for flag in plain]
-    against = explained(found.flags, plain)
+    against = explain_warnings(found.warnings, plain)
     flags += [flag.to_dict() | {"found": "against the model"} for flag in against]
     return {"flags": flags, "left_out": left_out, "failed": list(dict.fromkeys(failed))}
 
 
-def _exchange(records: Sequence[SiteRecord]) -> Callable[[FirstOrder], Exchange]:
+def _exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Exchange]:
     """From the expansion of all sites to about what two answer to each other's record."""
 
-    def build(first: FirstOrder) -> Exchange:
+    def build(first: LogLinearModel) -> Exchange:
         def pair(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
             histories = [(records[k].times_s, records[k].displacement_mm) for k in (i, j)]
             one, two = first.responses[i], first.responses[j]
-            return as_driven(one, *histories), as_driven(two, *histories[::-1])
+            return approximate_response(one, *histories), approximate_response(two, *histories[::-1])
 
         return pair
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...anatomy.sites.sites import indenter_axis
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
-from ...identify.checks.plausibility import Flag, RecordFacts, implausible
+from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
 from ...indentation import contact_radius
 from ...study import Record, Study
 from ..shared.artefacts import read_curves
@@ -19,7 +19,7 @@ from ..shared.context import Context
 Placed = Mapping[str, Mapping[str, Any]]
 
 
-def stored_flags(context: Context) -> tuple[Flag, ...]:
+def stored_flags(context: Context) -> tuple[RecordWarning, ...]:
     """Flags on all records from the stages ``surfaces``, ``sites`` and ``traces``."""
     study = context.study
     traces = context.stored("traces", "traces.json")["sites"]
@@ -42,7 +42,7 @@ def record_flags(
     steps_s: Mapping[str, float],
     placed: Placed,
     anatomy: Anatomy | None,
-) -> tuple[Flag, ...]:
+) -> tuple[RecordWarning, ...]:
     """Flags on the records.
 
     Parameters
@@ -65,12 +65,12 @@ def record_flags(
         for one in recorded
     ]
     remarks = tuple(_flag(one.name, r) for one in recorded for r in records[one.name].get("remarks", ()))
-    return (*remarks, *implausible(facts))
+    return (*remarks, *check_plausibility(facts))
 
 
-def _flag(site: str, remark: Mapping[str, Any]) -> Flag:
+def _flag(site: str, remark: Mapping[str, Any]) -> RecordWarning:
     """What reading a record had to say about it."""
-    return Flag((site,), **remark)
+    return RecordWarning((site,), **remark)
 
 
 def _facts(

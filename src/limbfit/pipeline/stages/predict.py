@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...identify.fit.correction import CoarseToFine
-from ...identify.fit.objective import SiteResponse, largest
-from ...identify.fit.prediction import Known, error_percent, summarise
+from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.objective import SiteResponse, largest_magnitude
+from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
 from ...indentation import (
     Simulation,
     SimulationJob,
@@ -41,7 +41,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     calibration = context.stored("calibrate", "calibration.json")
     answers = [Answer.of(stage, study) for stage in calibration["stages"]]
     one, best = answers[0].parameters, answers[-1].parameters
-    known = Known.of(calibration["uncertainty"])
+    known = PredictionModel.from_stored(calibration["uncertainty"])
     records = [site_record(context, record) for record in study.recorded]
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
@@ -61,7 +61,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     correction = None
     if searched is not records:
         coarse, others = others[:n], others[n:]
-        correction = CoarseToFine(coarse, own)
+        correction = MeshCorrection(coarse, own)
         ours = correction(coarse)
         fine = correction(others) if others else []
         others = [as_is if r.site.fitted else held for r, as_is, held in zip(records, others, fine)]
@@ -148,7 +148,7 @@ class SitePrediction:
     @property
     def warnings(self) -> list[str]:
         """What is doubtful or missing."""
-        doubts = self.ours.doubts if self.ours.completed else self.own.warnings
+        doubts = self.ours.warnings if self.ours.completed else self.own.warnings
         return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing.items())]
 
 
@@ -174,7 +174,9 @@ def _write_fields(context: Context, folder: Path, jobs: Sequence[SimulationJob],
         context.tell("predict", before + i + 1, total, f"fields of site {name}")
 
 
-def _write_curves(context: Context, folder: Path, site: SitePrediction, best: Array, known: Known) -> None:
+def _write_curves(
+    context: Context, folder: Path, site: SitePrediction, best: Array, known: PredictionModel
+) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
     record, ours, missing = site.record, site.ours, site.missing
     name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
@@ -189,13 +191,18 @@ def _write_curves(context: Context, folder: Path, site: SitePrediction, best: Ar
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
         own = 0.0 if record.site.fitted else site_deviation(context, record, ours, best)
-        low, high = known.interval_95(ours, best, record.name, unit, own)
+        low, high = known.compute_interval_95(ours, best, record.name, unit, own)
         columns |= {f"{name}_low_{unit}": np.maximum(low, 0.0), f"{name}_high_{unit}": high}
     write_curves(folder / f"{record.name}.csv", **columns)
 
 
 def _observed(
-    context: Context, folder: Path, site: SitePrediction, near: Simulation | None, best: Array, known: Known
+    context: Context,
+    folder: Path,
+    site: SitePrediction,
+    near: Simulation | None,
+    best: Array,
+    known: PredictionModel,
 ) -> list[dict[str, Any]]:
     """Everything that was seen beside a record's force with its prediction, as files and rows.
 
@@ -207,13 +214,13 @@ def _observed(
         ours = whole = one.respond(site.own)
         if near is not None:
             searched = one.respond(near)
-            ours = CoarseToFine([searched], [whole])([searched])[0]
+            ours = MeshCorrection([searched], [whole])([searched])[0]
         seen, what, unit = one.seen, one.seen.quantity, one.seen.ending
         columns = seen.columns | {f"{what}_measured_{unit}": one.compared}
         if whole.completed:
             columns[f"{what}_simulated_{unit}"] = whole.force_N
         if ours.completed:
-            low, high = known.interval_95(ours, best, one.name, one.unit)
+            low, high = known.compute_interval_95(ours, best, one.name, one.unit)
             columns |= {f"{what}_low_{unit}": low, f"{what}_high_{unit}": high}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
@@ -222,10 +229,12 @@ def _observed(
                 "what": seen.what,
                 "name": one.name,
                 "unit": seen.unit,
-                "largest": largest(one.compared),
+                "largest": largest_magnitude(one.compared),
                 "noise": seen.noise_sd,
                 **seen.facts,
-                "error_percent": error_percent(whole.force_N, one.compared) if whole.completed else None,
+                "error_percent": compute_error_percent(whole.force_N, one.compared)
+                if whole.completed
+                else None,
             }
         )
     return rows
@@ -237,7 +246,7 @@ def _row(site: SitePrediction) -> dict[str, Any]:
     def error(found: Simulation | SiteResponse | None) -> float | None:
         if found is None or not found.completed:
             return None
-        return error_percent(found.force_N, record.compared)
+        return compute_error_percent(found.force_N, record.compared)
 
     return {
         "site": record.site.name,
@@ -270,7 +279,7 @@ def _means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         for row in rows:
             if row["fitted"] == fitted and row["error_percent"] is not None:
                 errors.setdefault(row["site"], []).append(row["error_percent"])
-        summary = asdict(summarise([float(np.mean(of_site)) for of_site in errors.values()]))
+        summary = asdict(summarise_errors([float(np.mean(of_site)) for of_site in errors.values()]))
         for key in ("mean_percent", "sd_percent"):
             name = f"{key.removesuffix('_percent')}_error_{kind}_percent"
             found[name] = None if np.isnan(summary[key]) else summary[key]

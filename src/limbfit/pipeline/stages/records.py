@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...fe import texts_of
-from ...identify.fit.objective import Measured, SiteResponse
-from ...identify.uncertainty.noise import depth_slope
+from ...identify.fit.objective import MeasuredCurve, SiteResponse
+from ...identify.uncertainty.noise import compute_depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Site, Study
 from ...traces import SurfaceMotion, Thinning, WaveMeans
@@ -78,18 +78,20 @@ class SiteRecord:
         return self.record.site
 
     @property
-    def measured(self) -> Measured:
+    def measured(self) -> MeasuredCurve:
         """What the calibration compares with."""
         weight = self.record.weight * (1.0 if self.seen is None else self.seen.weight(self.error_share))
         doubt = self.touch_down_sd_mm * self._by_depth if self.seen is None else None
-        return Measured(self.name, self.compared, weight, self.site.name, self.unit, doubt, self.error_share)
+        return MeasuredCurve(
+            self.name, self.compared, weight, self.site.name, self.unit, doubt, self.error_share
+        )
 
     @property
     def _by_depth(self) -> Array:
         """How the record (n,) changes with the place of its touch-down, N/mm, or mm/mm."""
         if self.record.forced:
             return np.ones_like(self.times_s)
-        return self.smoothing @ depth_slope(self.times_s, self.displacement_mm, self.force_N)
+        return self.smoothing @ compute_depth_slope(self.times_s, self.displacement_mm, self.force_N)
 
     @property
     def compared(self) -> Array:

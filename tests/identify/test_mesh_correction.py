@@ -10,8 +10,8 @@ import pytest
 from bars import TRUTH, coarsened, plain, simulate
 
 from limbfit.errors import CalibrationError
-from limbfit.identify import SiteResponse
-from limbfit.identify.fit.correction import CoarseToFine
+from limbfit.identify.fit.correction import MeshCorrection
+from limbfit.identify.fit.objective import SiteResponse
 
 FORCE = np.array([0.0, 1.0, 2.0, 1.0])
 NONE = np.zeros((4, 0))
@@ -23,7 +23,7 @@ def response(force, **more) -> SiteResponse:
 
 def test_at_the_anchor_the_forces_are_the_fine_ones_and_slopes_are_scaled():
     coarse, fine = coarsened(TRUTH), plain(TRUTH)
-    correction = CoarseToFine(coarse, fine)
+    correction = MeshCorrection(coarse, fine)
     assert correction.reasons == ("",) * 4
     for found, rough, exact, scale in zip(correction(coarse), coarse, fine, correction.scales, strict=True):
         assert np.array_equal(found.force_N, exact.force_N)
@@ -31,7 +31,7 @@ def test_at_the_anchor_the_forces_are_the_fine_ones_and_slopes_are_scaled():
 
 
 def test_nearby_the_corrected_forces_are_nearer_than_the_coarse_ones():
-    correction, near = CoarseToFine(coarsened(TRUTH), plain(TRUTH)), 1.05 * TRUTH
+    correction, near = MeshCorrection(coarsened(TRUTH), plain(TRUTH)), 1.05 * TRUTH
     for found, rough, exact in zip(correction(coarsened(near)), coarsened(near), simulate(near), strict=True):
         before, after = (np.abs(one.force_N - exact.force_N).max() for one in (rough, found))
         assert after < 0.1 * before
@@ -39,7 +39,7 @@ def test_nearby_the_corrected_forces_are_nearer_than_the_coarse_ones():
 
 def test_the_scale_is_the_least_squares_ratio():
     fine = 1.1 * FORCE + np.array([0, 0.1, -0.1, 0.1])
-    correction = CoarseToFine([response(FORCE)], [response(fine)])
+    correction = MeshCorrection([response(FORCE)], [response(fine)])
     assert correction.scales[0] == pytest.approx(1.1)
     assert correction.differences_percent[0] == pytest.approx(100 * np.mean([0, 0.2, 0.1, 0.2]) / 2.1)
 
@@ -59,7 +59,7 @@ def test_a_site_without_an_anchor_has_a_reason_and_no_numbers(coarse, fine, reas
     other = response(FORCE), response(1.2 * FORCE)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # 0/0 among them
-        correction = CoarseToFine([coarse, other[0]], [fine, other[1]])
+        correction = MeshCorrection([coarse, other[0]], [fine, other[1]])
         found, right = correction([response(2 * FORCE)] * 2)
         assert correction.scales == (None, pytest.approx(1.2))
         assert correction.differences_percent[0] is None
@@ -70,16 +70,16 @@ def test_a_site_without_an_anchor_has_a_reason_and_no_numbers(coarse, fine, reas
 
 
 def test_what_fails_later_has_no_numbers_either():
-    correction = CoarseToFine([response(FORCE)], [response(1.2 * FORCE)])
+    correction = MeshCorrection([response(FORCE)], [response(1.2 * FORCE)])
     (found,) = correction([response(FORCE, completed=False, reason="did not converge")])
     assert (found.completed, found.reason) == (False, "in the search: did not converge")
     assert np.all(np.isnan(found.force_N))
 
 
 def test_doubts_of_all_three_simulations_are_carried():
-    coarse, fine = response(FORCE, doubts=("slips",)), response(FORCE, doubts=("folds",))
-    (found,) = CoarseToFine([coarse], [fine])([response(FORCE, doubts=("slips", "sinks in"))])
-    assert found.doubts == ("folds", "in the search: slips", "in the search: sinks in")
+    coarse, fine = response(FORCE, warnings=("slips",)), response(FORCE, warnings=("folds",))
+    (found,) = MeshCorrection([coarse], [fine])([response(FORCE, warnings=("slips", "sinks in"))])
+    assert found.warnings == ("folds", "in the search: slips", "in the search: sinks in")
 
 
 @pytest.mark.parametrize(
@@ -93,6 +93,6 @@ def test_doubts_of_all_three_simulations_are_carried():
 def test_other_sites_or_times_are_a_fault_of_the_caller(coarse, words):
     tibia = response(FORCE, site="tibia")
     with pytest.raises(CalibrationError, match=words):
-        CoarseToFine(coarse, [tibia])
+        MeshCorrection(coarse, [tibia])
     with pytest.raises(CalibrationError, match=words):
-        CoarseToFine([tibia], [replace(tibia, force_N=1.1 * FORCE)])(coarse)
+        MeshCorrection([tibia], [replace(tibia, force_N=1.1 * FORCE)])(coarse)

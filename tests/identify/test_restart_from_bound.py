@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, TRUTH, Counted, records
 
-from limbfit.identify import FIXED, Calibration, calibrate, separate, two_stages
-from limbfit.identify.fit.inside import go_on, gone_on, inside
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.multistart import combine_searches, continue_from_bound, find_start_inside
+from limbfit.identify.fit.parameters import FIXED, group_separately, stage_groupings
+from limbfit.identify.fit.state import Calibration
 
 GAMMA = NAMES.index("skin.gamma")
 LOW = replace(PAPER, upper=np.where(np.arange(8) == GAMMA, 1.5, PAPER.upper))  # below the truth of 2
@@ -23,7 +25,7 @@ def bounded() -> Calibration:
 
 
 def test_what_ended_at_a_bound_goes_back_to_its_start(bounded):
-    names, again = inside(bounded, LOW, separate(NAMES))
+    names, again = find_start_inside(bounded, LOW, group_separately(NAMES))
     assert names == ["skin.gamma"]
     others = np.arange(8) != GAMMA
     assert again.start[GAMMA] == PAPER.start[GAMMA]
@@ -31,17 +33,17 @@ def test_what_ended_at_a_bound_goes_back_to_its_start(bounded):
 
 
 def test_nothing_goes_on_where_nothing_ended_at_a_bound_or_could_move(bounded):
-    assert inside(calibrate(Counted(), records(), PAPER), PAPER, separate(NAMES)) is None
+    assert find_start_inside(calibrate(Counted(), records(), PAPER), PAPER, group_separately(NAMES)) is None
     fixed = tuple(FIXED if i == GAMMA else i for i in range(8))
-    assert inside(bounded, LOW, fixed) is None
-    assert inside(bounded, LOW.from_start(LOW.upper), separate(NAMES)) is None
+    assert find_start_inside(bounded, LOW, fixed) is None
+    assert find_start_inside(bounded, LOW.with_start(LOW.upper), group_separately(NAMES)) is None
 
 
 def test_no_smaller_error_leaves_the_answer(bounded):
     """There is one optimum: it is reached again."""
-    names, again = inside(bounded, LOW, separate(NAMES))
-    second = calibrate(Counted(), records(), again, stages=(separate(NAMES),))
-    found = gone_on(bounded, second, names)
+    names, again = find_start_inside(bounded, LOW, group_separately(NAMES))
+    second = calibrate(Counted(), records(), again, stages=(group_separately(NAMES),))
+    found = combine_searches(bounded, second, names)
     assert np.array_equal(found.parameters, bounded.parameters)
     assert found.history == bounded.history
     assert found.evaluations == bounded.evaluations + second.evaluations
@@ -52,11 +54,13 @@ def test_no_smaller_error_leaves_the_answer(bounded):
 
 def test_a_smaller_error_is_the_answer_and_its_way_follows_the_first(bounded):
     """The second search within wider bounds stands for one that leaves a worse optimum."""
-    second = calibrate(Counted(), records(), PAPER.from_start(bounded.parameters), stages=(separate(NAMES),))
-    found = gone_on(bounded, second, ["skin.gamma"])
+    second = calibrate(
+        Counted(), records(), PAPER.with_start(bounded.parameters), stages=(group_separately(NAMES),)
+    )
+    found = combine_searches(bounded, second, ["skin.gamma"])
     assert found.parameters == pytest.approx(TRUTH, rel=0.02)
     assert found.cost == second.cost < bounded.cost
-    assert [stage.grouping for stage in found.stages] == list(two_stages(NAMES))
+    assert [stage.grouping for stage in found.stages] == list(stage_groupings(NAMES))
     assert [one.stage for one in found.history] == sorted(one.stage for one in found.history)
     assert found.history[-1].parameters == second.history[-1].parameters
     assert found.history[-1].evaluations == found.evaluations
@@ -72,6 +76,6 @@ def test_a_second_search_that_fails_leaves_the_answer_and_is_told(bounded):
 
     said = []
     first = bounded, ()
-    assert go_on(first, LOW, two_stages(NAMES), search, said.append) is first
+    assert continue_from_bound(first, LOW, stage_groupings(NAMES), search, said.append) is first
     assert said[0] == "skin.gamma at a bound: searched again from inside"
     assert said[1].startswith("warning: skin.gamma at a bound: searched again from inside, which fails: ")

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, records
+from bars import NAMES, PAPER, SITES, TRUTH, records, storing
 
-from limbfit.identify import Prior, calibrate, estimate_uncertainty, separate
-from limbfit.identify.fit.parameters import search_space
-from limbfit.identify.uncertainty.beliefs import Beliefs
-from limbfit.identify.uncertainty.intervals import KeptRuns, sampled_uncertainty
-from limbfit.identify.uncertainty.noise import curve_noise
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.parameters import Prior, build_search_space, group_separately
+from limbfit.identify.uncertainty.estimator import PriorPrecision
+from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
+from limbfit.identify.uncertainty.noise import estimate_curve_noise
+from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 from limbfit.priors import of_tissues
 
 PEOPLE = tuple(Prior(name, *known) for name, known in of_tissues(("skin", "muscle")).items())
@@ -22,31 +23,31 @@ THIN = tuple(replace(site, sections=(0.005 * site.sections[0], site.sections[1])
 
 def test_shares_of_one_parameter_are_those_of_its_precisions():
     records_, prior, bounds = 5.0, 3.0, 2.0
-    beliefs = Beliefs(np.array([bounds**-0.5]), np.array([[prior**0.5]]), np.zeros(1))
-    share, wider = beliefs.shares(np.array([[1 / (records_ + prior + bounds)]]), np.ones((1, 1)))
+    beliefs = PriorPrecision(np.array([bounds**-0.5]), np.array([[prior**0.5]]), np.zeros(1))
+    share, wider = beliefs.compute_shares(np.array([[1 / (records_ + prior + bounds)]]), np.ones((1, 1)))
     assert share[0] == pytest.approx(prior / (records_ + prior + bounds))
     assert wider[0] == pytest.approx(np.sqrt((records_ + prior + bounds) / (records_ + bounds)))
 
 
 def test_a_parameter_that_does_not_move_has_no_share():
-    beliefs = Beliefs(np.ones(1), np.ones((1, 1)), np.zeros(1))
-    share, wider = beliefs.shares(np.array([[0.2]]), np.array([[1.0], [0.0]]))
+    beliefs = PriorPrecision(np.ones(1), np.ones((1, 1)), np.zeros(1))
+    share, wider = beliefs.compute_shares(np.array([[0.2]]), np.array([[1.0], [0.0]]))
     assert (share[1], wider[1]) == (0.0, 1.0)
 
 
 def told(unknowns, seed=0):
     """Logarithms of the answer and what is known of it, as a run states it, for a draw of noise."""
-    kept, data = KeptRuns(), records(0.03, seed=seed, sites=THIN)
+    kept, data = EvaluationStore(), records(0.03, seed=seed, sites=THIN)
 
     def simulate(parameters):
         return [site.respond(parameters) for site in THIN]
 
-    found = calibrate(kept.of(simulate), data, unknowns)
+    found = calibrate(storing(kept, simulate), data, unknowns)
     known = estimate_uncertainty(
-        found.parameters, found.responses, data, unknowns, curve_noise(found.responses, data)
+        found.parameters, found.responses, data, unknowns, estimate_curve_noise(found.responses, data)
     )
-    space = search_space(unknowns, separate(NAMES))
-    return np.log(found.parameters), sampled_uncertainty(known, data, unknowns, space, kept, simulate)
+    space = build_search_space(unknowns, group_separately(NAMES))
+    return np.log(found.parameters), sample_uncertainty(known, data, unknowns, space, kept, simulate)
 
 
 def half_widths(known):

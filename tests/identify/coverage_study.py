@@ -6,25 +6,26 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from bars import storing
 from numpy.typing import NDArray
 from scipy.special import bdtr
 
-from ..fit.calibration import calibrate
-from ..fit.objective import Measured, SiteResponse
-from ..fit.parameters import Unknowns, search_space, separate
-from ..fit.state import CalibrationSettings
-from .intervals import KeptRuns, restated, sampled_uncertainty
-from .likelihood import Likelihood, StandIn
-from .noise import SiteNoise
-from .posterior import Posterior, sample_posterior
-from .uncertainty import DETERMINED, Uncertainty, estimate_uncertainty
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import Unknowns, build_search_space, group_separately
+from limbfit.identify.fit.state import CalibrationSettings
+from limbfit.identify.uncertainty.intervals import EvaluationStore, restate_from_samples, sample_uncertainty
+from limbfit.identify.uncertainty.likelihood import ForceSurrogate, Likelihood
+from limbfit.identify.uncertainty.noise import SiteNoise
+from limbfit.identify.uncertainty.posterior import Posterior, sample_posterior
+from limbfit.identify.uncertainty.uncertainty import DETERMINED, Uncertainty, estimate_uncertainty
 
 Array = NDArray[np.float64]
 
 _START_SD = 0.1  # of the logarithms
 
 # From the number of a repeat and the true forces per site to records, and the noise that is claimed of them.
-Recording = Callable[[int, Sequence[Array]], tuple[Sequence[Measured], Sequence[SiteNoise]]]
+Recording = Callable[[int, Sequence[Array]], tuple[Sequence[MeasuredCurve], Sequence[SiteNoise]]]
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,6 @@ class Coverage:
     def share(self) -> float:
         """Of the determined combinations whose interval holds the truth."""
         return float(np.mean(np.abs(self.deviations[self.determined]) < 1))
-
-    @property
-    def by_combination(self) -> Array:
-        """The share (k,) for every combination, determined or not."""
-        return np.mean(np.abs(self.deviations) < 1, axis=0)
 
     @property
     def by_parameter(self) -> Array:
@@ -91,7 +87,7 @@ def no_deviation(responses: Sequence[SiteResponse], parameters: Array) -> tuple[
 
 
 def coverage_study(
-    simulate: StandIn,
+    simulate: ForceSurrogate,
     truth: Array,
     unknowns: Unknowns,
     record: Recording,
@@ -103,36 +99,36 @@ def coverage_study(
     """Calibrate and judge ``repeats`` records of the forces at ``truth`` (p,), each with noise of its own.
 
     Each calibration starts about a tenth off the truth; ``deviation`` says what each site as a whole is
-    expected to be off by, (n,) N per site; ``moves`` as in ``sampled_uncertainty``.
+    expected to be off by, (n,) N per site; ``moves`` as in ``sample_uncertainty``.
     Every repeat is what a study does: the calibration's own least squares, then ``estimate_uncertainty`` and
-    ``sampled_uncertainty`` with what was simulated, and with ``steps`` of the sampler the posterior on the
+    ``sample_uncertainty`` with what was simulated, and with ``steps`` of the sampler the posterior on the
     model itself.
     """
     clean = [response.force_N for response in simulate(truth)]
     settings = CalibrationSettings(relative_tolerance=1e-4, max_iterations=60)
-    stages = (separate(unknowns.names),)
-    space = search_space(unknowns, stages[0])
+    stages = (group_separately(unknowns.names),)
+    space = build_search_space(unknowns, stages[0])
     linear, stated, sampled, misfit, further = [], [], [], [], []
     for repeat in range(repeats):
         measured, noise = record(repeat, clean)
         off_truth = np.random.default_rng(repeat).normal(0.0, _START_SD, truth.size)
-        start = unknowns.from_start(truth * np.exp(off_truth))
-        kept = KeptRuns()
-        found = calibrate(kept.of(simulate), measured, start, settings, stages=stages)
+        start = unknowns.with_start(truth * np.exp(off_truth))
+        kept = EvaluationStore()
+        found = calibrate(storing(kept, simulate), measured, start, settings, stages=stages)
         u = estimate_uncertainty(
             found.parameters, found.responses, measured, unknowns, noise, settings=settings,
             site_N=deviation(found.responses, found.parameters),
         )  # fmt: skip
         linear.append(_judged(u, truth))
-        asked = KeptRuns()
-        asking = asked.of(simulate)
-        ours = sampled_uncertainty(u, measured, unknowns, space, kept, asking, moves=moves)
+        asked = EvaluationStore()
+        asking = storing(asked, simulate)
+        ours = sample_uncertainty(u, measured, unknowns, space, kept, asking, move_answer=moves)
         stated.append(_judged(ours, truth))
         further.append(len(asked.points) * len(measured))
         misfit.append(100 * u.residual_model.misfit_elsewhere)
         if steps:
-            draws = _posterior(simulate, measured, u, unknowns, steps)
-            sampled.append(_judged(restated(u, draws, unknowns, space), truth))
+            samples = _posterior(simulate, measured, u, unknowns, steps)
+            sampled.append(_judged(restate_from_samples(u, samples, unknowns, space), truth))
     return CoverageStudy(
         _coverage(stated, misfit),
         _coverage(linear, misfit),
@@ -156,10 +152,14 @@ def _judged(known: Uncertainty, truth: Array) -> Judged:
 
 
 def _posterior(
-    simulate: StandIn, measured: Sequence[Measured], known: Uncertainty, unknowns: Unknowns, steps: int
+    simulate: ForceSurrogate,
+    measured: Sequence[MeasuredCurve],
+    known: Uncertainty,
+    unknowns: Unknowns,
+    steps: int,
 ) -> Posterior:
     """Sampled from the most probable parameters on, as ``explore`` does."""
-    space = search_space(unknowns, separate(unknowns.names))
+    space = build_search_space(unknowns, group_separately(unknowns.names))
     likelihood = Likelihood(simulate, measured, known.residual_model, unknowns, space)
-    best = likelihood.best((known.parameters, known.centre))
-    return sample_posterior(likelihood, best.z, likelihood.covariance(best.z), steps=steps)
+    best = likelihood.find_best((known.parameters, known.centre))
+    return sample_posterior(likelihood, best.z, likelihood.compute_covariance(best.z), steps=steps)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from bars import PAPER, SITES, TRUTH, coarsened, plain, records, simulate
 
-from limbfit.identify import CalibrationSettings, SiteResponse, calibrate
-from limbfit.identify.fit.fidelity import FidelitySettings, calibrate_corrected
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.multifidelity import CorrectionSettings, calibrate_with_correction
+from limbfit.identify.fit.objective import SiteResponse
+from limbfit.identify.fit.state import CalibrationSettings
 
-TIGHT = FidelitySettings(rounds=4, tolerance_percent=0.02)
+TIGHT = CorrectionSettings(rounds=4, tolerance_percent=0.02)
 
 
 def counting(function, calls):
@@ -27,7 +29,7 @@ def test_the_coarse_model_alone_is_wrong_and_the_corrected_one_is_not():
     biased = calibrate(coarsened, records(), PAPER)
     assert biased.converged
     assert biased.parameters[4] == pytest.approx(TRUTH[4] / 1.1, rel=0.03)
-    found = calibrate_corrected(coarsened, plain, records(), PAPER, fidelity=TIGHT)
+    found = calibrate_with_correction(coarsened, plain, records(), PAPER, fidelity=TIGHT)
     assert found.calibration.converged, found.calibration.reason
     assert found.calibration.parameters == pytest.approx(TRUTH, rel=0.02)
     assert max(found.calibration.history[-1].errors_percent) < 0.05
@@ -35,7 +37,9 @@ def test_the_coarse_model_alone_is_wrong_and_the_corrected_one_is_not():
 
 def test_few_coarse_and_fewer_fine_evaluations():
     coarse, fine = [], []
-    found = calibrate_corrected(counting(coarsened, coarse), counting(plain, fine), records(0.03), PAPER)
+    found = calibrate_with_correction(
+        counting(coarsened, coarse), counting(plain, fine), records(0.03), PAPER
+    )
     assert found.calibration.converged, found.calibration.reason
     assert found.calibration.evaluations == len(coarse) == len(set(coarse)) <= 13
     assert len(fine) == len(found.rounds) <= 6
@@ -44,7 +48,7 @@ def test_few_coarse_and_fewer_fine_evaluations():
 
 
 def test_the_forces_at_the_end_are_the_fine_ones():
-    found = calibrate_corrected(coarsened, plain, records(0.03), PAPER)
+    found = calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
     exact = plain(found.calibration.parameters)
     for response, site in zip(found.calibration.responses, exact, strict=True):
         assert response.force_N == pytest.approx(site.force_N, abs=1e-12)
@@ -55,7 +59,7 @@ def test_the_forces_at_the_end_are_the_fine_ones():
 
 
 def test_every_stage_ends_with_fine_forces_and_history_is_whole():
-    found = calibrate_corrected(coarsened, plain, records(), PAPER).calibration
+    found = calibrate_with_correction(coarsened, plain, records(), PAPER).calibration
     assert [stage.grouping for stage in found.stages] == [(0, 1, 2, 3) * 2, tuple(range(8))]
     assert {iterate.stage for iterate in found.history} == {0, 1}
     assert found.stages[0].evaluations + found.stages[1].evaluations == found.evaluations
@@ -91,9 +95,11 @@ def test_a_run_killed_anywhere_and_begun_again_repeats_itself():
 
     def run():
         data = records(0.03)
-        return calibrate_corrected(remembered("coarse", coarsened), remembered("fine", plain), data, PAPER)
+        return calibrate_with_correction(
+            remembered("coarse", coarsened), remembered("fine", plain), data, PAPER
+        )
 
-    whole = calibrate_corrected(coarsened, plain, records(0.03), PAPER)
+    whole = calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
     kills = 0
     while True:
         left[0] = 1
@@ -122,8 +128,10 @@ def test_one_simulation_in_ten_may_fail_on_either_mesh(seed):
 
         return run
 
-    reference = calibrate_corrected(coarsened, plain, records(0.03), PAPER)
-    found = calibrate_corrected(failing(coarsened, 0.1, 0), failing(plain, 0.1, 1), records(0.03), PAPER)
+    reference = calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
+    found = calibrate_with_correction(
+        failing(coarsened, 0.1, 0), failing(plain, 0.1, 1), records(0.03), PAPER
+    )
     assert found.calibration.converged, found.calibration.reason
     assert found.calibration.parameters == pytest.approx(reference.calibration.parameters, rel=0.03)
 
@@ -134,7 +142,7 @@ def test_a_fine_simulation_that_always_fails_is_told():
             SiteResponse(r.force_N, r.jacobian, k != 2, "folded") for k, r in enumerate(plain(parameters))
         ]
 
-    found = calibrate_corrected(coarsened, fails, records(), PAPER)
+    found = calibrate_with_correction(coarsened, fails, records(), PAPER)
     assert not found.calibration.converged
     assert "the correction fails: s2: on the whole mesh: folded" in found.calibration.reason
     json.dumps([vars(one) for one in found.rounds], allow_nan=False)  # as it is stored
@@ -156,7 +164,7 @@ def fine_cost(parameters, data):
 def test_where_the_coarse_model_answers_too_weakly_the_best_corrected_iterate_is_the_answer():
     """A coarse model with a third of the fine one's slope sends the search three times too far."""
     data, fine = records(0.03), []
-    found = calibrate_corrected(too_weak, counting(plain, fine), data, PAPER)
+    found = calibrate_with_correction(too_weak, counting(plain, fine), data, PAPER)
 
     def cost(parameters):
         return fine_cost(parameters, data)
@@ -178,7 +186,7 @@ def test_a_coarse_simulation_lost_half_way_back_leaves_the_correction_before():
             return [SiteResponse(0 * r.force_N, 0 * r.jacobian, False, "lost") for r in found]
         return found
 
-    found = calibrate_corrected(coarse, counting(plain, fine), data, PAPER)
+    found = calibrate_with_correction(coarse, counting(plain, fine), data, PAPER)
     failed = [one for one in found.rounds if one.reason]
     assert failed
     assert all("s0: in the search: lost" in one.reason for one in failed)
@@ -196,13 +204,13 @@ def test_corrections_that_cannot_settle_are_not_called_converged():
     def restless(parameters):
         return [SiteResponse(r.force_N * rng.uniform(0.9, 1.1), r.jacobian) for r in plain(parameters)]
 
-    found = calibrate_corrected(coarsened, restless, records(), PAPER).calibration
+    found = calibrate_with_correction(coarsened, restless, records(), PAPER).calibration
     assert not found.converged
     assert "have not settled" in found.reason
 
 
 def test_two_equal_models_need_one_correction_per_stage():
-    found = calibrate_corrected(simulate, plain, records(0.03), PAPER, CalibrationSettings())
+    found = calibrate_with_correction(simulate, plain, records(0.03), PAPER, CalibrationSettings())
     assert [one.stage for one in found.rounds][:3] == [-1, 0, 1]
     assert max(found.rounds[0].expected_percent) < 1e-9
     assert found.correction.scales == pytest.approx([1.0] * 4)

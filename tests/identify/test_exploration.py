@@ -5,22 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records, simulate
+from coverage_study import coverage_study
 
-from limbfit.identify import SiteResponse, calibrate, estimate_uncertainty, separate
-from limbfit.identify.fit.parameters import search_space, shared
-from limbfit.identify.uncertainty.coverage import coverage_study
-from limbfit.identify.uncertainty.explore import ExploreSettings, explore
-from limbfit.identify.uncertainty.noise import curve_noise
-from limbfit.identify.uncertainty.posterior import Posterior, principal_axes
-from limbfit.identify.uncertainty.sources import Gain
+from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.objective import SiteResponse
+from limbfit.identify.fit.parameters import build_search_space, group_by_kind, group_separately
+from limbfit.identify.uncertainty.estimator import FitSensitivity
+from limbfit.identify.uncertainty.exploration import ExplorationSettings, explore_posterior
+from limbfit.identify.uncertainty.noise import estimate_curve_noise
+from limbfit.identify.uncertainty.posterior import Posterior, compute_principal_axes
+from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 
-SPACE = search_space(PAPER, separate(NAMES))
+SPACE = build_search_space(PAPER, group_separately(NAMES))
 
 
 def calibrated(noise=0.03, seed=4, **extra):
     data = records(noise, seed=seed)
-    found = calibrate(simulate, data, PAPER.from_start(TRUTH), stages=(separate(NAMES),))
-    noise = curve_noise(found.responses, data)
+    found = calibrate(simulate, data, PAPER.with_start(TRUTH), stages=(group_separately(NAMES),))
+    noise = estimate_curve_noise(found.responses, data)
     return data, found, estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
 
 
@@ -34,8 +36,8 @@ def test_an_exploration_spends_its_runs_and_holds_the_truth():
         return [simulate(p) for p in points]
 
     earlier = [np.array(i.parameters) for i in found.history]
-    settings = ExploreSettings(runs=24, batch=4, steps=600, checked=1)
-    done = explore(many, data, PAPER, SPACE, known, earlier, settings)
+    settings = ExplorationSettings(runs=24, batch=4, steps=600, checked=1)
+    done = explore_posterior(many, data, PAPER, SPACE, known, earlier, settings)
     # A check asks for the optimum and two ends of a profile, the narrowest and the widest.
     assert len(asked) <= len(earlier) + 24 + 5
     assert done.good_enough
@@ -55,37 +57,39 @@ def test_failed_runs_do_not_stop_an_exploration():
         runs[-1][0] = SiteResponse(bad.force_N, bad.jacobian, False, "stopped")
         return runs
 
-    settings = ExploreSettings(runs=8, batch=8, steps=200, checked=0)
+    settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=0)
     earlier = [np.array(i.parameters) for i in found.history]
-    done = explore(flaky, data, PAPER, SPACE, known, earlier, settings)
+    done = explore_posterior(flaky, data, PAPER, SPACE, known, earlier, settings)
     assert len(done.runs) == len(earlier) + 8 - 2
-    assert done.emulator.check(TRUTH, simulate(TRUTH)).max() < 0.5
+    assert done.emulator.compute_errors_percent(TRUTH, simulate(TRUTH)).max() < 0.5
 
 
 def test_a_source_shifts_the_answer_as_a_new_calibration_would():
     data, found, known = calibrated(0.001)
-    gain = Gain.at(found.parameters, found.responses, known.residual_model, PAPER, SPACE)
+    gain = FitSensitivity.linearise(found.parameters, found.responses, known.residual_model, PAPER, SPACE)
     bump = [0.002 * d.force_N for d in data]
 
     def changed(p):
         return [SiteResponse(r.force_N + b, r.jacobian) for r, b in zip(simulate(p), bump)]
 
-    again = calibrate(changed, data, PAPER.from_start(found.parameters), stages=(separate(NAMES),))
+    again = calibrate(changed, data, PAPER.with_start(found.parameters), stages=(group_separately(NAMES),))
     # The two weigh the records differently, so the shift is the same in what all sites agree on.
     moved = np.log(again.parameters / found.parameters)
-    assert gain.shift(bump)[[0, 4]] == pytest.approx(moved[[0, 4]], abs=5e-4)
-    assert gain.shift(bump)[[0, 4]] == pytest.approx([-0.002, -0.002], abs=5e-4)
-    alone = gain.covariance(bump, shared=False)
+    assert gain.compute_shift(bump)[[0, 4]] == pytest.approx(moved[[0, 4]], abs=5e-4)
+    assert gain.compute_shift(bump)[[0, 4]] == pytest.approx([-0.002, -0.002], abs=5e-4)
+    alone = gain.compute_covariance(bump, shared=False)
     parts = [gain.matrices[k] @ bump[k] for k in range(len(SITES))]
     assert alone == pytest.approx(sum(np.outer(part, part) for part in parts))
-    assert gain.covariance(bump, shared=True) == pytest.approx(np.outer(gain.shift(bump), gain.shift(bump)))
+    assert gain.compute_covariance(bump, shared=True) == pytest.approx(
+        np.outer(gain.compute_shift(bump), gain.compute_shift(bump))
+    )
 
 
 @pytest.mark.slow
 def test_coverage_of_whole_calibrations():
     def record(repeat, forces):
         data = records(0.03, seed=repeat)
-        return data, curve_noise([SiteResponse(f, np.zeros((60, 0))) for f in forces], data)
+        return data, estimate_curve_noise([SiteResponse(f, np.zeros((60, 0))) for f in forces], data)
 
     found = coverage_study(simulate, TRUTH, PAPER, record, repeats=20).linearised
     assert found.determined.all()
@@ -103,14 +107,14 @@ def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
     logs[:, 0] += along
     logs[:, 1] += 0.5 * along**2
     posterior = Posterior(NAMES, np.exp(logs), np.ones(4000), 0.3, 1.0, 4000.0, True)
-    axes = principal_axes(posterior, SPACE)
+    axes = compute_principal_axes(posterior, SPACE)
     assert axes @ axes.T == pytest.approx(np.eye(TRUTH.size), abs=1e-12)
-    widths = (np.log(posterior.draws) @ axes.T).std(axis=0)
+    widths = (np.log(posterior.samples) @ axes.T).std(axis=0)
     assert (np.diff(widths) > 0).all()
     assert widths[-2] == pytest.approx(np.sqrt(0.5) * 0.6**2, rel=0.1)  # of half the square
     assert abs(axes[-2, 1]) > 0.95
-    tied = search_space(PAPER, shared(NAMES))
-    rows = principal_axes(posterior, tied)
+    tied = build_search_space(PAPER, group_by_kind(NAMES))
+    rows = compute_principal_axes(posterior, tied)
     assert rows.shape == (4, TRUTH.size)
     assert rows[:, :4] == pytest.approx(rows[:, 4:])
 
@@ -124,8 +128,8 @@ def vague():
         return [simulate(p) for p in points]
 
     earlier = [np.array(i.parameters) for i in found.history]
-    settings = ExploreSettings(runs=8, batch=8, steps=200, checked=1)
-    return explore(many, data, PAPER, SPACE, known, earlier, settings)
+    settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=1)
+    return explore_posterior(many, data, PAPER, SPACE, known, earlier, settings)
 
 
 def test_profiles_say_where_they_are_extrapolated(vague):
@@ -165,8 +169,8 @@ def test_an_end_that_cannot_be_simulated_is_told():
         return runs
 
     earlier = [np.array(i.parameters) for i in found.history]
-    settings = ExploreSettings(runs=8, batch=8, steps=200, checked=1)
-    done = explore(failing, data, PAPER, SPACE, known, earlier, settings)
+    settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=1)
+    done = explore_posterior(failing, data, PAPER, SPACE, known, earlier, settings)
     widest = next(check for check in done.checks if check.why == "widest")
     assert widest.solved[1] is None
     assert widest.solved[0] is not None
