@@ -1,4 +1,4 @@
-"""The phantom's socket is read back from its file around the true limb, as deep as its truth says."""
+"""The phantom's socket: it fits any limb, and is read back from its file as deep as its truth says."""
 
 from __future__ import annotations
 
@@ -8,16 +8,22 @@ import numpy as np
 import pytest
 from test_phantom_folder import cubic_law
 
-from limbfit.anatomy.surfaces.surfaces import load_anatomy
+from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.surfaces.surfaces import load_anatomy, write_surface
 from limbfit.phantom import make_limb, make_phantom
-from limbfit.phantom.socket import LINER_MM
-from limbfit.phantom.surfaces import outer_surface
+from limbfit.phantom.socket import LINER_MM, make_socket
+from limbfit.phantom.surfaces import outer_surface, true_anatomy
 from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.socket import read_socket
 from limbfit.study import load_study
 
 
 def test_a_socket_beside_the_patient(tmp_path: Path) -> None:
-    truth = make_phantom(tmp_path / "study", seed=2, socket=True, sites=["01"], mapping=cubic_law)["socket"]
+    def simulate(function, jobs):
+        assert list(tmp_path.glob(".study-*/socket/socket.stl"))  # made before anything is simulated
+        return cubic_law(function, jobs)
+
+    truth = make_phantom(tmp_path / "study", seed=2, socket=True, sites=["01"], mapping=simulate)["socket"]
     study = load_study(tmp_path / "study")
     assert study.socket.file == Path(truth["file"])
     assert study.socket.liner.thickness_mm == truth["liner_mm"]
@@ -32,3 +38,29 @@ def test_a_socket_beside_the_patient(tmp_path: Path) -> None:
         if area["depth_mm"] > 0:
             assert depth[near] > 0.6 * area["depth_mm"]
     assert 1.0 < np.median(depth) < 2.5  # 3 % of a radius of some 60 mm
+
+
+def check_socket(seed: int, file: Path | None = None) -> None:
+    """The socket of a coarse limb, where it decides as on the fine one; read back from a file, if given."""
+    anatomy, liner = true_anatomy(make_limb(seed), 8.0), outer_surface(make_limb(seed), LINER_MM, 8.0)
+    socket, areas = make_socket(anatomy, liner)
+    assert anatomy.height(socket.points).max() < -20.0  # below the cut, with the brim's flare
+    depth = socket.offset(liner)
+    depths = [depth[np.linalg.norm(socket.points - a.position, axis=1).argmin()] for a in areas]
+    assert np.all(np.array(depths[:3]) > [5.0, 4.0, 5.0])  # pressed in, besides 3 % of some 60 mm
+    assert np.all(np.array(depths[3:]) < 0.5)  # relieved
+    if file is not None:
+        write_surface(file, socket.surface)
+        frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+        assert not read_socket(file, outer=liner, frame=frame, bones=anatomy.bones).notes
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_its_bar_bears_on_the_patellar_tendon(seed: int) -> None:
+    check_socket(seed)
+
+
+@pytest.mark.slow
+def test_every_seed_has_a_socket_that_is_read_back(tmp_path: Path) -> None:
+    for seed in range(100):
+        check_socket(seed, tmp_path / "socket.stl")

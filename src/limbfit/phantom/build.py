@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import interp1d
 
-from ..anatomy.surfaces.surfaces import save_anatomy
+from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
 from .forces import DISCRETISATIONS, ForceJob, TrueForce, TruthMeshJob, site_force, site_mesh
@@ -126,13 +126,15 @@ def make_phantom(
     everywhere = true_sites(limb, seed)
     indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
     with _appearing(folder) as work:
-        _write_images(work, limb, everywhere, detail, seed, tell)
         truth = _truth(limb, everywhere, detail, seed, parameters)
-        truth["sites"] = _write_traces(work, limb, indented, detail, seed, parameters, mapping, tell, seen)
-        text = study_text(indented, detail, seed, limb, seen)
+        text, anatomy = study_text(indented, detail, seed, limb, seen), true_anatomy(limb)
         if socket:
-            truth["socket"] = write_socket(work, limb)
+            truth["socket"] = write_socket(work, limb, anatomy)
             text += SOCKET_STUDY
+        _write_images(work, limb, everywhere, detail, seed, tell)
+        truth["sites"] = _write_traces(
+            work, limb, anatomy, indented, detail, seed, parameters, mapping, tell, seen
+        )
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
@@ -179,6 +181,7 @@ def _write_images(
 def _write_traces(
     work: Path,
     limb: Limb,
+    anatomy: Anatomy,
     indented: Sequence[TrueSite],
     detail: str,
     seed: int,
@@ -191,7 +194,7 @@ def _write_traces(
     truth, traces = work / "truth", work / "traces"
     truth.mkdir()
     traces.mkdir()
-    save_anatomy(truth, true_anatomy(limb))
+    save_anatomy(truth, anatomy)
     made = DISCRETISATIONS[detail]
     settings = replace(made.mesh, layers=limb.layers)
     places = [(site.name, _triple(site.position), _triple(site.axis)) for site in indented]

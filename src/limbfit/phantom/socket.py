@@ -5,19 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..anatomy.frame import limb_frame
 from ..anatomy.surfaces.surfacefiles import write_surface
-from ..socket import Area, Recipe, rectified
+from ..anatomy.surfaces.surfaces import Anatomy, Surface
+from ..socket import Area, Recipe, Socket, read_socket, rectified
 from ..socket.landmarks import directions, knee_centre
 from ..socket.regions import default_regions
 from ..socket.trim import Trim
 from .geometry import Limb
-from .surfaces import outer_surface, true_anatomy
+from .surfaces import outer_surface
 
 FILE = Path("socket") / "socket.stl"
 LINER_MM = 6.0
 REDUCTION_PERCENT = 3.0
-BELOW_KNEE_MM = 10.0
+BELOW_KNEE_MM, BAND_MM = 10.0, 6.0  # of the brim at the back, and of the skin that says how far back it is
 # Region, radius and depth (mm) of what is pressed in or relieved.
 AREAS = (
     ("patellar tendon", 25.0, 4.0),
@@ -33,19 +36,48 @@ file = "{FILE.as_posix()}"
 """
 
 
-def write_socket(folder: Path, limb: Limb) -> dict[str, Any]:
-    """Write the socket of a limb into a study's folder; returns what is true of it."""
-    anatomy = true_anatomy(limb)
+def make_socket(anatomy: Anatomy, outer: Surface) -> tuple[Socket, list[Area]]:
+    """The socket around a limb in a liner, and its areas, of which one bears on the patellar tendon.
+
+    Parameters
+    ----------
+    anatomy : of the limb, with a tibia and a patella.
+    outer : the closed surface of the liner, LPS mm, flat at the same proximal cut.
+
+    Raises
+    ------
+    SurfaceError
+        Where the limb has no place for it.
+    """
+    regions = default_regions(anatomy, directions(anatomy))
+    areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS]
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    return rectified(outer, frame, Recipe(_trim(anatomy), REDUCTION_PERCENT, areas)), areas
+
+
+def _trim(anatomy: Anatomy) -> Trim:
+    """As of a patellar-tendon-bearing socket: from the patella's middle to below the knee at the back.
+
+    A brim below the knee all around would cut through the bar on the tendon, half of which lies above it.
+    """
     known, knee = directions(anatomy), knee_centre(anatomy)
     assert knee is not None  # the phantom has a tibia
-    regions = default_regions(anatomy, known)
-    areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS]
-    trim = Trim([(knee - BELOW_KNEE_MM * anatomy.cut_normal, anatomy.cut_normal)])
-    recipe = Recipe(trim, REDUCTION_PERCENT, areas)
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    socket = rectified(outer_surface(limb, LINER_MM), frame, recipe)
+    front, skin = anatomy.bones["patella"].points.mean(axis=0), anatomy.skin.points
+    near = np.abs(anatomy.height(skin) - anatomy.height(knee) + BELOW_KNEE_MM) < BAND_MM
+    behind = ((skin[near] - knee) @ known.anterior).min()
+    back = knee + behind * known.anterior - BELOW_KNEE_MM * known.proximal
+    slope = (front - back) @ known.proximal / ((front - back) @ known.anterior)
+    return Trim([(front, known.proximal - slope * known.anterior)])
+
+
+def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
+    """Write the socket of a limb into a study's folder and read it back; returns what is true of it."""
+    outer = outer_surface(limb, LINER_MM)
+    socket, areas = make_socket(anatomy, outer)
     (folder / FILE).parent.mkdir()
     write_surface(folder / FILE, socket.surface)
+    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    read_socket(folder / FILE, outer=outer, frame=frame, bones=anatomy.bones)
     return {
         "file": FILE.as_posix(),
         "liner_mm": LINER_MM,
