@@ -120,6 +120,11 @@ class Grid:
         array = np.flip(self.array, tuple(2 - axis for axis in axes))
         return replace(self, array=array, origin=self.index_to_point(last), direction=direction)
 
+    def cropped(self, box: Sequence[slice]) -> Self:
+        """The samples in a box of array indices ``[k, j, i]``."""
+        start = [part.start for part in box][::-1]
+        return replace(self, array=self.array[tuple(box)], origin=self.index_to_point(start))
+
     def nearest_lps(self) -> Self:
         """The same samples with right-handed index axes in the order and sense nearest to x, y, z.
 
@@ -169,7 +174,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class Volume(Grid):
-    """A scalar image, ``array`` float32; see :class:`Grid`."""
+    """A scalar image, ``array`` float32; see :class:`Grid`. ``modality`` is DICOM's code where it is known."""
+
+    modality: str = ""
 
     def _as_array(self, array: ArrayLike) -> NDArray[Any]:
         return np.asarray(array, dtype=np.float32)

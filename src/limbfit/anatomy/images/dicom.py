@@ -113,7 +113,7 @@ def _read_volume(series: Series) -> Volume:
     origin = slices[0].position
     assert origin is not None
     check_voxels((slices[0].columns, slices[0].rows, len(slices)), slices[0].path)
-    return Volume(read_pixels(slices), spacing, origin, direction)
+    return Volume(read_pixels(slices), spacing, origin, direction, slices[0].modality)
 
 
 def _none(folder: Path) -> ImageError:

@@ -5,19 +5,12 @@ from __future__ import annotations
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
-from scipy.ndimage import (
-    binary_closing,
-    binary_erosion,
-    binary_fill_holes,
-    binary_opening,
-    gaussian_filter,
-    grey_dilation,
-)
-from scipy.ndimage import label as connected
+from scipy.ndimage import gaussian_filter, grey_dilation
 
 from ...errors import ImageError
 from ..ends import longest_axis
 from ..grid import Volume
+from ..morphology import close_mask, erode_mask, fill_slices, find_box, find_largest_piece, open_mask
 from .supports import without_supports
 
 Mask = NDArray[np.bool_]
@@ -39,21 +32,9 @@ def smoothed(volume: Volume) -> Field:
     return gaussian_filter(volume.array, sigma)
 
 
-def check_contrast(volume: Volume) -> None:
-    """Refuse what the search for markers was not made for."""
-    low, high = float(volume.array.min()), float(volume.array.max())
-    if high <= low:
-        raise ImageError("the image is constant", remedy="check the series")
-    if low < -200:
-        raise ImageError(
-            "the image has the grey values of CT; markers are found in MRI only",
-            remedy="give the sites' positions (position in study.toml)",
-        )
-
-
 def limb_axis(volume: Volume) -> int:
     """The grid axis (0, 1, 2 for i, j, k) along which the limb is longest."""
-    tissue = _largest(volume.array > _otsu(volume.array))
+    tissue = find_largest_piece(volume.array > _otsu(volume.array))
     if tissue.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
     return longest_axis(tissue, volume)
@@ -67,14 +48,22 @@ def limb_mask(volume: Volume, smooth: Field) -> Mask:
     push it outward by partial volume.
     """
     tissue = float(np.median(smooth[smooth > _otsu(smooth)]))
-    rough = _largest(smooth > _TISSUE * tissue)
-    rough = _largest(without_supports(_solid(rough, volume), volume))
+    body = find_largest_piece(smooth > _TISSUE * tissue)
+    box = find_box(body, np.ceil(_CLOSE_MM / volume.spacing[::-1]).astype(int))
+    limb = np.zeros(body.shape, dtype=bool)
+    limb[box] = _outline(body[box], smooth[box], _TISSUE * tissue, volume)
+    return limb
+
+
+def _outline(body: Mask, smooth: Field, darkest: float, volume: Volume) -> Mask:
+    """The limb in the box of the largest body, of what is brighter than ``darkest``."""
+    rough = find_largest_piece(without_supports(_solid(body, volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
     size = 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 1
     half = 0.5 * grey_dilation(smooth, size=tuple(size))
-    core = binary_erosion(rough, ball(_RIM_MM, volume.spacing), border_value=1)
-    return _largest(_solid(core | (rough & (smooth > np.maximum(half, _TISSUE * tissue))), volume))
+    core = erode_mask(rough, _RIM_MM, volume.spacing)
+    return find_largest_piece(_solid(core | (rough & (smooth > np.maximum(half, darkest))), volume))
 
 
 def _otsu(array: Field) -> float:
@@ -86,35 +75,8 @@ def _otsu(array: Field) -> float:
 
 def _solid(mask: Mask, volume: Volume) -> Mask:
     """Closed over dark skin and bone, filled slice by slice, without spikes."""
-    reach = np.ceil(_CLOSE_MM / volume.spacing[::-1]).astype(int) + 1
-    inner = tuple(slice(r, -r) for r in reach)
-    padded = np.pad(mask, [(r, r) for r in reach], mode="edge")
-    closed = binary_closing(padded, ball(_CLOSE_MM, volume.spacing))[inner] | mask
-    filled = fill_slices(closed)
-    opened = binary_opening(
-        np.pad(filled, [(r, r) for r in reach], mode="edge"), ball(_OPEN_MM, volume.spacing)
-    )
-    return fill_slices(opened[inner])
-
-
-def _largest(mask: Mask) -> Mask:
-    parts, count = connected(mask)
-    if count == 0:
-        return mask
-    return parts == int(np.argmax(np.bincount(parts.ravel())[1:])) + 1
-
-
-def fill_slices(mask: Mask) -> Mask:
-    """Holes filled within each slice: a bone that reaches the image's end is a hole there, not in 3-D."""
-    return np.stack([binary_fill_holes(plane) for plane in mask])
-
-
-def ball(radius_mm: float, spacing: NDArray[np.float64]) -> Mask:
-    """A ball in physical size as a structuring element ``[k, j, i]``."""
-    steps = spacing[::-1]
-    axes = [np.arange(-n, n + 1) * s for n, s in zip((radius_mm / steps).astype(int), steps)]
-    grid = np.meshgrid(*axes, indexing="ij")
-    return sum(x * x for x in grid) <= radius_mm**2 + 1e-9
+    filled = fill_slices(close_mask(mask, _CLOSE_MM, volume.spacing))
+    return fill_slices(open_mask(filled, _OPEN_MM, volume.spacing))
 
 
 def bias_field(volume: Volume, limb: Mask) -> Field:

@@ -14,16 +14,10 @@ from itertools import pairwise
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
-from scipy.ndimage import (
-    binary_dilation,
-    binary_erosion,
-    binary_opening,
-    binary_propagation,
-    distance_transform_edt,
-)
+from scipy.ndimage import binary_propagation, distance_transform_edt, find_objects
 from scipy.ndimage import label as connected
 
-from .body import ball, fill_slices
+from ..morphology import compute_depth, dilate_mask, erode_mask, fill_slices, find_box, open_mask
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -50,18 +44,20 @@ def find_bones(levels: Field, limb: Mask, spacing: Spacing, smallest_mm3: float)
     spacing : mm along i, j, k.
     smallest_mm3 : bones smaller than this are left out.
     """
-    deep = _depth(limb, spacing) > _SKIN_MM
+    deep = compute_depth(limb, spacing) > _SKIN_MM
     marrow = deep & (levels > _BRIGHT) & (escape_level(levels, limb) < _ESCAPE)
     parts = _parts(marrow, _SEED_PART * smallest_mm3 / float(np.prod(spacing)))
     if parts.max() == 0:
         return []
-    for value in range(1, parts.max() + 1):
-        _follow(parts, value, levels, deep, spacing)
+    for value, place in enumerate(find_objects(parts), start=1):
+        _follow(parts, value, place[0], levels, deep, spacing)
     parts = _rejoined(parts)
-    owned = _with_cortex(parts, levels, deep, spacing)
-    bones = [owned == value for value in range(1, parts.max() + 1)]
-    large = [bone for bone in bones if bone.sum() * np.prod(spacing) >= smallest_mm3]
-    return sorted(large, key=lambda bone: -int(bone.sum()))
+    box = find_box(parts > 0, np.ceil(_CORTEX_MM / spacing[::-1]).astype(int) + 1)
+    owned = np.zeros_like(parts)
+    owned[box] = _with_cortex(parts[box], levels[box], deep[box], spacing)
+    sizes = np.bincount(owned[box].ravel())[1:]
+    large = 1 + np.flatnonzero(sizes * np.prod(spacing) >= max(smallest_mm3, 1))
+    return [owned == value for value in sorted(large, key=lambda value: -sizes[value - 1])]
 
 
 def escape_level(levels: Field, limb: Mask) -> Field:
@@ -75,13 +71,6 @@ def escape_level(levels: Field, limb: Mask) -> Field:
     return found
 
 
-def _depth(limb: Mask, spacing: Spacing) -> Field:
-    """Distance to the outline, mm; the image's ends do not count as outline."""
-    padded = np.pad(limb, ((1, 1), (1, 1), (1, 1)))
-    padded[0], padded[-1] = padded[1], padded[-2]
-    return distance_transform_edt(padded, sampling=spacing[::-1])[1:-1, 1:-1, 1:-1]
-
-
 def _parts(marrow: Mask, smallest: float) -> NDArray[np.int32]:
     """Connected cavities of at least ``smallest`` voxels, numbered from 1."""
     found, count = connected(marrow, np.ones((3, 3, 3)))
@@ -93,28 +82,31 @@ def _parts(marrow: Mask, smallest: float) -> NDArray[np.int32]:
     return number[found]
 
 
-def _follow(parts: NDArray[np.int32], value: int, levels: Field, deep: Mask, spacing: Spacing) -> None:
-    """Go on slice by slice where the cortex is too thin to enclose the marrow, as near a joint.
+def _follow(
+    parts: NDArray[np.int32], value: int, slices: slice, levels: Field, deep: Mask, spacing: Spacing
+) -> None:
+    """Go on beyond a part's slices where the cortex is too thin to enclose the marrow, as near a joint.
 
     Changes ``parts`` in place.
     """
-    filled = np.flatnonzero((parts == value).any(axis=(1, 2)))
-    for step, k in ((-1, int(filled[0])), (1, int(filled[-1]))):
+    margin = np.ceil(_STEP_OUT_MM / spacing[1::-1]).astype(int) + 1
+    for step, k in ((-1, slices.start), (1, slices.stop - 1)):
         while 0 <= k + step < len(parts):
-            previous = fill_slices((parts[k] == value)[None])[0]
+            box = find_box(parts[k] == value, margin)
+            previous = fill_slices((parts[k][box] == value)[None])[0]
             k += step
-            free = deep[k] & ((parts[k] == 0) | (parts[k] == value))
-            found = _next_section(previous, levels[k], free, spacing)
+            here = parts[k][box]
+            free = deep[k][box] & ((here == 0) | (here == value))
+            found = _next_section(previous, levels[k][box], free, spacing)
             if found is None:
                 break
-            parts[k][found] = value
+            here[found] = value
 
 
 def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) -> Mask | None:
     """The marrow in the next slice, split from fat around it along the darkest line (watershed)."""
-    flat = np.array([spacing[0], spacing[1], 1e6])
-    inside = binary_erosion(previous, ball(_STEP_IN_MM, flat)[0]) & free
-    allowed = binary_dilation(previous, ball(_STEP_OUT_MM, flat)[0]) & free
+    inside = erode_mask(previous, _STEP_IN_MM, spacing) & free
+    allowed = dilate_mask(previous, _STEP_OUT_MM, spacing) & free
     if not inside.any():
         return None
     markers = np.where(allowed, 0, 2).astype(np.uint8)
@@ -123,7 +115,7 @@ def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) ->
         sitk.GetImageFromArray(-plane), sitk.GetImageFromArray(markers), False, True
     )
     section = (sitk.GetArrayFromImage(basins) == 1) & (plane > _BRIGHT)
-    section = binary_opening(section, ball(_STEP_IN_MM, flat)[0])
+    section = open_mask(section, _STEP_IN_MM, spacing)
     ratio = section.sum() / previous.sum()
     return section if _GROWTH[0] <= ratio <= _GROWTH[1] else None
 
@@ -146,15 +138,9 @@ def _with_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: S
     distance, nearest = distance_transform_edt(~marrow, sampling=spacing[::-1], return_indices=True)
     dark = deep & (levels < _DARK) & (distance < _CORTEX_MM)
     bone = binary_propagation(marrow, mask=fill_slices(marrow | dark))
-    bone = _without_tails(bone, spacing) | marrow
+    bone = open_mask(bone, _TAIL_MM, spacing) | marrow
     bone = binary_propagation(marrow, mask=fill_slices(bone))
     return np.where(bone, parts[tuple(nearest)], 0)
-
-
-def _without_tails(bone: Mask, spacing: Spacing) -> Mask:
-    reach = int(_TAIL_MM / spacing[2]) + 1
-    padded = np.pad(bone, ((reach, reach), (0, 0), (0, 0)), mode="edge")
-    return binary_opening(padded, ball(_TAIL_MM, spacing))[reach:-reach]
 
 
 def name_bones(bones: list[Mask], spacing: Spacing) -> list[str]:

@@ -15,28 +15,53 @@ from ..grid import Volume
 Contrast = Literal["auto", "T1", "UTE", "CT"]
 
 AIR_HU, MUSCLE_HU = -1000.0, 50.0
-_LOWEST_MR = -200.0  # MRI has no negative values but for small ones of filters
+_LIGHTEST_HU = -200.0  # every CT of a limb shows something lighter than fat
+_AIR_WINDOW_HU = -400.0  # no air is denser, where a grey-value window cut it off
+_AIR_WIDTH_HU = 200.0  # of the peak of air in the histogram
+_AIR_SHARE = 0.01  # of the voxels: fewer are an artefact of resampling
 _TOP_HU = 100.0  # the outline does not tell bone from soft tissue
 
 
 def is_ct(volume: Volume, stated: Contrast = "auto") -> bool:
-    """Whether an image has Hounsfield units, by its grey values; what was stated must not contradict them.
+    """Whether an image has Hounsfield units: by its DICOM modality, else by the peak of air in its histogram.
+
+    Without a modality a stated ``CT`` needs no such peak, only grey values below those of fat.
 
     Raises
     ------
     ImageError
-        For a constant image, or a stated contrast that the grey values contradict.
+        For a constant image, a CT without Hounsfield units, or a stated contrast that the image contradicts.
     """
     low, high = float(volume.array.min()), float(volume.array.max())
     if high <= low:
         raise ImageError("the image is constant", remedy="check the series")
-    found = low < _LOWEST_MR
+    if volume.modality in ("CT", "MR"):
+        found, evidence = volume.modality == "CT", f"the DICOM modality {volume.modality} does"
+    else:
+        found = _shows_air(volume, low) or (stated == "CT" and low < _LIGHTEST_HU)
+        evidence = f"the grey values, {low:.0f} to {high:.0f}, do"
     if stated != "auto" and found != (stated == "CT"):
         raise ImageError(
-            f"the grey values, {low:.0f} to {high:.0f}, are not those of {stated}",
+            f"{evidence} not fit {stated}",
             remedy='check the series, or give segmentation.contrast = "auto"',
         )
+    if found and low > _LIGHTEST_HU:
+        raise ImageError(
+            f"the grey values of this CT, {low:.0f} to {high:.0f}, are not Hounsfield units",
+            remedy="export the original series again",
+        )
     return found
+
+
+def _shows_air(volume: Volume, low: float) -> bool:
+    """Whether the histogram has a peak at -1000, or at the end of a grey-value window.
+
+    Resampling of MRI by B-splines overshoots to negative values too, but in few voxels, the fewer the lower.
+    """
+    air = max(low, AIR_HU)
+    span = (air - _AIR_WIDTH_HU / 2, air + 1.5 * _AIR_WIDTH_HU)
+    peak, beside = np.histogram(volume.array, bins=2, range=span)[0]
+    return bool(air < _AIR_WINDOW_HU and peak > beside and peak > _AIR_SHARE * volume.array.size)
 
 
 def above_air(volume: Volume) -> Volume:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_opening, find_objects, grey_dilation
+from scipy.ndimage import find_objects, grey_dilation
 from scipy.ndimage import label as connected
 
-from .body import ball, fill_slices
+from ..morphology import close_mask, fill_slices, open_mask
 from .contrast import MUSCLE_HU
 
 Mask = NDArray[np.bool_]
@@ -57,10 +57,7 @@ def _inner(sharp: Mask, dense: Mask, spacing: Spacing) -> Mask:
 
 def _filled(part: Mask, spacing: Spacing) -> Mask:
     """Closed over gaps of the cortex, filled slice by slice, without spikes."""
-    reach = np.ceil(_CLOSE_MM / spacing[::-1]).astype(int) + 1
-    inner = tuple(slice(r, -r) for r in reach)
-    padded = np.pad(part, [(reach[0], reach[0])] + [(r, r) for r in reach[1:]], mode="constant")
-    padded[: reach[0]], padded[-reach[0] :] = padded[reach[0]], padded[-reach[0] - 1]
-    closed = fill_slices(binary_closing(padded, ball(_CLOSE_MM, spacing)) | padded)
-    opened = binary_opening(closed, ball(_SMOOTH_MM, spacing)) | (closed & padded)
-    return np.asarray(opened[inner])
+    padded = np.pad(part, ((0, 0), (1, 1), (1, 1)))  # a bone goes on beyond its ends, not beside them
+    closed = fill_slices(close_mask(padded, _CLOSE_MM, spacing))
+    opened = open_mask(closed, _SMOOTH_MM, spacing) | padded
+    return np.asarray(opened[:, 1:-1, 1:-1])

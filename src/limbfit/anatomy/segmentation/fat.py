@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_propagation, distance_transform_edt, gaussian_filter
 from scipy.ndimage import label as connected
 
+from ..morphology import find_largest_piece, open_mask
+
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
 Spacing = NDArray[np.float64]
@@ -33,7 +35,7 @@ _NOISE_MM = 0.9
 def bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
     """Voxels nearer to fat than to muscle in MRI, as bright as these are in their neighbourhood.
 
-    ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`depth_below`). What a coil
+    ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`compute_depth`). What a coil
     sees less of is darker, fat and muscle alike, and N4 leaves some of that.
     """
     rind = limb & ~bones & (depth < _RIND_MM)
@@ -68,10 +70,11 @@ def _half_way(levels: Field, rind: Mask, spacing: Spacing) -> Field:
         found = found[tuple(nearest)]
     else:
         found[:] = (1 + _BRIGHTEST) / 2
-    whole = [
-        np.interp(np.arange(n) / e, c, np.arange(len(c))) for n, e, c in zip(levels.shape, every, centres)
-    ]
-    return _resampled(found, whole)
+    k, j, i = (
+        _interpolate_places(np.interp(np.arange(n) / e, c, np.arange(len(c))), len(c))
+        for n, e, c in zip(levels.shape, every, centres)
+    )
+    return j @ np.tensordot(k, found.astype(np.float32), 1) @ i.T
 
 
 def _between(values: Field) -> float:
@@ -90,13 +93,13 @@ def _centres(count: int, step: float) -> NDArray[np.float64]:
     return np.linspace(0, count - 1, max(2, round(count / max(step, 1.0)) + 1))
 
 
-def _resampled(coarse: NDArray[np.float64], places: list[NDArray[np.float64]]) -> Field:
-    """Linear interpolation axis by axis at fractional indices."""
-    for axis, place in enumerate(places):
-        low = np.minimum(place.astype(int), coarse.shape[axis] - 2)
-        part = (place - low).reshape([-1 if n == axis else 1 for n in range(3)]).astype(np.float32)
-        coarse = np.take(coarse, low, axis) * (1 - part) + np.take(coarse, low + 1, axis) * part
-    return coarse.astype(np.float32)
+def _interpolate_places(places: NDArray[np.float64], count: int) -> Field:
+    """The matrix (n, count) that interpolates ``count`` values linearly at fractional indices (n,)."""
+    low = np.minimum(places.astype(int), count - 2)
+    rows, part = np.arange(len(places)), (places - low).astype(np.float32)
+    weights = np.zeros((len(places), count), dtype=np.float32)
+    weights[rows, low], weights[rows, low + 1] = 1 - part, part
+    return weights
 
 
 def subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
@@ -106,21 +109,12 @@ def subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: S
     """
     outer = ~limb | (depth < SKIN_MM)
     layer = _without_small_holes(bright | outer, spacing) & ~bones
-    opened = _opened(layer, spacing)
+    opened = open_mask(layer, SEPTUM_MM, spacing)
     joined = binary_propagation(outer & opened, mask=opened) | outer
     # What the layer parts from the inner limb belongs to it too.
-    parts, count = connected(limb & ~joined)
-    if count > 1:
-        joined |= (parts > 0) & (parts != int(np.argmax(np.bincount(parts.ravel())[1:])) + 1)
+    rest = limb & ~joined
+    joined |= rest & ~find_largest_piece(rest)
     return np.asarray(joined & limb & ~bones)
-
-
-def depth_below(limb: Mask, spacing: Spacing) -> Field:
-    """Distance to the outline, mm; the image's ends do not count as outline."""
-    padded = np.pad(limb, ((1, 1), (1, 1), (1, 1)))
-    padded[0], padded[-1] = padded[1], padded[-2]
-    found = distance_transform_edt(padded, sampling=spacing[::-1])[1:-1, 1:-1, 1:-1]
-    return np.asarray(found, dtype=np.float32)
 
 
 def _without_small_holes(mask: Mask, spacing: Spacing) -> Mask:
@@ -131,12 +125,3 @@ def _without_small_holes(mask: Mask, spacing: Spacing) -> Mask:
     small = np.bincount(parts.ravel()) * float(spacing[0] * spacing[1]) < _VESSEL_MM2
     small[0] = False
     return np.asarray(mask | small[parts])
-
-
-def _opened(mask: Mask, spacing: Spacing) -> Mask:
-    """Opened by a ball of ``SEPTUM_MM``; beyond the image everything goes on as at its border."""
-    reach = np.ceil(2 * SEPTUM_MM / spacing[::-1]).astype(int) + 1
-    padded = np.pad(mask, [(r, r) for r in reach], mode="edge")
-    inner = distance_transform_edt(padded, sampling=spacing[::-1]) > SEPTUM_MM
-    opened = distance_transform_edt(~inner, sampling=spacing[::-1]) <= SEPTUM_MM
-    return np.asarray(opened[tuple(slice(r, -r) for r in reach)])

@@ -12,16 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, grey_dilation
+from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import cKDTree
 
+from ...errors import ImageError
 from ..grid import Volume
-from ..segmentation.body import ball, check_contrast, limb_mask, smoothed
+from ..morphology import dilate_mask, erode_mask, find_box
+from ..segmentation.body import limb_mask, smoothed
+from ..segmentation.contrast import is_ct
 from ..surfaces.triangles import Surface, bodies, from_pyvista
 from .markers import Bump, bumps, cap_faces, near_cap
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Field = NDArray[np.float32]
 
 _RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
 _SPACING_MM = 3.0  # of the places where patches are fitted
@@ -38,22 +42,32 @@ def marked_skin(volume: Volume) -> tuple[Surface, Mask]:
 
     Where the image ends, the skin is closed by a flat cap.
     """
-    check_contrast(volume)
+    if is_ct(volume):
+        raise ImageError(
+            "the image is CT; markers are found in MRI only",
+            remedy="give the sites' positions (position in study.toml)",
+        )
     smooth = smoothed(volume)
     limb = limb_mask(volume, smooth)
-    near = ball(_RIM_MM, volume.spacing)
-    core = binary_erosion(limb, near, border_value=1)
-    size = 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 1
+    box = find_box(limb, 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 2)
+    contour = _contour(smooth[box], limb[box], volume.spacing)
+    skin = Surface(volume.cropped(box).index_to_point(contour.points), contour.faces)
+    return (skin if skin.volume > 0 else skin.flipped), limb
+
+
+def _contour(smooth: Field, limb: Mask, spacing: Array) -> Surface:
+    """Where the signal falls to half of the tissue beside it, near to a limb's outline, in voxels."""
+    core = erode_mask(limb, _RIM_MM, spacing)
+    size = 2 * np.ceil(_RIM_MM / spacing[::-1]).astype(int) + 1
     half = gaussian_filter(0.5 * grey_dilation(smooth, size=tuple(size)), 1.0)
     level = np.clip(smooth / np.maximum(half, 1e-6) - 1, -1, 1)
     level[core] = 1.0
-    level[~binary_dilation(limb, near)] = -1.0
+    level[~dilate_mask(limb, _RIM_MM, spacing)] = -1.0
     padded = np.pad(level, 1, constant_values=-1.0)
     data = pv.ImageData(dimensions=padded.shape[::-1])
     data.point_data["level"] = padded.ravel()
     found = from_pyvista(data.contour([0.0], scalars="level", method="flying_edges", compute_normals=False))
-    skin = bodies(Surface(volume.index_to_point(found.points - 1), found.faces))[0]
-    return (skin if skin.volume > 0 else skin.flipped), limb
+    return bodies(Surface(found.points - 1, found.faces))[0]
 
 
 @dataclass(frozen=True)
