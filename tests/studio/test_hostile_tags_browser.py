@@ -111,7 +111,7 @@ def test_no_tag_is_run_shown_sent_or_stored(limb, serve, launch):
     page.reload()
     drawn = {
         "identification": page.locator("#run-state").get_by_text("The last run"),
-        "image": page.locator("#status").get_by_text("Image ready."),
+        "image": page.locator(".view.image[data-state=ready]"),
         "model": page.get_by_role("checkbox", name="tibia"),
         "traces": page.locator("#trace-facts dd").first,
         "results": page.get_by_text("No fields are stored for this site."),
@@ -136,7 +136,7 @@ def test_no_tag_is_run_shown_sent_or_stored(limb, serve, launch):
     sorted((limb / "mri").iterdir())[30].unlink()
     page.goto(page.url.partition("#")[0] + "#/image")
     page.reload()
-    page.get_by_text("This view does not open").wait_for()
+    page.get_by_text("Cannot read the image").wait_for()
     page.evaluate("location.hash = '#/identification'")
     page.locator("#run-start").click()
     until(lambda: page.locator("#run-state.bad").count())

@@ -32,7 +32,7 @@ def write_run(results, folder: str, begin: str, factor: float) -> dict:
 @pytest.mark.slow
 def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, open_page):
     page = open_page(serve(study) + "#/socket")
-    page.get_by_text("No socket run is stored: limbfit socket STUDY makes one").wait_for()
+    page.get_by_text("No run of the socket is stored yet.").wait_for()
     results = study / "results"
     content = write_run(results, "socket", "held", 5.0)
     (results / "socket" / "socket.json").write_text(json.dumps(content))

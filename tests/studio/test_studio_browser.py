@@ -65,7 +65,8 @@ def test_a_painted_stroke_is_saved_and_stages_turn_stale(tmp_path, serve, open_p
     file = limb / "results" / "segment" / "labels.seg.nrrd"
     before = read_labels(file)
     page = open_page(serve(limb) + "#/image")
-    until(lambda: "Image ready" in page.locator("#status").inner_text())
+    page.locator(".view.image[data-state=ready]").wait_for()
+    assert page.locator("#status").inner_text() == ""
     page.locator("#layout-axial").click()
     canvas = page.locator("#slices")
     box = canvas.bounding_box()

@@ -90,10 +90,12 @@ def _file(folder: StudyFolder, run: str, step: int) -> Path:
 
 @router.get("")
 def get_runs(folder: Folder) -> dict[str, Any]:
-    """Stored runs, and the patient's sides."""
+    """Stored runs, the patient's sides, and the run that goes on or begins."""
     anatomy = anatomy_of(folder, folder.load())
     frame = patient_frame(None if anatomy is None else anatomy.cut_normal)
-    return {"runs": runs_of(folder), "frame": frame.tolist()}
+    run = running(folder)
+    more = {"run": run, "starting": starting(folder), "last": last_run(folder, run is not None)}
+    return {"runs": runs_of(folder), "frame": frame.tolist()} | more
 
 
 @router.get("/mesh/{run}")
@@ -139,7 +141,7 @@ def shape_of(folder: StudyFolder) -> dict[str, Any]:
 
     ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one;
     ``trim``: ``points`` where the brim runs on the skin, and whether they are those of a line; ``mark``,
-    which another face changes, ``problem`` in words or None, ``volume_cm3``.
+    which another face changes, ``problem`` in words or None, ``has_limb``, ``volume_cm3``.
     """
     study = folder.load()
     table, anatomy = study.socket, anatomy_of(folder, study)
@@ -164,6 +166,7 @@ def shape_of(folder: StudyFolder) -> dict[str, Any]:
         "regions": list(regions),
         "mark": mark,
         "problem": None if drawn else found,
+        "has_limb": anatomy is not None,
         "volume_cm3": found.volume_mm3 / 1000.0 if isinstance(found, Socket) else None,
     }
 
@@ -248,10 +251,8 @@ def _drawn(folder: StudyFolder, mark: str) -> Socket | str:
 
 @router.get("/shape")
 def get_shape(folder: Folder) -> dict[str, Any]:
-    """What the study says of the shape, whether it can be drawn, and the run that goes on or begins."""
-    run = running(folder)
-    more = {"run": run, "starting": starting(folder), "last": last_run(folder, run is not None)}
-    return shape_of(folder) | more
+    """What the study says of the shape, and whether it can be drawn; see `shape_of`."""
+    return shape_of(folder)
 
 
 @router.get("/face")

@@ -1,18 +1,21 @@
 // The shell: tabs, stages, theme, and what every view is given.
 //
 // A view is a module `views/<name>.js` that exports
-//   mount(element, context)   builds the view in `element`; may return { show(), hide() }
+//   mount(element, context)   builds the view in `element`; returns { show(), hide() }, of which none is needed
 // and is given
 //   context.api.get(path), .post(path, body), .bytes(path), .url(path)   paths below /api
 //   context.study             the study as GET /api/study tells it; always the newest
 //   context.stages, .run      rows of `limbfit status`, and the run that goes on or null
 //   context.on(listener)      listener({ study, stages, labels, log, acquired, run, theme }), true for what changed;
 //                             a hidden view is told of it when it is shown again
+//   context.load(place, what, read)   reads what a place shows: see states.js
 //   context.say(text)         a line at the bottom, read out too, while the view is seen;  context.warn(text) one that stays
 //   context.refresh()         ask for changes at once
+// A view builds itself and reads what it shows by `load`, which says in its place what is loading, missing or wrong.
 // Nothing is kept here that is not in the study's files.
 import { api, ApiError } from "/static/api.js";
 import { el, replace } from "/static/dom.js";
+import { load } from "/static/states.js";
 
 const VIEWS = [
   ["image", "Image"],
@@ -32,6 +35,7 @@ const context = {
   study: null,
   stages: [],
   run: null,
+  load: (place, what, read) => load(place, what, read, context.warn),
   say(text) {
     document.getElementById("status").textContent = text;
   },
@@ -145,14 +149,11 @@ async function open(name) {
     on: { value: (listener) => made.listeners.add(listener) },
     say: { value: (text) => context.view === name && context.say(text) },
   });
-  try {
-    const module = await import(`/static/views/${name}.js`);
-    made.view = (await module.mount(element, own)) ?? {};
+  await context.load(element, "the view", async () => {
+    const { mount } = await import(`/static/views/${name}.js`);
+    made.view = mount(element, own);
     tellMissed(made);
-  } catch (error) {
-    replace(element, el("p", { class: "failed" }, `This view does not open: ${error.message}`));
-    console.error(error);
-  }
+  });
 }
 
 function route() {
@@ -213,7 +214,7 @@ async function begin() {
   if (location.search) history.replaceState(null, "", `/${location.hash}`); // the key stays out of sight
   theme();
   tabs();
-  await poll();
+  await context.load(document.getElementById("view"), "the study", () => poll());
   addEventListener("hashchange", route);
   route();
 }

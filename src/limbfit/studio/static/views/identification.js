@@ -9,9 +9,9 @@ const LOOKS = [["--second", "solid"], ["--simulated", "dashed"], ["--third", "da
 const ENDS = { running: "goes on", ended: "ended well" };
 const STATES = { done: "done", stale: "stale", begun: "begun", missing: "not done" };
 
-export async function mount(element, context) {
+export function mount(element, context) {
   const view = new IdentificationView(element, context);
-  await view.refresh();
+  view.refresh();
   context.on((changed) => (changed.study || changed.stages || changed.log || changed.run) && view.refresh());
   context.on((changed) => changed.theme && view.charts.forEach((chart) => chart.draw()));
   return { show: () => view.refresh() };
@@ -19,7 +19,7 @@ export async function mount(element, context) {
 
 class IdentificationView {
   constructor(element, context) {
-    this.context = context;
+    Object.assign(this, { element, context });
     this.parts = new Map();
     this.site = null;
     element.classList.add("split");
@@ -34,6 +34,7 @@ class IdentificationView {
 
   sidebar() {
     this.start = el("button", { type: "button", class: "main", id: "run-start", onclick: () => this.run({}) }, "Run what is missing");
+    this.runAll = el("button", { type: "button", class: "main", onclick: () => this.run({}) }, "Run the study");
     this.stop = el("button", { type: "button", id: "run-stop", onclick: () => this.halt() }, "Stop");
     this.until = el("select", { id: "run-until" });
     this.state = el("p", { id: "run-state", role: "status" });
@@ -69,21 +70,24 @@ class IdentificationView {
       return;
     }
     this.busy = true;
-    try {
-      this.found = await this.context.api.get("identification");
-      this.tellRun();
-      this.convergence();
-      this.results();
-      this.sites();
-    } catch (error) {
-      this.context.warn(error.message);
-    } finally {
-      this.busy = false;
-    }
+    await this.context.load(this.element, "the search and what came out", () => this.read());
+    this.busy = false;
     if (this.again) {
       this.again = false;
       this.refresh();
     }
+  }
+
+  async read() {
+    this.found = await this.context.api.get("identification");
+    this.tellRun();
+    this.convergence();
+    this.results();
+    this.sites();
+    const { answer, iterates, run, starting } = this.found;
+    if (answer || iterates.rows.length) return;
+    if (run || starting) return { text: "The study is running. Its search appears here once it has begun." };
+    return { text: "Nothing is identified yet: the stages until calibrate search the parameters of the tissues.", actions: [this.runAll] };
   }
 
   // --- the run --------------------------------------------------------------------------------------------
@@ -235,7 +239,7 @@ class IdentificationView {
   results() {
     const { answer, parameters, tissues } = this.found;
     if (!answer) {
-      replace(this.answer, el("p", {}, "Nothing is identified yet: run the stages until calibrate."));
+      replace(this.answer, el("p", {}, "Nothing is identified yet."));
       return;
     }
     if (this.answered === JSON.stringify(answer)) return;

@@ -1,28 +1,24 @@
 // The view Image: slices and 3-D by niivue, labels painted on top and saved into the study.
 import { el, replace } from "/static/dom.js";
+import { canDraw } from "/web/viewer.js";
+import { NO_WEBGL, runButton } from "/static/views/parts.js";
 
 const LAYOUTS = [["all", "All"], ["axial", "Axial"], ["coronal", "Coronal"], ["sagittal", "Sagittal"], ["render", "3-D"]];
 const STEPS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0], PageUp: [0, 0, 1], PageDown: [0, 0, -1] };
 
-export async function mount(element, context) {
-  const facts = await context.api.get("image");
-  if (!facts.has_image) {
-    element.append(el("p", { class: "padded" }, "This study starts from surfaces: it has no image. See the limb under Model."));
-    return {};
-  }
+export function mount(element, context) {
   const view = new ImageView(element, context);
-  await view.open(facts);
-  context.on((changed) => changed.labels && view.labelsChanged());
-  context.on((changed) => changed.theme && view.colours());
+  view.refresh();
+  context.on((changed) => (changed.labels || (changed.study && element.dataset.state !== "ready")) && view.refresh());
+  context.on((changed) => changed.theme && view.viewer && view.colours());
   return { show: () => view.wake(), hide: () => view.sleep() };
 }
 
 class ImageView {
   constructor(element, context) {
-    this.context = context;
+    Object.assign(this, { element, context });
     this.strokes = [];
     this.pen = null;
-    element.classList.add("split");
     this.canvas = el("canvas", { id: "slices", tabindex: 0, "aria-describedby": "slice-keys",
       "aria-label": "Slices of the image and the limb in 3-D" });
     this.place = el("p", { class: "hint", id: "place", "aria-live": "off" });
@@ -32,8 +28,30 @@ class ImageView {
     this.canvas.addEventListener("keydown", (event) => this.key(event));
   }
 
+  refresh() {
+    return this.context.load(this.element, "the image", () => this.read());
+  }
+
+  async read() {
+    const facts = await this.context.api.get("image");
+    this.element.classList.toggle("split", facts.has_image);
+    if (!facts.has_image) {
+      const model = el("button", { type: "button", onclick: () => (location.hash = "#/model") }, "Show the limb");
+      return { text: "This study starts from surfaces: it has no image.", actions: [model] };
+    }
+    if (!canDraw()) return { text: NO_WEBGL };
+    const first = !this.opened;
+    this.opened ??= this.open(facts);
+    try {
+      await this.opened;
+    } catch (error) {
+      this.opened = null;
+      throw error;
+    }
+    if (!first) await this.labelsChanged(facts);
+  }
+
   async open(facts) {
-    this.context.say("Reading the image …");
     const { api } = this.context;
     const [library, image] = await Promise.all([import("/static/vendor/niivue.js"), api.bytes("image/volume")]);
     const { Niivue, NVImage, SHOW_RENDER, MULTIPLANAR_TYPE, SLICE_TYPE } = library;
@@ -61,15 +79,15 @@ class ImageView {
     this.viewer.onDrawingChanged = (action) => action === "draw" && this.stroke();
     this.viewer.createOnLocationChange();
     await this.surfaces(facts.surfaces);
-    this.context.say("Image ready.");
   }
 
   /** Nothing is drawn on a canvas without a size. */
   sleep() {
-    this.viewer.drawScene = () => {};
+    if (this.viewer) this.viewer.drawScene = () => {};
   }
 
   wake() {
+    if (!this.viewer) return;
     delete this.viewer.drawScene;
     this.viewer.resizeListener();
   }
@@ -120,8 +138,7 @@ class ImageView {
   }
 
   /** Someone else (a run, another tab, 3D Slicer) wrote the labels. */
-  async labelsChanged() {
-    const facts = await this.context.api.get("image");
+  async labelsChanged(facts) {
     if (facts.labels?.base === this.facts.labels?.base) return;
     if (this.strokes.length) {
       this.context.warn("The labels were changed elsewhere while you painted: they can no longer be saved from here. Use “Start again” to see the new ones.");
@@ -240,7 +257,7 @@ class ImageView {
   }
 
   paintControls(slider) {
-    if (!this.facts.labels) return [el("h2", {}, "Labels"), el("p", {}, "No labels yet: run the stage segment under Identification.")];
+    if (!this.facts.labels) return [el("h2", {}, "Labels"), el("p", {}, "There are no labels yet."), runButton(this.context, "segment")];
     const names = this.facts.labels.names;
     const choose = (value, text, colour) => {
       const swatch = colour ? el("span", { class: "swatch" }) : null;

@@ -2,7 +2,7 @@
 import { el, replace } from "/static/dom.js";
 import { readArrays } from "/web/arrays.js";
 import { canDraw, Viewer } from "/web/viewer.js";
-import { cutPanel, FITTED, HELD_OUT, labelled, loadMesh, NAVIGATION, NO_WEBGL, REGION_COLOURS, SIDES } from "/static/views/parts.js";
+import { cutPanel, FITTED, HELD_OUT, labelled, loadMesh, NAVIGATION, NO_WEBGL, REGION_COLOURS, runButton, SIDES } from "/static/views/parts.js";
 import { SiteEditor } from "/static/views/sites.js";
 
 const DRAFT = "#cc79a7";
@@ -14,9 +14,9 @@ const QUALITIES = {
   volume_mm3: { title: "volume of a cell (mm³)" },
 };
 
-export async function mount(element, context) {
+export function mount(element, context) {
   const view = new ModelView(element, context);
-  await view.refresh();
+  view.refresh();
   context.on((changed) => (changed.study || changed.stages) && view.refresh());
   return { show: () => view.viewer?.resize() };
 }
@@ -33,8 +33,9 @@ class ModelView {
       this.viewer = new Viewer(this.stage, "The limb in three dimensions with its sites.");
       this.viewer.onSite = (name) => this.choose(name);
       this.viewer.onSurface = (hit) => this.editor.placed(hit.point);
-    } else this.stage.append(el("p", { class: "padded failed" }, NO_WEBGL));
+    }
     this.editor = new SiteEditor(this);
+    this.run = runButton(context, "surfaces");
     this.build();
   }
 
@@ -61,15 +62,15 @@ class ModelView {
     this.meshPanel.hidden = true;
   }
 
-  async refresh() {
-    const turn = ++this.reading;
-    try {
-      const scene = await this.context.api.get("model/scene");
-      if (turn !== this.reading) return; // a newer one was asked for or taken
-      await this.take(scene, JSON.stringify(scene) === JSON.stringify(this.scene));
-    } catch (error) {
-      this.context.warn(error.message);
-    }
+  refresh() {
+    return this.context.load(this.element, "the model", () => this.read());
+  }
+
+  async read() {
+    const turn = ++this.reading, scene = await this.context.api.get("model/scene");
+    if (turn === this.reading) await this.take(scene, JSON.stringify(scene) === JSON.stringify(this.scene)); // else a newer one was asked for or taken
+    if (!this.drawing) return { text: NO_WEBGL };
+    if (!this.shapes.size) return { text: "There are no surfaces of the limb yet.", actions: [this.run] };
   }
 
   /**
@@ -78,14 +79,14 @@ class ModelView {
    */
   async take(scene, unchanged = false) {
     ++this.reading; // an older answer that is still under way is void
-    const first = this.scene === null || !Object.keys(this.scene.surfaces).length;
     this.scene = scene;
     if (!scene.sites.some((site) => site.name === this.chosen)) this.chosen = scene.sites[0]?.name ?? null;
     if (!unchanged) this.editor.show();
     this.marks();
     if (this.drawing) {
       await this.readSurfaces();
-      if (first) this.viewer.lookAtAll(scene.frame);
+      if (this.shapes.size && !this.framed) this.viewer.lookAtAll(scene.frame);
+      this.framed = this.shapes.size > 0;
     }
     this.showBoxes();
     await this.showMesh();
@@ -122,7 +123,6 @@ class ModelView {
       const box = el("input", { type: "checkbox", checked: shape.shown, onchange: () => this.showShape(shape, box.checked) });
       return el("label", { class: "row" }, box, name);
     }));
-    if (!this.shapes.size && this.drawing) replace(this.shown, el("p", { class: "hint" }, "There are no surfaces yet: run the stages until surfaces (view Identification)."));
     this.showSurfaces();
   }
 

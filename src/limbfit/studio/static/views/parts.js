@@ -1,4 +1,4 @@
-// Parts that the views Model and Results share.
+// Parts that views share.
 import { el } from "/static/dom.js";
 import { readArrays } from "/web/arrays.js";
 
@@ -14,6 +14,20 @@ export const REGION_COLOURS = (index, count) => (index === 0 ? "#e3c878" : index
 /** A control with its label before it. */
 export function labelled(text, control) {
   return el("label", { class: "field" }, text, control);
+}
+
+/** A button that runs the stages of the study until one of them, and shows how they go. */
+export function runButton(context, until) {
+  const start = async () => {
+    try {
+      await context.api.post("identification/start", { until });
+    } catch (error) {
+      return context.warn(error.message);
+    }
+    location.hash = "#/identification";
+    context.refresh();
+  };
+  return el("button", { type: "button", class: "main", onclick: start }, `Run the stages until ${until}`);
 }
 
 /** A mesh of the server as viewer.js wants it, all its arrays, and its facts. */

@@ -4,7 +4,7 @@ import { readArrays } from "/web/arrays.js";
 import { shortNumber } from "/web/colours.js";
 import { nodalMeans } from "/web/volume.js";
 import { canDraw, Viewer } from "/web/viewer.js";
-import { cutPanel, FITTED, HELD_OUT, labelled, loadMesh, NO_WEBGL, REGION_COLOURS } from "/static/views/parts.js";
+import { cutPanel, FITTED, HELD_OUT, labelled, loadMesh, NO_WEBGL, REGION_COLOURS, runButton } from "/static/views/parts.js";
 
 const FALLBACK = "von_mises", AT_ONCE = 3;
 
@@ -12,6 +12,7 @@ export class Player {
   /** moment(time) is told of every moment shown, in s. */
   constructor(context, moment) {
     Object.assign(this, { context, moment, frames: [], times: [], at: 0, playing: null, turn: 0, mesh: null });
+    this.run = runButton(context, "predict");
     this.stage = el("div", { class: "player-stage" });
     this.drawing = canDraw();
     if (this.drawing) this.viewer = new Viewer(this.stage, "A field on the deformed, cut mesh of a site.");
@@ -21,7 +22,7 @@ export class Player {
 
   build() {
     this.source = el("select", { onchange: () => { this.wanted = this.source.value; this.load(); } });
-    this.field = el("select", { onchange: () => this.readFrames() });
+    this.field = el("select", { onchange: () => this.load(() => this.readFrames()) });
     this.map = el("select", { onchange: () => this.scale() }, ...["viridis", "cividis"].map((name) => el("option", { value: name }, name)));
     this.smooth = el("input", { type: "checkbox", checked: true, onchange: () => this.show(this.at) });
     this.edges = el("input", { type: "checkbox", onchange: () => this.style() });
@@ -29,7 +30,7 @@ export class Player {
     this.warpText = el("output", { class: "hint" });
     this.limits = ["lowest colour", "highest colour"].map((text) => el("input", { type: "number", step: "any", class: "limit", placeholder: "auto", "aria-label": text, onchange: () => this.scale() }));
     this.cut = cutPanel((plane) => this.viewer?.cutMesh(plane), (normal) => this.viewer?.view.lookAlong(normal.map((value) => -value)), { whole: false });
-    this.settings = el("div", {}, labelled("stored", this.source), labelled("show", this.field), labelled("colours", this.map),
+    this.settings = el("div", {}, el("h2", {}, "Field"), labelled("stored", this.source), labelled("show", this.field), labelled("colours", this.map),
       el("div", { class: "field" }, "range", el("span", {}, ...this.limits)),
       el("label", { class: "field" }, "deformation", this.warpText, this.warp),
       el("label", { class: "row" }, this.smooth, "smooth (means at the nodes)"),
@@ -51,7 +52,12 @@ export class Player {
     await this.load();
   }
 
-  async load() {
+  load(read = () => this.read()) {
+    const what = [`the fields of site ${this.site.name}`, this.source.selectedOptions[0]?.text].filter(Boolean).join(", ");
+    return this.context.load(this.stage, what, read);
+  }
+
+  async read() {
     this.stop();
     const chosen = this.sources.find((one) => one.source === this.source.value);
     this.turn++;
@@ -61,8 +67,9 @@ export class Player {
     const playable = this.times.length > 1;
     for (const part of [this.button, this.slider, this.speed]) part.disabled = !playable;
     this.slider.max = String(Math.max(0, this.times.length - 1));
-    this.words.textContent = chosen ? "" : "No fields are stored for this site.";
-    if (!chosen) return;
+    this.words.textContent = "";
+    this.settings.hidden = !chosen;
+    if (!chosen) return { text: "No fields are stored for this site.", actions: [this.run] };
     const { mesh, facts } = await loadMesh(this.context, `results/mesh/${chosen.source}/${encodeURIComponent(this.site.name)}`);
     if (this.sources.find((one) => one.source === this.source.value) !== chosen) return;
     this.mesh = mesh;
@@ -87,7 +94,7 @@ export class Player {
     this.cut.turn();
   }
 
-  /** Read the chosen field at all moments, the deepest first, a few at once. */
+  /** Read the chosen field at all moments, a few at once; done when the first, the deepest, is shown. */
   async readFrames() {
     const turn = ++this.turn, field = this.field.value, source = this.source.value;
     if (!this.mesh || !field) return;
@@ -107,8 +114,7 @@ export class Player {
     const worker = async () => {
       while (order.length && turn === this.turn) await read(order.shift());
     };
-    await Promise.all(Array.from({ length: AT_ONCE }, worker));
-    if (turn === this.turn) this.scale();
+    Promise.all(Array.from({ length: AT_ONCE }, worker)).then(() => turn === this.turn && this.scale(), (error) => this.context.warn(error.message));
   }
 
   /** One colour range for all moments, or what was asked for. */

@@ -11,9 +11,9 @@ const parted = (key) => { const [, name, digits, unit] = /^(.*?)(\d*)(?:_(kPa|s)
 const AXES = { time_s: { title: "Time", unit: "s" }, displacement_mm: { title: "Displacement", unit: "mm" } };
 const WATCH_MS = 1500;
 
-export async function mount(element, context) {
+export function mount(element, context) {
   const view = new ResultsView(element, context);
-  await view.refresh();
+  view.refresh();
   context.on((changed) => {
     if (changed.theme) view.chart?.draw();
     if (changed.study || changed.stages) view.refresh();
@@ -30,7 +30,7 @@ class ResultsView {
     this.simulation = el("div", {});
     this.files = el("div", {});
     const side = el("div", { class: "side", tabindex: "0", role: "region", "aria-label": "Settings of the results" },
-      el("h2", {}, "Site"), labelled("site", this.site), this.simulation, el("h2", {}, "Field"), this.player.settings,
+      el("h2", {}, "Site"), labelled("site", this.site), this.simulation, this.player.settings,
       el("p", { class: "hint" }, NAVIGATION), this.files);
     this.curveBox = el("div", {});
     this.axis = el("select", { onchange: () => { this.against = this.axis.value; this.drawCurves(); } },
@@ -50,21 +50,22 @@ class ResultsView {
     element.append(side, this.main);
   }
 
-  async refresh() {
-    try {
-      const { api } = this.context;
-      [this.outcome, this.scene] = await Promise.all([api.get("results"), api.get("model/scene")]);
-      if (this.other && !this.outcome.kept.some((run) => run.name === this.other)) this.other = "";
-      this.beside = this.other ? await api.get(`results?kept=${encodeURIComponent(this.other)}`) : null;
-    } catch (error) {
-      return this.context.warn(error.message);
-    }
+  refresh() {
+    return this.context.load(this.element, "the results", () => this.read());
+  }
+
+  async read() {
+    const { api } = this.context;
+    [this.outcome, this.scene] = await Promise.all([api.get("results"), api.get("model/scene")]);
+    if (this.other && !this.outcome.kept.some((run) => run.name === this.other)) this.other = "";
+    this.beside = this.other ? await api.get(`results?kept=${encodeURIComponent(this.other)}`) : null;
     const sites = this.scene.sites.flatMap((site) => (site.records.length ? site.records.map((name) => ({ ...site, name })) : [site]));
     this.indentations = sites;
     replace(this.site, ...sites.map((site) => el("option", { value: site.name }, [site.name, site.region, site.fitted ? "fitted" : "held out"].filter(Boolean).join(", "))));
     if (!sites.some((site) => site.name === this.chosen)) this.chosen = sites[0]?.name ?? null;
     this.showRuns();
-    if (this.chosen !== null) await this.choose(this.chosen);
+    if (this.chosen !== null) this.choose(this.chosen);
+    else return { text: "The study names no sites." };
   }
 
   async choose(name) {

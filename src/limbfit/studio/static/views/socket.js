@@ -1,47 +1,48 @@
 // The view Socket: the shape with its areas, runs started, and stored runs stepped through, two beside each other.
 import { el, replace, table } from "/static/dom.js";
-import { labelled, NAVIGATION, SIDES } from "/static/views/parts.js";
+import { labelled, NAVIGATION, runButton, SIDES } from "/static/views/parts.js";
 import { ShapeEditor } from "/static/views/socket_areas.js";
 import { link, Pane } from "/static/views/socket_pane.js";
 
 const FIELDS = { pressure: "contact pressure", shear: "shear" };
-const NONE = "No socket run is stored: limbfit socket STUDY makes one, limbfit socket design STUDY designs.";
 const RUNS = "runs", SHAPE = "shape";
 
-export async function mount(element, context) {
+export function mount(element, context) {
   const view = new SocketView(element, context);
-  await view.refresh();
-  context.on((changed) => (changed.study || changed.stages || changed.log || changed.run) && view.refresh(changed));
+  view.refresh();
+  context.on((changed) => (changed.study || changed.stages || changed.log || changed.run) && view.refresh());
   return { show: () => view.panes.forEach((pane) => pane.viewer?.resize()) };
 }
 
 class SocketView {
   constructor(element, context) {
-    Object.assign(this, { context, runs: [], turn: 0, marks: "", frame: null });
+    Object.assign(this, { element, context, runs: [], turn: 0, marks: "", frame: null });
     const side = el("div", { class: "side", tabindex: "0", role: "region", "aria-label": "Settings of the socket" });
     const main = el("div", { class: "stagearea results-main" });
     element.classList.add("split");
     element.append(side, main);
     const choice = (entries, act) => el("select", { onchange: act }, ...entries.map(([key, text]) => el("option", { value: key }, text)));
     this.mode = choice([[RUNS, "stored runs"], [SHAPE, "its shape"]], () => this.switch());
-    this.run = choice([], () => this.load());
-    this.beside = choice([["", "nothing"]], () => this.load());
-    this.field = choice(Object.entries(FIELDS).map(([key, text]) => [key, `${text} (kPa)`]), () => this.read());
+    this.run = choice([], () => this.reread(() => this.load()));
+    this.beside = choice([["", "nothing"]], () => this.reread(() => this.load()));
+    this.field = choice(Object.entries(FIELDS).map(([key, text]) => [key, `${text} (kPa)`]), () => this.reread(() => this.read()));
     this.colours = choice(["viridis", "cividis"].map((name) => [name, name]), () => (this.shaping ? this.editor.paint() : this.scale()));
     this.slider = el("input", { type: "range", min: "0", max: "0", step: "1", value: "0", "aria-label": "step", oninput: () => this.show() });
     this.words = el("output", { class: "player-words" });
     this.pointed = el("output", { class: "hint socket-pointed" });
     this.table = el("div", { class: "padded table-box", tabindex: "0", role: "region", "aria-label": "Regions" });
-    this.none = el("p", { class: "padded", hidden: true }, NONE);
     this.stages = el("div", { class: "socket-stages" });
     this.bar = el("div", { class: "player-bar" }, this.slider, this.words);
-    main.append(this.none, this.stages, this.bar, this.table);
+    main.append(this.stages, this.bar, this.table);
     this.panes = [this.pane()];
     this.editor = new ShapeEditor(this);
     if (this.viewer) Object.assign(this.viewer, { onSite: (name) => this.editor.choose(name), onMesh: (point) => this.shaping && this.editor.placed(point) });
     this.ofRuns = el("div", {}, labelled("run", this.run), labelled("beside it", this.beside), labelled("show", this.field));
-    this.starters = [["Run the socket", false], ["Run the design", true]].map(([text, design]) =>
-      el("button", { type: "button", onclick: () => this.start(design) }, text));
+    const starters = (name) => [["Run the socket", false], ["Run the design", true]].map(([text, design]) =>
+      el("button", { type: "button", class: name, onclick: () => this.start(design) }, text));
+    this.starters = starters();
+    this.offers = starters("main");
+    this.toSurfaces = runButton(context, "surfaces");
     this.stop = el("button", { type: "button", onclick: () => this.post("identification/stop", {}, "was asked to stop; what is finished is kept") }, "Stop");
     this.progress = el("p", { class: "hint", role: "status" });
     replace(side, labelled("view", this.mode), this.ofRuns, this.editor.part, labelled("colours", this.colours),
@@ -73,7 +74,7 @@ class SocketView {
   }
 
   arrange() {
-    this.ofRuns.hidden = this.underPointer.hidden = this.pointed.hidden = this.shaping;
+    this.ofRuns.hidden = this.underPointer.hidden = this.pointed.hidden = this.shaping || !this.runs.length;
     this.editor.part.hidden = !this.shaping;
     this.bar.hidden = this.table.hidden = this.shaping;
   }
@@ -87,27 +88,44 @@ class SocketView {
     await this.refresh();
   }
 
-  async refresh() {
-    try {
-      const shape = await this.context.api.get("socket/shape");
-      this.tellRun(shape);
-      const found = await this.context.api.get("socket"), marks = JSON.stringify(found);
-      this.frame = found.frame;
-      if (this.shaping) {
-        this.none.hidden = true;
-        this.stages.hidden = false;
-        const seen = JSON.stringify({ ...shape, run: null, starting: null, last: null });
-        if (seen !== this.marks) await this.editor.take(shape);
-        this.marks = seen;
-      } else if (marks !== this.marks) {
-        Object.assign(this, { marks, runs: found.runs });
-        this.options(this.run, found.runs);
-        this.options(this.beside, found.runs, [["", "nothing"]]);
-        await this.load();
-      }
-    } catch (error) {
-      this.context.warn(error.message);
+  refresh() {
+    return this.reread(() => this.readAll());
+  }
+
+  reread(read) {
+    return this.context.load(this.element, this.shaping ? "the shape of the socket" : "the runs of the socket", read);
+  }
+
+  async readAll() {
+    const { api } = this.context, found = await api.get("socket");
+    this.frame = found.frame;
+    this.tellRun(found);
+    if (this.shaping) {
+      const shape = await api.get("socket/shape"), marks = JSON.stringify(shape);
+      if (!this.shaping) return; // another view was chosen meanwhile
+      if (marks !== this.marks) await this.editor.take(shape);
+      this.marks = marks;
+      return shape.has_limb ? null : { text: "There is no limb yet to draw a socket around.", actions: [this.toSurfaces] };
     }
+    const marks = JSON.stringify([found.runs, found.frame]);
+    if (marks !== this.marks) {
+      Object.assign(this, { marks, runs: found.runs });
+      this.arrange();
+      this.options(this.run, found.runs);
+      this.options(this.beside, found.runs, [["", "nothing"]]);
+      try {
+        await this.load();
+      } catch (error) {
+        this.marks = ""; // read again the next time
+        throw error;
+      }
+    }
+    if (this.runs.length) return;
+    if (found.run || found.starting) return { text: "The study is running. A run of its socket appears here once it is stored." };
+    return {
+      text: "No run of the socket is stored yet. It computes pressure and shear on the limb (limbfit socket); the design searches a better shape (limbfit socket design).",
+      actions: this.offers,
+    };
   }
 
   options(select, runs, first = []) {
@@ -155,35 +173,25 @@ class SocketView {
   async load() {
     const turn = ++this.turn, find = (name) => this.runs.find((one) => one.run === name);
     const chosen = find(this.run.value), other = find(this.beside.value);
-    this.none.hidden = Boolean(chosen);
-    this.stages.hidden = !chosen;
     this.chosen = chosen;
     for (const part of [this.run, this.beside, this.field, this.slider]) part.disabled = !chosen;
     this.compareWith(chosen && other);
     this.panes[0].clear();
     if (!chosen) return replace(this.table), (this.words.textContent = "");
     this.slider.max = String(chosen.steps.length - 1);
-    try {
-      const wanted = [chosen, other].filter(Boolean);
-      await Promise.all(wanted.map((run, i) => this.panes[i].load(run, this.frame)));
-      if (turn === this.turn) await this.read();
-    } catch (error) {
-      if (turn === this.turn) this.context.warn(error.message);
-    }
+    const wanted = [chosen, other].filter(Boolean);
+    await Promise.all(wanted.map((run, i) => this.panes[i].load(run, this.frame)));
+    if (turn === this.turn) await this.read();
   }
 
   /** The chosen field at all steps. */
   async read() {
     const turn = this.turn;
     if (this.panes.some((pane) => !pane.run)) return;
-    try {
-      await Promise.all(this.panes.map((pane) => pane.read(this.field.value)));
-      if (turn !== this.turn) return;
-      this.scale();
-      this.show();
-    } catch (error) {
-      this.context.warn(error.message);
-    }
+    await Promise.all(this.panes.map((pane) => pane.read(this.field.value)));
+    if (turn !== this.turn) return;
+    this.scale();
+    this.show();
   }
 
   /** One colour range for all steps and both pictures, from zero to the largest value of all. */

@@ -8,13 +8,13 @@ const FORCE = { title: "Force", unit: "N" };
 const DEPTH = { title: "Displacement", unit: "mm" };
 const PREVIEW_MS = 250;
 
-export async function mount(element, context) {
+export function mount(element, context) {
   const view = new TracesView(element, context);
   const live = new LivePanel(view.live, context, (site) => view.choose(site));
   context.on((changed) => changed.acquired && live.look());
   context.on((changed) => changed.theme && live.draw(true));
   live.look();
-  await view.refresh();
+  view.refresh();
   context.on((changed) => (changed.study || changed.stages || changed.acquired) && view.refresh());
   context.on((changed) => changed.theme && view.charts.forEach((chart) => chart.draw()));
   return { show: () => live.show(), hide: () => live.hide() };
@@ -27,19 +27,27 @@ class TracesView {
     this.site = null;
     this.found = { sites: [], flags: [] };
     element.classList.add("split");
+    this.element = element;
     this.side = el("div", { class: "side" });
-    this.area = el("div", {});
+    this.head = el("div", {});
+    this.area = el("div", { class: "record" });
     this.live = el("section", { class: "card", id: "live", "aria-label": "The session that is being recorded", hidden: true });
-    element.append(this.side, el("div", { class: "stagearea padded" }, this.live, this.area));
+    element.append(this.side, el("div", { class: "stagearea padded" }, this.live, this.head, this.area));
   }
 
   async refresh() {
-    const sites = this.context.study?.indentations ?? [];
-    if (this.dragging || !sites.length) return;
-    if (!sites.some((site) => site.name === this.site)) this.site = (sites.find((site) => site.is_recorded) ?? sites[0]).name;
-    this.list();
+    if (this.dragging) return;
+    await this.context.load(this.element, "the records", () => this.readSites());
+    if (this.element.dataset.state !== "ready") return;
     await this.open(this.site);
     await this.judge();
+  }
+
+  async readSites() {
+    this.sites = (this.context.study ?? (await this.context.api.get("study"))).indentations;
+    if (!this.sites.some((site) => site.name === this.site)) this.site = (this.sites.find((site) => site.is_recorded) ?? this.sites[0])?.name;
+    this.list();
+    if (!this.sites.length) return { text: "The study names no sites. Add them under Model, or as [[sites]] of study.toml." };
   }
 
   /** All records are read for this, which takes seconds where there are many. */
@@ -56,7 +64,7 @@ class TracesView {
 
   list() {
     const focused = this.side.contains(document.activeElement) ? document.activeElement.dataset.site : null;
-    const rows = this.context.study.indentations.map((site) => {
+    const rows = this.sites.map((site) => {
       const error = this.found.sites.find((row) => row.site === site.name)?.error;
       const flags = this.flags(site.name).length;
       const notes = [site.fitted ? "fitted" : "held out", site.region];
@@ -93,33 +101,28 @@ class TracesView {
     this.charts = [];
   }
 
-  async open(name) {
-    const turn = (this.turn = (this.turn ?? 0) + 1);
-    const site = this.context.study.indentations.find((one) => one.name === name);
+  open(name) {
+    const site = this.sites.find((one) => one.name === name);
     this.flagList = el("ul", { class: "plain flags" });
     this.doubts();
-    const head = [el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList];
+    replace(this.head, el("h2", {}, `Site ${name}${site.region ? `, ${site.region}` : ""}`), this.flagList);
+    return this.context.load(this.area, `the record of site ${name}`, () => this.read(site));
+  }
+
+  async read(site) {
+    const turn = (this.turn = (this.turn ?? 0) + 1);
     if (!site.is_recorded) {
       this.close();
-      replace(this.area, head, el("p", {}, site.has_trace ? "Its record is yet to be made (limbfit acquire)." : "This site has no record: it is planned to be simulated."));
-      return;
+      return { text: site.has_trace ? `Its record is yet to be made: limbfit acquire STUDY --site ${site.name}` : "This site has no record: it is planned to be simulated. Measure it (limbfit acquire), and name the file as its trace in study.toml." };
     }
-    if (!this.charts.length) replace(this.area, head, el("p", { class: "hint" }, "Reading the record …"));
-    let record;
-    try {
-      record = await this.context.api.get(`traces/${encodeURIComponent(name)}`);
-    } catch (error) {
-      this.close();
-      replace(this.area, head, el("p", { class: "bad" }, error.message));
-      return;
-    }
+    const record = await this.context.api.get(`traces/${encodeURIComponent(site.name)}`);
     if (turn !== this.turn) return;
     this.close();
     this.record = record;
     const [force, depth, loop] = [0, 1, 2].map(() => el("div", {}));
     this.facts = el("dl", { class: "facts", id: "trace-facts" });
     this.reset = el("button", { type: "button", id: "trace-reset", onclick: () => this.store({ touch_down_s: null, peak_s: null }) }, "Let limbfit find both");
-    replace(this.area, head, force, el("div", { class: "pair" }, depth, loop), el("div", { class: "row" }, this.reset), this.facts);
+    replace(this.area, force, el("div", { class: "pair" }, depth, loop), el("div", { class: "row" }, this.reset), this.facts);
     this.charts = [
       new HandledChart(force, this.content("force_N", FORCE, true), 300),
       new HandledChart(depth, this.content("displacement_mm", DEPTH, true), 240),
