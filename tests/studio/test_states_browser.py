@@ -1,4 +1,4 @@
-"""Every view in a real browser where it has nothing to show yet: it is being read, is missing, or cannot be read."""
+"""Every view in a real browser where it has nothing to show: it is being read, is missing, or cannot be read."""
 
 from __future__ import annotations
 
@@ -10,53 +10,49 @@ import numpy as np
 import pytest
 
 from browsing import serious_findings
+from conftest import write_trace
 from limbfit.anatomy.imaging import Volume, write_volume
 
-PLANNED = """
+STUDY = """
 [study]
-name = "planned"
+name = "begun"
 [image]
 path = "image.nrrd"
 [[sites]]
 name = "a"
 position = [0.0, 0.0, 0.0]
 depth_mm = 5.0
+[[sites]]
+name = "b"
+trace = "b.csv"
+position = [0.0, 0.0, 0.0]
 """
-# What is missing in a study of which nothing was run, and what is offered.
+# What each view reads at first, in words and below /api/.
+READ = {
+    "image": ("the image", "image"),
+    "model": ("the model", "model/scene"),
+    "traces": ("the record of site b", "traces/b"),
+    "identification": ("the search and what came out", "identification"),
+    "results": ("the results", "results"),
+    "socket": ("the runs of the socket", "socket"),
+}
+# What is missing where nothing was run, and what is offered.
 MISSING = {
     "model": ("no surfaces of the limb yet", ["Run the stages until surfaces"]),
-    "traces": ("This site has no record", []),
     "identification": ("Nothing is identified yet", ["Run the study"]),
     "results": ("No fields are stored for this site", ["Run the stages until predict"]),
     "socket": ("No run of the socket is stored yet", ["Run the socket", "Run the design"]),
 }
-VIEWS = ("image", *MISSING)
-# What a view waits for at first.
-READ = {
-    "image": "image",
-    "model": "model/scene",
-    "identification": "identification",
-    "results": "results",
-    "socket": "socket",
-}
 
 
 @pytest.fixture
-def planned(tmp_path):
-    """A study of an image alone."""
-    image = Volume(np.zeros((8, 8, 8), np.float32), np.full(3, 4.0), np.zeros(3), np.eye(3))
-    write_volume(tmp_path / "image.nrrd", image)
-    (tmp_path / "study.toml").write_text(PLANNED)
+def begun(tmp_path):
+    """A study with an image and a record, of which nothing was run; a second site has no record."""
+    ramp = np.linspace(0.0, 1000.0, 16**3, dtype=np.float32).reshape(16, 16, 16)
+    write_volume(tmp_path / "image.nrrd", Volume(ramp, np.full(3, 4.0), np.zeros(3), np.eye(3)))
+    write_trace(tmp_path / "b.csv")
+    (tmp_path / "study.toml").write_text(STUDY)
     return tmp_path
-
-
-def show(page, view: str) -> None:
-    page.evaluate("(view) => (location.hash = `#/${view}`)", view)
-
-
-def states(page, view: str, kind: str):
-    """What says so in a view, seen by the user."""
-    return page.locator(f".view.{view} .state.{kind}:visible")
 
 
 @contextmanager
@@ -70,51 +66,56 @@ def held(page, path: str) -> Iterator[None]:
     page.unroute(f"**/api/{path}")
 
 
-def test_every_view_says_that_it_is_read_then_what_is_missing_and_offers_it(planned, serve, open_page):
-    page = open_page(serve(planned) + "#/traces")
-    for view, path in READ.items():
+def show(page, view: str) -> None:
+    page.evaluate("(view) => (location.hash = `#/${view}`)", view)
+
+
+def state(page, view: str, kind: str):
+    """What says of a view, where a user sees it, that it is loading, empty or failed."""
+    return page.locator(f".view.{view} .state.{kind}:visible")
+
+
+def test_every_view_says_that_it_is_read_what_is_missing_and_what_is_wrong(begun, serve, open_page):
+    page = open_page(serve(begun), may_say="status of 422")
+    for view, (what, path) in READ.items():
         with held(page, path):
             show(page, view)
-            states(page, view, "loading").get_by_text("Reading the ").wait_for()
-            assert not page.locator(f".view.{view} .side").is_visible()  # nothing there does anything yet
+            state(page, view, "loading").get_by_text(f"Reading {what} …").wait_for()
+            side = page.locator(f".view.{view} .side")
+            assert side.is_visible() == (view == "traces")  # others do nothing yet
+    assert serious_findings(page) == []
     for view, (text, offered) in MISSING.items():
         show(page, view)
-        panel = states(page, view, "empty")
-        panel.get_by_text(text).wait_for()
-        assert panel.get_by_role("button").all_inner_texts() == offered
+        empty = state(page, view, "empty")
+        empty.get_by_text(text).wait_for()
+        assert empty.get_by_role("button").all_inner_texts() == offered
         assert page.locator(f".view.{view} .side").is_visible()
-        assert page.locator(f".view.{view} .state.loading").count() == 0
-        assert serious_findings(page) == []
-
-
-def test_every_view_says_what_cannot_be_read_and_shows_it_once_it_can(study, serve, open_page):
-    address, file = serve(study), study / "study.toml"
-    text = file.read_text()
-    file.write_text(text + "[[")
-    (study / "2.csv").write_text("no record\n")
-    page = open_page(address + "#/image", may_say="Failed to load resource")
-    for view in VIEWS:
-        show(page, view)
-        states(page, view, "failed").get_by_text("study.toml").wait_for()
-        assert states(page, view, "failed").get_attribute("role") == "alert"
+        assert state(page, view, "loading").count() == 0
     assert serious_findings(page) == []
-    file.write_text(text)  # mended: the page follows by itself
-    page.locator(".view.socket[data-state=empty]").wait_for()
-    for view in ("model", "identification", "results"):
-        show(page, view)
-        page.locator(f".view.{view} .side").wait_for()
     show(page, "image")
-    states(page, "image", "empty").get_by_text("starts from surfaces").wait_for()
-    page.get_by_role("button", name="Show the limb").click()
-    page.locator(".view.model .lf-canvas").wait_for()
+    page.locator(".view.image[data-state=ready]").wait_for()
+    assert page.locator("#status").inner_text() == ""  # nothing is being read any more
     show(page, "traces")
     page.locator("#trace-facts dd").first.wait_for()
-    with held(page, "traces/2"):
-        page.locator("[data-site='2']").click()
-        states(page, "traces", "loading").get_by_text("Reading the record of site 2 …").wait_for()
-    failed = states(page, "traces", "failed")
-    failed.get_by_text("Cannot read the record of site 2: ").wait_for()
-    (study / "2.csv").write_text((study / "1.csv").read_text())
+    page.locator("[data-site='a']").click()
+    state(page, "traces", "empty").get_by_text("This site has no record").wait_for()
+    assert not page.locator("#trace-facts").is_visible()
+
+    file, text = begun / "study.toml", (begun / "study.toml").read_text()
+    file.write_text(text + "[[")
+    (begun / "b.csv").write_text("no record\n")
+    page.reload()
+    for view in READ:
+        show(page, view)
+        failed = state(page, view, "failed")
+        failed.get_by_text("study.toml: not valid TOML").wait_for()
+        assert failed.get_attribute("role") == "alert"
+    assert serious_findings(page) == []
+    file.write_text(text)
+    state(page, "socket", "empty").wait_for()  # what is seen follows by itself
+    show(page, "traces")
+    failed = state(page, "traces", "failed")
+    failed.get_by_text("Cannot read the record of site b: ").wait_for()
+    write_trace(begun / "b.csv")
     failed.get_by_role("button", name="Try again").click()
     page.locator("#trace-facts dd").first.wait_for()
-    assert page.get_by_role("heading", name="Site 2").is_visible()

@@ -192,6 +192,8 @@ def test_the_page_is_worked_by_keyboard(study, serve, open_page):
     until(lambda: page.get_by_role("tab", name="Image").get_attribute("aria-selected") == "true")
     assert page.evaluate("document.activeElement.id") == "tab-image"
     page.get_by_text("starts from surfaces").wait_for()
+    page.get_by_role("button", name="Show the limb").press("Enter")
+    page.get_by_role("checkbox", name="skin").wait_for()
     theme = page.evaluate("document.documentElement.dataset.theme")
     page.locator("#theme").press("Enter")
     assert page.evaluate("document.documentElement.dataset.theme") != theme
