@@ -17,7 +17,7 @@ import pytest
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, sharing
 from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
-from limbfit.pipeline.verbs.doctor import squeeze_cube
+from limbfit.pipeline.verbs.doctor import judge_self_test, squeeze_cube
 from limbfit.pipeline.verbs.journal import discreet
 from limbfit.study import load_study
 
@@ -170,6 +170,12 @@ def test_a_folder_that_cannot_be_written_is_one_clear_line(alone, monkeypatch):
 def test_the_self_test_knows_its_answer():
     found, wanted = squeeze_cube(1e-4)
     assert found == pytest.approx(wanted, rel=1e-3)
+    right = judge_self_test(found, wanted, seconds=3600.0)  # a compiler may take its time
+    assert (right.state, right.remedy) == ("ok", "")
+    for wrong in (1.01 * wanted, 0.0, float("nan")):
+        judged = judge_self_test(wrong, wanted, seconds=1.0)
+        assert judged.state == "failed"
+        assert judged.remedy
 
 
 @pytest.mark.slow

@@ -29,8 +29,10 @@ from ..shared.provenance import machine, versions
 
 NEEDED_GB = 4.0  # of memory, for one site at the paper's size
 FREE_GB = 2.0  # of disk, for the results of a study
+_SELF_TEST_REMEDY = (
+    "run again with LIMBFIT_TRACEBACK=1; if a library was built for another processor, reinstall it"
+)
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "msedge")
-_SELF_TEST_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -176,18 +178,22 @@ def _writing(folder: Path) -> Iterator[Finding]:
 def _self_test() -> Iterator[Finding]:
     """A slightly compressed cube in a worker process, against Young's modulus."""
     start = perf_counter()
-    remedy = "run again with LIMBFIT_TRACEBACK=1; if a library was built for another processor, reinstall it"
     try:
         with ProcessExecutor(1) as executor:
             found, wanted = next(executor.map(squeeze_cube, [1e-4]))
     except (LimbfitError, ArithmeticError, ImportError, OSError, ValueError) as error:
-        yield Finding("self-test", "failed", f"{type(error).__name__}: {error}", remedy)
+        yield Finding("self-test", "failed", f"{type(error).__name__}: {error}", _SELF_TEST_REMEDY)
         return
-    off, seconds = abs(found / wanted - 1.0), perf_counter() - start
-    state = "failed" if off > 1e-3 else "warning" if seconds > _SELF_TEST_S else "ok"
-    slow = "the first run compiles; later ones are quicker" if seconds > _SELF_TEST_S else ""
-    text = f"stress of a cube {off:.1e} off its closed form, {seconds:.1f} s"
-    yield Finding("self-test", state, text, remedy if state == "failed" else slow)
+    yield judge_self_test(found, wanted, perf_counter() - start)
+
+
+def judge_self_test(found: float, wanted: float, seconds: float) -> Finding:
+    """A right stress is ``ok`` however long it took: a busy machine compiles for a minute."""
+    off = abs(found / wanted - 1.0)
+    text = f"stress of a cube {off:.1e} off its closed form, {seconds:.1f} s (the first run compiles)"
+    if off <= 1e-3:
+        return Finding("self-test", "ok", text)
+    return Finding("self-test", "failed", text, _SELF_TEST_REMEDY)
 
 
 def squeeze_cube(strain: float) -> tuple[float, float]:
