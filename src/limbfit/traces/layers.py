@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import TraceError
+from .formats import TIME
 from .numerics import Array
 from .reading import read_columns
 
@@ -63,7 +64,7 @@ def read_layers(path: str | Path, time_name: str) -> Layers:
         With the file, the column and the remedy.
     """
     file = Path(path)
-    columns = read_columns(file, (time_name,), wanted=lambda name: name.endswith(SUFFIX))
+    columns = read_columns(file, {TIME: time_name}, wanted=lambda name: name.endswith(SUFFIX))
     time = columns.pop(time_name)
     if not columns:
         raise TraceError(

@@ -1,26 +1,54 @@
-"""Records from CSV tables and MAT files."""
+"""Records from files: columns by name, in s, mm and N.
+
+A unit is converted where the file states it, beside a name in brackets or in a row under the names; a unit
+that is not known is refused.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, whosmat
 
 from ..errors import TraceError
+from .formats import TIME, Row, ColumnTable, is_number, read_table
 from .numerics import Array
 from .record import COLUMNS, Trace, check_trace
 
-MAX_SAMPLES = 20_000_000
+_UNITS: Mapping[str, Mapping[str, float]] = {  # by the end of a column's key; "m_s" before "s"
+    "m_s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "s": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0, "h": 3600.0},
+    "mm": {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3, "in": 25.4, "inch": 25.4},
+    "N": {
+        "N": 1.0,
+        "newton": 1.0,
+        "newtons": 1.0,
+        "kN": 1e3,
+        "cN": 1e-2,
+        "mN": 1e-3,
+        "kgf": 9.80665,
+        "lbf": 4.4482216152605,
+    },
+}
+_BRACKETED = re.compile(r".*[\[(]\s*(?P<unit>[^\[\]()]+?)\s*[\])]")
+_DAY_S = 86400.0
+_CLOCK = re.compile(
+    r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ]\s*)?"  # a date: a record is shorter than a day
+    r"(?P<h>\d{1,2}):(?P<m>\d{2}):(?P<s>\d{2}(?:[.,]\d+)?)"
+    r"\s*(?P<half>[AaPp][Mm])?(?:Z|[+-]\d{2}:?\d{2})?"
+)
 
 
 def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Trace:
-    """Read and check a record from a CSV table (comma, semicolon or tab) or a MAT file (version 5).
+    """Read and check a record; its ``notes`` say what was done to read it.
 
     Parameters
     ----------
-    path : the file; ``.mat`` is read as MATLAB's, anything else as text with one header line.
+    path : a text table (comma, semicolon or tab; UTF-8 or UTF-16), ``.lvm``, ``.tdms``, ``.xlsx`` or ``.mat``
+        (version 5).
     columns : the names of time (s), displacement (mm) and force (N) in it.
 
     Raises
@@ -29,120 +57,156 @@ def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Tra
         With the file, the row or column, and the remedy.
     """
     file = Path(path)
-    found = read_columns(file, columns)
-    trace = Trace(*(found[name] for name in columns))
+    table = read_table(file, dict(zip(COLUMNS, columns)))
+    notes = list(table.notes)
+    time = _read_clock(table, columns[0], file, notes)
+    if time is None:
+        time = _read_column(table, TIME, columns[0], file, "", notes)
+    displacement, force = (
+        _read_column(table, key, name, file, "", notes) for key, name in zip(COLUMNS[1:], columns[1:])
+    )
+    trace = Trace(time, displacement, force, tuple(notes))
     check_trace(trace, columns=columns, file=file)
     return trace
 
 
 def read_columns(
     file: Path,
-    columns: Sequence[str],
+    columns: Mapping[str, str],
     wanted: Callable[[str], bool] = lambda name: False,
     gaps: bool = False,
 ) -> dict[str, Array]:
-    """The named columns of a file that `read_trace` could read, and all others that are ``wanted``.
+    """Columns of a file that `read_trace` could read, by their keys, and all others that are ``wanted``.
 
-    With ``gaps`` an empty cell of a table is nan.
+    Parameters
+    ----------
+    columns : the name of each column that must be there, by its key; a key ends in its unit, as ``time_s``.
+    wanted : True for the names of others that are read; these are their own keys.
+    gaps : an empty cell of a table is nan.
 
     Raises
     ------
     TraceError
         With the file, the row or column, and the remedy.
     """
-    if not file.is_file():
-        raise TraceError("no such file", file=file)
-    if file.suffix.lower() == ".mat":
-        found = _read_mat(file, columns, wanted)
+    table = read_table(file, columns)
+    named = {name: key for key, name in columns.items()}
+    named |= {name: name for name in table.names if wanted(name) and name not in named}
+    empty = "nan" if gaps else ""
+    return {name: _read_column(table, key, name, file, empty, []) for name, key in named.items()}
+
+
+def _read_column(table: ColumnTable, key: str, name: str, file: Path, empty: str, notes: list[str]) -> Array:
+    """The values of a column in the unit of its key.
+
+    Raises
+    ------
+    TraceError
+        For a cell that is no number, or a name that several columns have, which differ.
+    """
+    places = [i for i, known in enumerate(table.names) if known == name]
+    if table.vectors:
+        found = [_to_vector(table.vectors[i], name, file) for i in places]
     else:
-        found = _read_table(file, columns, wanted, "nan" if gaps else "")
-    return {name: np.asarray(c, dtype=np.float64) for name, c in found.items()}
+        found = [_read_numbers(table.rows, i, name, file, empty) for i in places]
+    found = [values * _factor(table.units[i], key, name, file, notes) for i, values in zip(places, found)]
+    if any(not np.array_equal(values, found[0], equal_nan=True) for values in found):
+        raise TraceError(
+            f"{len(places)} columns are named {name!r}",
+            file=file,
+            place="header",
+            remedy=f'rename the one that is meant, and name it in the study: [traces] {key} = "..."',
+        )
+    return found[0]
 
 
-def _chosen(
-    known: Sequence[str], columns: Sequence[str], wanted: Callable[[str], bool], file: Path
-) -> list[str]:
-    """The columns to be read; those that are named must be there."""
-    for name in columns:
-        _column(known, name, file)
-    return [*columns, *(name for name in known if wanted(name) and name not in columns)]
+def _factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -> float:
+    """What values of a column are multiplied with; 1 where no unit is stated.
+
+    Raises
+    ------
+    TraceError
+        For a unit that is not one of the key's quantity, or not that in the column's name.
+    """
+    known = next(units for end, units in _UNITS.items() if key.endswith(f"_{end}"))
+    beside = _BRACKETED.fullmatch(name)
+    below = _BRACKETED.fullmatch(unit)
+    stated = [below["unit"] if below else unit] if unit else []
+    if beside and _find_unit(known, beside["unit"]):  # other brackets hold other things than units
+        stated.append(beside["unit"])
+    factors = {_find_unit(known, one) for one in stated} or {1.0}
+    factor = factors.pop()
+    if not factor or factors:
+        raise TraceError(
+            f"the unit {' and '.join(stated)!r} of column {name!r} is none of {', '.join(known)}",
+            file=file,
+            place="units",
+            remedy=f'convert the column, or name another in the study: [traces] {key} = "..."',
+        )
+    if factor != 1.0:
+        notes.append(f"column {name!r} is converted from {stated[0]} to {next(iter(known))}")
+    return factor
 
 
-def _read_table(
-    file: Path, columns: Sequence[str], wanted: Callable[[str], bool], empty: str
-) -> dict[str, Array]:
-    with file.open("rb") as stream:
-        if b"\0" in stream.read(4096):
-            raise TraceError("not a text table", file=file, remedy="give CSV with one header line, or MAT")
+def _find_unit(known: Mapping[str, float], unit: str) -> float:
+    """The factor of a unit, words in any case; 0 where it is not known."""
+    unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
+    return known.get(unit, known.get(unit.lower() if len(unit) > 3 else "", 0.0))
+
+
+def _get(row: Row, place: int, file: Path, name: str) -> str:
+    line, cells = row
+    if place >= len(cells):
+        raise TraceError("the row is too short", file=file, place=f"line {line}, column {name}")
+    return cells[place]
+
+
+def _read_numbers(rows: Sequence[Row], place: int, name: str, file: Path, empty: str) -> Array:
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise TraceError(f"not UTF-8 text ({error.reason})", file=file, remedy="save as UTF-8") from None
-    numbered = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    if not numbered:
-        raise TraceError("the file is empty", file=file)
-    header = numbered[0][1]
-    delimiter = max("\t;,", key=header.count)
-    names = [name.strip().strip('"') for name in header.split(delimiter)]
-    cells = [(i, [cell.strip() or empty for cell in line.split(delimiter)]) for i, line in numbered[1:]]
-    if delimiter != ",":
-        cells = [(i, [cell.replace(",", ".") for cell in row]) for i, row in cells]
-    chosen = _chosen(names, columns, wanted, file)
-    return {name: _numbers(cells, names.index(name), name, file) for name in chosen}
-
-
-def _column(names: Sequence[str], name: str, file: Path) -> None:
-    if name in names:
-        return
-    shown = ", ".join(repr(n[:40]) for n in names[:8])
-    raise TraceError(
-        f"no column {name!r}; it has {shown}",
-        file=file,
-        place="header",
-        remedy="rename the column, or name it in [traces] of the study",
-    )
-
-
-def _numbers(cells: list[tuple[int, list[str]]], place: int, name: str, file: Path) -> Array:
-    try:
-        return np.array([float(row[place]) for _, row in cells])
+        return np.array([float(cells[place] or empty) for _, cells in rows])
     except (ValueError, IndexError):
-        for line, row in cells:
-            _cell(row, place, file, f"line {line}, column {name}")
+        for row in rows:
+            cell = _get(row, place, file, name) or empty
+            if not is_number(cell) or "," in cell:
+                where = f"line {row[0]}, column {name}"
+                raise TraceError(f"{cell[:40]!r} is not a number", file=file, place=where) from None
         raise
 
 
-def _cell(row: list[str], place: int, file: Path, where: str) -> None:
-    if place >= len(row):
-        raise TraceError("the row is too short", file=file, place=where) from None
-    try:
-        float(row[place])
-    except ValueError:
-        raise TraceError(f"{row[place].strip()[:40]!r} is not a number", file=file, place=where) from None
+def _read_clock(table: ColumnTable, name: str, file: Path, notes: list[str]) -> Array | None:
+    """Seconds from the first of times of day (midnight may pass) or time stamps; None for numbers.
+
+    Only of a record: files that go with it share its zero, which they would not know.
+    """
+    place = table.names.index(name)
+    if table.vectors:
+        stamps = np.asarray(table.vectors[place])
+        if stamps.dtype.kind != "M" or not stamps.size:
+            return None
+        notes.append(f"the time stamps in column {name!r} are counted from the first")
+        return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"))
+    if not table.rows or not _CLOCK.fullmatch(_get(table.rows[0], place, file, name)):
+        return None
+    notes.append(f"the times of day in column {name!r} are counted from the first")
+    times = np.array([_seconds(_get(row, place, file, name), row[0], name, file) for row in table.rows])
+    midnights = np.cumsum(np.diff(times, prepend=times[0]) < -_DAY_S / 2)
+    return np.asarray(times - times[0] + _DAY_S * midnights)
 
 
-def _read_mat(file: Path, columns: Sequence[str], wanted: Callable[[str], bool]) -> dict[str, Array]:
-    """Variables, or fields of one struct."""
-    try:
-        sizes = {name: int(np.prod(shape)) for name, shape, _ in whosmat(file)}
-        if sum(sizes.values()) > MAX_SAMPLES:
-            raise TraceError(f"larger than {MAX_SAMPLES} numbers", file=file)
-        content = {k: v for k, v in loadmat(file, squeeze_me=True).items() if not k.startswith("__")}
-    except TraceError:
-        raise
-    except NotImplementedError:
-        raise TraceError("MAT version 7.3", file=file, remedy="save it in MATLAB with '-v7'") from None
-    except Exception as error:  # a broken file can fail anywhere in the parser
-        raise TraceError(f"not a readable MAT file ({type(error).__name__})", file=file) from None
-    structs = [v for v in content.values() if isinstance(v, np.ndarray) and v.dtype.names and v.shape == ()]
-    if columns[0] not in content and len(structs) == 1:
-        content = {name: structs[0][name].item() for name in structs[0].dtype.names}
-    chosen = _chosen(list(content), columns, wanted, file)
-    return {name: _mat_vector(content[name], name, file) for name in chosen}
+def _seconds(cell: str, line: int, name: str, file: Path) -> float:
+    """Of a time of day since midnight."""
+    clock = _CLOCK.fullmatch(cell)
+    if clock is None:
+        where = f"line {line}, column {name}"
+        raise TraceError(f"{cell[:40]!r} is not a time of day", file=file, place=where)
+    hours = int(clock["h"])
+    if clock["half"]:
+        hours = hours % 12 + 12 * (clock["half"].lower() == "pm")
+    return 3600 * hours + 60 * int(clock["m"]) + float(clock["s"].replace(",", "."))
 
 
-def _mat_vector(value: object, name: str, file: Path) -> Array:
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu" or array.squeeze().ndim != 1:
+def _to_vector(value: Any, name: str, file: Path) -> Array:
+    array = np.asarray(value).squeeze()
+    if array.dtype.kind not in "fiu" or array.ndim != 1:
         raise TraceError("not a vector of real numbers", file=file, place=name)
-    return array.squeeze().astype(np.float64)
+    return np.asarray(array, dtype=np.float64)

@@ -22,11 +22,12 @@ _FIRST, _STILL = 5, 0.02  # samples at the least that tell the force at the star
 
 @dataclass(frozen=True)
 class Trace:
-    """One record: ``time_s``, ``displacement_mm``, ``force_N``, each (n,)."""
+    """One record: ``time_s``, ``displacement_mm``, ``force_N``, each (n,); ``notes``: how it was read."""
 
     time_s: Array
     displacement_mm: Array
     force_N: Array
+    notes: tuple[str, ...] = ()
 
 
 def check_trace(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import TraceError
+from .formats import TIME
 from .numerics import Array
 from .reading import read_columns
 
@@ -102,7 +103,8 @@ def read_surface_motion(path: str | Path, time_name: str) -> SurfaceMotion:
         With the file, the column and the remedy.
     """
     file = Path(path)
-    columns = read_columns(file, (time_name, *PLACE), wanted=lambda name: name in MOVES, gaps=True)
+    named = {TIME: time_name} | {name: name for name in PLACE}
+    columns = read_columns(file, named, wanted=lambda name: name in MOVES, gaps=True)
     given = [name for name in MOVES if name in columns]
     if not given:
         raise TraceError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -113,7 +114,8 @@ def _without_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
         mended = values.copy()
         mended[spikes] = np.interp(trace.time_s[spikes], trace.time_s[~spikes], values[~spikes])
         largest = float(np.abs(values - mended).max())
-        trace = replace(trace, **{column: mended})
+        change: dict[str, Any] = {column: mended}
+        trace = replace(trace, **change)
         what = (
             f"{count} of {len(values)} samples of the {quantity} stick out by up to {largest:.2g} {unit} and "
             "were replaced"

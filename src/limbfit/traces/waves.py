@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import TraceError
+from .formats import TIME
 from .numerics import Array
 from .reading import read_columns
 
@@ -83,7 +84,7 @@ def read_wave_speeds(path: str | Path, time_name: str) -> tuple[WaveSpeeds, ...]
         With the file, the column and the remedy.
     """
     file = Path(path)
-    columns = read_columns(file, (time_name,), wanted=lambda name: name.endswith("_m_s"), gaps=True)
+    columns = read_columns(file, {TIME: time_name}, wanted=lambda name: name.endswith("_m_s"), gaps=True)
     time = columns.pop(time_name)
     if not columns:
         raise TraceError(

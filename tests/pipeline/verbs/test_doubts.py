@@ -54,6 +54,20 @@ def test_a_record_in_another_unit_is_told(five, factors, word):
     assert word in found[0]["cause"]
 
 
+def test_an_export_of_a_rig_is_read_and_what_was_done_is_told(five):
+    """In kilonewtons, below a preamble: the same site, and a remark."""
+    plain = check_study(load_study(five), listener=lambda event: None)["sites"]["3"]
+    head, *rows = (five / "3.csv").read_text().splitlines()
+    table = np.loadtxt(rows, delimiter=",") * (1, 1, 1e-3)
+    lines = ["Rig,7", head, "s,mm,kN", *(",".join(map(repr, row)) for row in table.tolist())]
+    (five / "3.csv").write_text("\n".join(lines))
+    told = check_study(load_study(five), listener=lambda event: None)
+    assert told["sites"]["3"]["peak_force_N"] == pytest.approx(plain["peak_force_N"], rel=1e-6)
+    assert [(flag["sites"], flag["kind"]) for flag in told["flags"]] == [(["3"], "reading")]
+    words = "the header in line 2 is skipped; column 'force_N' is converted from kN to N"
+    assert words in told["flags"][0]["text"]
+
+
 def test_a_wrong_axis_is_told_with_its_angle(five):
     text = (five / "study.toml").read_text()
     text = text.replace(f"position = {PLACES[2]}", f"position = {PLACES[2]}\naxis = [0.0, 1.0, 0.0]")

@@ -15,6 +15,7 @@ from ...study import Record, Study
 from ...traces import (
     Creep,
     Regularised,
+    Remark,
     SurfaceMotion,
     Thinning,
     TouchDown,
@@ -78,9 +79,17 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
         "knots_s": smooth.knots_s.tolist(),
         "knots_mm": smooth.knots_mm.tolist(),
         "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
-        "remarks": [asdict(remark) for remark in known.remarks],
+        "remarks": [asdict(remark) for remark in (*_reading_remarks(trace), *known.remarks)],
     }
     return trace, smooth, facts
+
+
+def _reading_remarks(trace: Trace) -> tuple[Remark, ...]:
+    """What was done to read a file that is no plain table in s, mm and N."""
+    if not trace.notes:
+        return ()
+    cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
+    return (Remark("reading", "; ".join(trace.notes), cause, remedy, {}),)
 
 
 def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:

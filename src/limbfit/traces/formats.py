@@ -1,0 +1,341 @@
+"""Files of records as tables of named columns: text, LabVIEW's measurement files, Excel, MATLAB.
+
+Nothing is interpreted here: names, stated units and cells are as they are in the file.
+
+Sources: National Instruments, Specification for the LabVIEW Measurement File (.lvm); npTDMS's documentation.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.io import loadmat, whosmat
+
+from ..errors import TraceError
+from .record import MAX_SAMPLES
+
+MAX_PREAMBLE = 1000  # lines before the header
+TIME = "time_s"  # the key of the times
+_END_OF_HEADER = "***End_of_Header***"
+_X = "X_Value"  # LabVIEW's name of the times
+
+Names = Mapping[str, str]  # of columns, by the keys of [traces]
+Row = tuple[int, list[str]]  # the number of a line, and its cells
+
+
+@dataclass(frozen=True)
+class ColumnTable:
+    """Columns of a file by their position.
+
+    Attributes
+    ----------
+    names, units : of the columns; a unit is "" where the file states none.
+    rows : of a table of text.
+    vectors : of a file that holds numbers, one for each name.
+    notes : what was done to read it, in words.
+    """
+
+    names: Sequence[str]
+    units: Sequence[str]
+    rows: Sequence[Row] = ()
+    vectors: Sequence[Any] = ()
+    notes: tuple[str, ...] = ()
+
+
+def read_table(file: Path, columns: Names) -> ColumnTable:
+    """The table of a file, by its suffix; it has the columns that are named.
+
+    Raises
+    ------
+    TraceError
+        Where the file cannot be read, or holds no table with these columns.
+    """
+    if not file.is_file():
+        raise TraceError("no such file", file=file)
+    suffix = file.suffix.lower()
+    if suffix == ".mat":
+        return _read_mat(file, columns)
+    if suffix == ".tdms":
+        return _read_tdms(file, columns)
+    if suffix in (".xlsx", ".xlsm"):
+        return _read_excel(file, columns)
+    if suffix == ".xls":
+        raise TraceError("an Excel file from before 2007", file=file, remedy="save it as .xlsx")
+    text, note = _decode(file)
+    is_labview = suffix == ".lvm" and text.startswith("LabVIEW Measurement")
+    try:
+        table = (_read_lvm if is_labview else _read_text)(text, file, columns)
+    except csv.Error as error:
+        raise TraceError(f"not a text table ({error})", file=file, remedy="export it again") from None
+    return replace(table, notes=note + table.notes)
+
+
+def is_number(cell: str) -> bool:
+    """True for a number with a decimal point or comma."""
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _check_names(names: Sequence[str], columns: Names, file: Path) -> None:
+    for key, name in columns.items():
+        if name not in names:
+            shown = ", ".join(repr(n[:40]) for n in [n for n in names if n][:8])
+            raise TraceError(
+                f"no column {name!r}; it has {shown}",
+                file=file,
+                place="header",
+                remedy=f'rename the column, or name it in the study: [traces] {key} = "..."',
+            )
+
+
+# --- text
+
+
+def _decode(file: Path) -> tuple[str, tuple[str, ...]]:
+    """The text of a file and the note on its encoding."""
+    data = file.read_bytes()
+    is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    if b"\0" in data[:4096] and not is_utf16:
+        raise TraceError("not a text table", file=file, remedy="give CSV with one header line, or MAT")
+    name, encoding = ("UTF-16", "utf-16") if is_utf16 else ("UTF-8", "utf-8-sig")
+    try:
+        return data.decode(encoding), ("the text is UTF-16",) if is_utf16 else ()
+    except UnicodeDecodeError as error:
+        raise TraceError(f"not {name} text ({error.reason})", file=file, remedy="save as UTF-8") from None
+
+
+def _split(lines: Sequence[str], delimiter: str, start: int = 0) -> list[Row]:
+    """The cells of lines that are neither empty nor comments; ``start`` lines come before them."""
+    reader = csv.reader(lines, delimiter=delimiter)
+    rows = [(start + reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    return [row for row in rows if any(row[1]) and not row[1][0].startswith("#")]
+
+
+def _delimiter(line: str) -> str:
+    return max("\t;,", key=line.count)
+
+
+def _read_text(text: str, file: Path, columns: Names) -> ColumnTable:
+    lines = text.splitlines()
+    single = [_split([line], _delimiter(line), i) for i, line in enumerate(lines[:MAX_PREAMBLE])]
+    header = _find_header([row for rows in single for row in rows], columns, file)
+    number = header[0]
+    delimiter = _delimiter(lines[number - 1])
+    rows = _split(lines[number:], delimiter, number)
+    if delimiter != ",":
+        rows = [(i, [cell.replace(",", ".") for cell in row]) for i, row in rows]
+    return _table(header, rows, columns, has_preamble=any(single[: number - 1]))
+
+
+def _find_header(rows: Sequence[Row], columns: Names, file: Path) -> Row:
+    """The first row that holds all names.
+
+    Raises
+    ------
+    TraceError
+        Where none does. It shows the row that holds the most of them; where none holds any, the first row
+        that is as wide as the numbers.
+    """
+    if not rows:
+        raise TraceError("the file is empty", file=file)
+    likely = max(rows, key=lambda row: sum(name in row[1] for name in columns.values()))
+    if not set(columns.values()) & set(likely[1]):
+        width = next((len(row) for _, row in rows if sum(map(is_number, row)) > 1), len(likely[1]))
+        likely = next((row for row in rows if len(row[1]) == width), likely)
+    _check_names(likely[1], columns, file)
+    return likely
+
+
+def _table(header: Row, rows: Sequence[Row], columns: Names, has_preamble: bool) -> ColumnTable:
+    """The table below a header; its first row may state units: words in each of the named columns."""
+    number, names = header
+    notes = (f"what stands before the header in line {number} is skipped",) if has_preamble else ()
+    first = (rows[0][1] if rows else []) + [""] * len(names)
+    if all(_is_word(first[names.index(name)]) for name in columns.values()):
+        return ColumnTable(names, first[: len(names)], rows[1:], notes=notes)
+    return ColumnTable(names, [""] * len(names), rows, notes=notes)
+
+
+def _is_word(cell: str) -> bool:
+    return bool(cell) and not is_number(cell) and not any(c.isdigit() for c in cell)
+
+
+# --- LabVIEW's measurement files
+
+
+def _read_lvm(text: str, file: Path, columns: Names) -> ColumnTable:
+    """All segments after each other; ``X_Value`` is the time where no other column is named as that."""
+    lines = text.splitlines()
+    delimiter = "," if any(line.startswith("Separator,") for line in lines) else "\t"
+    tags: dict[str, list[str]] = {}
+    rows: list[Row] = []
+    segments: list[tuple[dict[str, list[str]], list[Row]]] = []
+    in_header = True
+    for number, row in _split(lines, delimiter):
+        if row[0] == "Channels":
+            tags, in_header = {}, True
+        if row[0] == _END_OF_HEADER:
+            rows, in_header = [], False
+            segments.append((tags, rows))
+        elif in_header:
+            tags[row[0]] = [cell.replace(",", ".") for cell in row[1:]]
+        else:
+            rows.append((number, [cell.replace(",", ".") for cell in row]))
+    with_names = [one for one in segments if one[1]]
+    first = with_names[0][1][0] if with_names else _find_header([], columns, file)
+    names = first[1]
+    if any(rows[0][1] != names for _, rows in with_names):
+        raise TraceError("its segments hold different channels", file=file, remedy="save one segment")
+    notes: tuple[str, ...] = ()
+    if columns[TIME] not in names and "Time" in with_names[0][0].get("X_Dimension", ()):
+        names = [columns[TIME] if name == _X else name for name in names]
+        notes = (f"the times are LabVIEW's {_X}",)
+    rows = [row for tags, rows in with_names for row in _timed(rows[1:], tags, names, columns[TIME], file)]
+    _find_header([(first[0], names)], columns, file)
+    units = ["", *with_names[0][0].get("Y_Unit_Label", [])] + [""] * len(names)
+    return ColumnTable(names, units[: len(names)], rows, notes=notes)
+
+
+def _timed(
+    rows: Sequence[Row], tags: Mapping[str, list[str]], names: Sequence[str], time: str, file: Path
+) -> list[Row]:
+    """The rows of a segment, their times made of ``X0`` and ``Delta_X`` where the file leaves them out.
+
+    Raises
+    ------
+    TraceError
+        Where these are not the same for all channels.
+    """
+    if names[0] != time or any(row[0] for _, row in rows):
+        return list(rows)
+    starts, steps = (set(filter(None, tags.get(tag, []))) for tag in ("X0", "Delta_X"))
+    if len(starts) != 1 or len(steps) != 1 or not all(map(is_number, starts | steps)):
+        raise TraceError(
+            "its channels are not sampled at the same times",
+            file=file,
+            place="X0, Delta_X",
+            remedy="save them with one X column, or name a channel of times in the study: [traces] time_s",
+        )
+    start, step = float(starts.pop()), float(steps.pop())
+    return [(number, [repr(start + i * step), *row[1:]]) for i, (number, row) in enumerate(rows)]
+
+
+# --- files of libraries that are optional
+
+
+def _import(module: str, package: str, extra: str, file: Path) -> Any:
+    try:
+        return import_module(module)
+    except ImportError:
+        raise TraceError(
+            f"files {file.suffix} are read by {package}, which is not installed",
+            file=file,
+            remedy=f"pip install 'limbfit[{extra}]', or export the record as CSV",
+        ) from None
+
+
+def _read_tdms(file: Path, columns: Names) -> ColumnTable:
+    """The group that holds the columns, its times by their channel or by the waveform's increment."""
+    nptdms = _import("nptdms", "npTDMS", "tdms", file)
+    try:
+        groups = [
+            [_read_channel(one) for one in group.channels()] for group in nptdms.TdmsFile.read(file).groups()
+        ]
+    except Exception as error:  # a broken file can fail anywhere in the parser
+        raise TraceError(f"not a readable TDMS file ({type(error).__name__})", file=file) from None
+    others = {name for key, name in columns.items() if key != TIME} or {columns[TIME]}
+    fitting = [group for group in groups if others <= {one.name for one in group}]
+    if len(fitting) > 1:
+        raise TraceError(
+            f"{len(fitting)} of its groups hold these channels", file=file, remedy="save one group to a file"
+        )
+    channels = fitting[0] if fitting else [one for group in groups for one in group]
+    notes: tuple[str, ...] = ()
+    if fitting and columns[TIME] not in (one.name for one in channels):
+        tracks = [one.time_s for one in channels if one.name in others]
+        if all(track is not None and np.array_equal(track, tracks[0]) for track in tracks):
+            channels = [_Channel(columns[TIME], "s", tracks[0], None), *channels]
+            notes = ("the times are those of the waveform",)
+    names = [one.name for one in channels]
+    _check_names(names, columns, file)
+    return ColumnTable(
+        names, [one.unit for one in channels], vectors=[one.values for one in channels], notes=notes
+    )
+
+
+class _Channel(NamedTuple):
+    """Of a TDMS file; ``time_s`` are the waveform's times, None where it has none."""
+
+    name: str
+    unit: str
+    values: Any
+    time_s: Any
+
+
+def _read_channel(channel: Any) -> _Channel:
+    unit = str(channel.properties.get("unit_string", ""))
+    has_waveform = "wf_increment" in channel.properties
+    return _Channel(channel.name, unit, channel[:], channel.time_track() if has_waveform else None)
+
+
+def _read_excel(file: Path, columns: Names) -> ColumnTable:
+    """The one sheet that holds the columns; times of day are written as ISO 8601 says."""
+    openpyxl = _import("openpyxl", "openpyxl", "excel", file)
+    try:
+        book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+        sheets = {sheet.title: _sheet_rows(sheet) for sheet in book.worksheets}
+        book.close()
+    except Exception as error:  # a broken file can fail anywhere in the parser
+        raise TraceError(f"not a readable Excel file ({type(error).__name__})", file=file) from None
+    wanted = set(columns.values())
+    fitting = [name for name, rows in sheets.items() if any(wanted <= set(row) for _, row in rows)]
+    if len(fitting) > 1:
+        shown = ", ".join(fitting)
+        raise TraceError(f"the sheets {shown} all hold these columns", file=file, remedy="keep one of them")
+    rows = sheets[fitting[0]] if fitting else max(sheets.values(), key=len)
+    header = _find_header(rows[:MAX_PREAMBLE], columns, file)
+    below = [row for row in rows if row[0] > header[0]]
+    return _table(header, below, columns, has_preamble=rows[0] != header)
+
+
+def _sheet_rows(sheet: Any) -> list[Row]:
+    rows = [
+        (i, [_cell(value) for value in row]) for i, row in enumerate(sheet.iter_rows(values_only=True), 1)
+    ]
+    return [row for row in rows if any(row[1])]
+
+
+def _cell(value: Any) -> str:
+    """The text of a cell."""
+    if hasattr(value, "isoformat"):
+        return str(value.isoformat())
+    return "" if value is None else str(value).strip()
+
+
+def _read_mat(file: Path, columns: Names) -> ColumnTable:
+    """Variables, or fields of one struct."""
+    try:
+        sizes = {name: int(np.prod(shape)) for name, shape, _ in whosmat(file)}
+        if sum(sizes.values()) > MAX_SAMPLES:
+            raise TraceError(f"larger than {MAX_SAMPLES} numbers", file=file)
+        content = {k: v for k, v in loadmat(file, squeeze_me=True).items() if not k.startswith("__")}
+    except TraceError:
+        raise
+    except NotImplementedError:
+        raise TraceError("MAT version 7.3", file=file, remedy="save it in MATLAB with '-v7'") from None
+    except Exception as error:  # a broken file can fail anywhere in the parser
+        raise TraceError(f"not a readable MAT file ({type(error).__name__})", file=file) from None
+    structs = [v for v in content.values() if isinstance(v, np.ndarray) and v.dtype.names and v.shape == ()]
+    if columns[TIME] not in content and len(structs) == 1:
+        content = {name: structs[0][name].item() for name in structs[0].dtype.names}
+    _check_names(list(content), columns, file)
+    return ColumnTable(list(content), [""] * len(content), vectors=list(content.values()))
