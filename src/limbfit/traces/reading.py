@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TraceError
-from .formats import TIME, Row, ColumnTable, is_number, read_table
+from .formats import TIME, ColumnTable, Row, is_number, read_table
 from .numerics import Array
 from .record import COLUMNS, Trace, check_trace
 
