@@ -50,6 +50,7 @@ import psutil
 HERE = Path(__file__).parent
 LIMBFIT = (sys.executable, "-m", "limbfit")
 LATE_S, PAUSE_S, MAKING = 30.0, 0.25, 3.0
+ENDING_S = 10.0  # for killed processes to be gone
 WALL_PER_PROCESSOR = 10.0  # a process that waits for ever ends at so many times the limit
 RED = ("late", "failed")
 OUTCOMES = ("ok", "refused", *RED, "over", "missing")
@@ -147,12 +148,16 @@ def run_process(words: Sequence[str], output: IO[str], limit_s: float) -> Ending
 
 def _end_session(process: subprocess.Popen[bytes]) -> None:
     """Kill what is left of a process, of its session and of those that began another."""
+    started: list[psutil.Process] = []
     with suppress(psutil.NoSuchProcess):
-        for one in psutil.Process(process.pid).children(recursive=True):
+        started = psutil.Process(process.pid).children(recursive=True)
+    for one in started:
+        with suppress(psutil.NoSuchProcess):
             one.kill()
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+    psutil.wait_procs(started, timeout=ENDING_S)
 
 
 class Matrix:
