@@ -53,6 +53,7 @@ from .pipeline.experiments.cube import compress_cube as compress_cube
 from .pipeline.shared.context import Progress as Progress
 from .pipeline.verbs.acquire import (
     acquire_site as acquire_site,
+    check_recording as check_recording,
     judge_recording as judge_recording,
     serve_fitsocket as serve_fitsocket,
     virtual_fitsocket as virtual_fitsocket,

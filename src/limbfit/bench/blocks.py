@@ -38,6 +38,13 @@ def block_site(
 ) -> SiteModel:
     """A site in the middle of a block's top, its mesh stored in ``file``; in and out at the usual speed."""
     write_vtu(mesh, file)
+    return block_model(name, file, steps or SolverTable(), element, depth_mm)
+
+
+def block_model(
+    name: str, file: Path, steps: SolverTable, element: str, depth_mm: float = INDENTATION
+) -> SiteModel:
+    """The same, of a mesh that ``file`` holds."""
     ramp = depth_mm / SPEED
     return SiteModel(
         name=name,
@@ -47,7 +54,7 @@ def block_site(
         axis=(0.0, 0.0, -1.0),
         knots_s=(0.0, ramp, 2 * ramp),
         knots_mm=(0.0, depth_mm, 0.0),
-        steps=steps or SolverTable(),
+        steps=steps,
         element=element,
     )
 

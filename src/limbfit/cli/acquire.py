@@ -62,6 +62,8 @@ def acquire(
     names = [site] if site else [one.name for one in limbfit.waiting(given)]
     if not names:
         raise InputError("every record is made", file=given.file, remedy="give --site and --again")
+    for name in names:  # all of them, before the first is made
+        limbfit.check_recording(given, name, depth_mm=depth, unattended=unattended, replace_record=again)
     rows = []
     for name in names:
         tool = given.indentation(name).indenter

@@ -10,6 +10,7 @@ from .shared.context import Listener, Progress
 
 _HOME = {
     "acquire_site": "verbs.acquire",
+    "check_recording": "verbs.acquire",
     "judge_recording": "verbs.acquire",
     "serve_fitsocket": "verbs.acquire",
     "virtual_fitsocket": "verbs.acquire",

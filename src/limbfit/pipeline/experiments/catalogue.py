@@ -21,18 +21,21 @@ from ...study import Study
 from ..shared.artefacts import read_json
 from ..shared.context import Context
 from ..shared.keys import Keys, Stage
+from ..shared.limb import Check, LimbGeometry
 from ..shared.planned import SEEN
 from ..shared.store import Store
-from .crossvalidation import run_crossvalidate
-from .cube import COMPRESSION_PERCENT, run_cube
-from .design import run_design
-from .protocol import run_protocol
-from .refinement import FACTORS, run_refinement
-from .regions import run_regions
+from ..stages.calibrate import check_fitted
+from .crossvalidation import check_crossvalidate, run_crossvalidate
+from .cube import COMPRESSION_PERCENT, check_cube, run_cube
+from .design import check_design, run_design
+from .protocol import check_protocol, run_protocol
+from .refinement import FACTORS, check_refinement, run_refinement
+from .regions import check_regions, run_regions
 from .sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
-from .socket import run_socket
-from .socket_design import run_socket_design
+from .socket import check_socket, run_socket
+from .socket_design import check_socket_design, run_socket_design
 from .uncertainty import run_uncertainty
+from .variants import check_variants
 
 
 @dataclass(frozen=True)
@@ -40,17 +43,20 @@ class Experiment(Stage):
     """A stage of its own, outside the chain: ``run(context, folder, **options)`` writes ``<name>.json``.
 
     ``needs`` names stages of the chain; ``options`` are what it can be run with and their defaults, in plain
-    JSON. ``run`` returns facts for its stamp.
+    JSON. ``run`` returns facts for its stamp. ``check`` refuses what study, limb and options decide.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
+    check: Check | None = None
 
 
 _SIMULATED = ("sites", "traces", "mesh", "calibrate")
 _INDENTERS, _RECORD = ("indenter", "indenters", "clamps"), ("site", "name", "indenter")
 
 
-def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) -> Experiment:
+def _sensitivity(
+    name: str, run: Callable[..., dict[str, Any]], check: Check = check_variants, **options: Any
+) -> Experiment:
     return Experiment(
         f"sensitivity-{name}",
         run,
@@ -59,6 +65,7 @@ def _sensitivity(name: str, run: Callable[..., dict[str, Any]], **options: Any) 
         site_keys=("name", "region", "edge", "depth_mm", "speed_mm_s", "indenter"),
         record_keys=_RECORD,
         options={"sites": [], **options},
+        check=check,
     )
 
 
@@ -69,6 +76,7 @@ _OWN: tuple[Experiment, ...] = (
         needs=("calibrate",),
         tables=("material",),
         options={"compression_percent": COMPRESSION_PERCENT},
+        check=check_cube,
     ),
     Experiment(
         "regions",
@@ -78,12 +86,13 @@ _OWN: tuple[Experiment, ...] = (
         site_keys=("name", "region", "fitted", "weight", "edge", "indenter"),
         record_keys=_RECORD,
         options={"sites": "all"},
+        check=check_regions,
     ),
     _sensitivity("c", run_stiffness),
     _sensitivity("kappa", run_kappa, ratios=list(KAPPA_RATIOS)),
     _sensitivity("contact", run_contact),
     _sensitivity("indenter", run_indenter),
-    _sensitivity("mesh", run_refinement, factors=list(FACTORS)),
+    _sensitivity("mesh", run_refinement, check_refinement, factors=list(FACTORS)),
     Experiment(
         "uncertainty",
         run_uncertainty,
@@ -100,6 +109,7 @@ _OWN: tuple[Experiment, ...] = (
         site_keys=("name", "region", "fitted", "weight", "edge", "indenter"),
         record_keys=_RECORD,
         options={"fit": 0, "choices": 200, "seed": 0, "runs": 12},
+        check=check_crossvalidate,
     ),
     Experiment(
         "design",
@@ -108,7 +118,8 @@ _OWN: tuple[Experiment, ...] = (
         tables=("material", "solver", *_INDENTERS),
         site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter"),
         record_keys=_RECORD,
-        options={"sites": 4, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
+        options={"sites": 0, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
+        check=check_design,
     ),
     Experiment(
         "protocol",
@@ -123,6 +134,7 @@ _OWN: tuple[Experiment, ...] = (
             **{"seen": dict.fromkeys(SEEN), "pressures": {}},
             **{"parameters": {}, "parameters_from": "", "noise": {}},
         },
+        check=check_protocol,
     ),
     Experiment(
         "socket",
@@ -132,6 +144,7 @@ _OWN: tuple[Experiment, ...] = (
         apart=("socket.design",),
         options={"parameters": {}, "parameters_from": "", "covariance_log": None}
         | {"most_probable": None, "samples": 0},
+        check=check_socket,
     ),
     Experiment(
         "socket_design",
@@ -139,6 +152,7 @@ _OWN: tuple[Experiment, ...] = (
         needs=("surfaces",),
         tables=("socket", "geometry", "mesh", "material"),
         options={"parameters": {}, "parameters_from": "", "optimise": [], "simulations": 0},
+        check=check_socket_design,
     ),
 )
 
@@ -173,6 +187,22 @@ def options_of(experiment: Experiment, given: Mapping[str, Any]) -> dict[str, An
     if unknown:
         raise InputError(f"{experiment.name} has no option {unknown}")
     return {**experiment.options, **given}
+
+
+def check_experiment(
+    experiment: Experiment, study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]
+) -> None:
+    """Refuse an experiment that its inputs rule out; ``limb``: None where it is not known yet.
+
+    Raises
+    ------
+    InputError
+        With the remedy.
+    """
+    if "calibrate" in experiment.needs:
+        check_fitted(study)
+    if experiment.check is not None:
+        experiment.check(study, limb, options)
 
 
 def experiment_key(

@@ -7,7 +7,7 @@ from those too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import comb
 from pathlib import Path
@@ -34,8 +34,10 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import compute_error_percent
 from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
+from ...study import Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
 from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, unknowns
 
@@ -44,6 +46,25 @@ Runs = list[list[SiteResponse]]
 
 _CHECKED = 3  # fits whose optima are simulated in each of two rounds
 _MARGIN = 0.02  # of the emulator's box, in the logarithm, that fits may go beyond
+
+
+def check_crossvalidate(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse a study whose recorded sites are all fitted; see `run_crossvalidate`.
+
+    Raises
+    ------
+    StudyError
+        With the remedy.
+    """
+    recorded = [site for site in study.sites if study.records_at(site)]
+    size = options["fit"] or len(study.fitted)
+    if not 0 < size < len(recorded):
+        raise StudyError(
+            f"{size} of {len(recorded)} recorded sites fitted leave none to be predicted",
+            file=study.file,
+            place="sites",
+            remedy="record more sites, or fit fewer (--fit)",
+        )
 
 
 def run_crossvalidate(
@@ -57,13 +78,6 @@ def run_crossvalidate(
     study = context.study
     recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
-    if not 0 < size < len(recorded):
-        raise StudyError(
-            f"{size} of {len(recorded)} recorded sites fitted leave none to be predicted",
-            file=study.file,
-            place="sites",
-            remedy="record more sites, or fit fewer (--fit)",
-        )
     laboratory = Laboratory(
         context, experiment_cache(context, folder), study.records_at(*recorded), "crossvalidate"
     )

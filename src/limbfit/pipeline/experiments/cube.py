@@ -6,6 +6,7 @@ A cube of 10 mm between frictionless plates that hold on to it: compressed over 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,10 @@ from ...indentation import materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
 from ...mesh.boxes import HEX, boxes
+from ...study import Study
 from ..shared.artefacts import read_json, write_json
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
 from .published import PUBLISHED
 
 Array = NDArray[np.float64]
@@ -74,12 +77,7 @@ def compress_cube(
     InputError
         For a compression that is no compression.
     """
-    if not 0.0 < compression_percent <= 60.0:
-        raise InputError(
-            f"a compression of {compression_percent:g} % is not possible here",
-            place="compression",
-            remedy="give one above 0 and up to 60 %",
-        )
+    check_compression(compression_percent)
     times = _times()
     rows, stresses = [], {}
     for specimen in _specimens(parameters or {}, kappa_ratio, law):
@@ -101,14 +99,31 @@ def compress_cube(
     return content
 
 
+def check_compression(percent: float) -> None:
+    """Raise `InputError` for a compression that is none, or too large."""
+    if not 0.0 < percent <= 60.0:
+        raise InputError(
+            f"a compression of {percent:g} % is not possible here",
+            place="compression",
+            remedy="give one above 0 and up to 60 %",
+        )
+
+
+def check_cube(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse tissues with fibres, and what is no compression.
+
+    Raises
+    ------
+    InputError
+    """
+    check_compression(options["compression_percent"])
+    if study.fibres:
+        what = "the cube compares isotropic tissues, and this study has fibres"
+        raise InputError(what, file=study.file, place="material.law")
+
+
 def run_cube(context: Context, folder: Path, *, compression_percent: float) -> dict[str, Any]:
     """The experiment: this study's identified tissues beside the published ones."""
-    if context.study.fibres:
-        raise InputError(
-            "the cube compares isotropic tissues, and this study has fibres",
-            file=context.study.file,
-            place="material.law",
-        )
     context.tell("cube", 0, 1, "compressing")
     stages = context.stored("calibrate", "calibration.json")["stages"]
     compress_cube(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,57 @@ from ...identify.checks.design import (
 )
 from ...identify.fit.objective import SiteResponse
 from ...indentation import Parameters, SiteModel
-from ...study import Study
+from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
 from ..shared.simulations import curve_job, experiment_cache, model_of
 from ..stages.laboratory import unknowns
 
 Array = NDArray[np.float64]
 
+DEFAULT_SITES = 4
 DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go
+
+
+def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse more sites than there are, sites with several records, and depths that fit at too few of them.
+
+    Raises
+    ------
+    InputError
+    """
+    sites, depths = wanted_sites(study, options["sites"]), options["depths_mm"]
+    if not 0 < sites <= len(study.sites):
+        raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
+    for site in study.sites:
+        records = study.records_at(site)
+        if len(records) > 1 or any(record.forced for record in records):
+            raise InputError(
+                "a design chooses one indentation per site, under a stated displacement; a site has others",
+                file=study.file,
+                place=f"sites.{site.name}",
+                remedy="leave one of that kind in a study for the design",
+            )
+    if limb is None or not depths:
+        return
+    fitting = [site for site in study.sites if min(depths) <= _deepest_mm(study, limb, site)]
+    if len(fitting) < sites:
+        what = f"{min(depths):g} mm is no deeper than half of the tissue at {len(fitting)} of {sites} sites"
+        raise StudyError(
+            what, file=study.file, place="--depths", remedy="give smaller depths, or fewer sites"
+        )
+
+
+def wanted_sites(study: Study, sites: int) -> int:
+    """How many sites to choose: of 0 as many as the study fits, else four, or all where it has fewer."""
+    return sites or len(study.fitted) or min(DEFAULT_SITES, len(study.sites))
+
+
+def _deepest_mm(study: Study, limb: LimbGeometry, site: Site) -> float:
+    """How deep a candidate at a site may go."""
+    width = study.indenter_of((study.records_at(site) or (site,))[0]).width_mm
+    return DEEPEST_SHARE * tissue_under(limb.anatomy, *limb.place(site), width)
 
 
 def run_design(
@@ -48,17 +90,6 @@ def run_design(
 ) -> dict[str, Any]:
     """Simulate every candidate once, with derivatives, and choose."""
     study = context.study
-    if not 0 < sites <= len(study.sites):
-        raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
-    for site in study.sites:
-        records = study.records_at(site)
-        if len(records) > 1 or any(record.forced for record in records):
-            raise InputError(
-                "a design chooses one indentation per site, under a stated displacement; a site has others",
-                file=study.file,
-                place=f"sites.{site.name}",
-                remedy="leave one of that kind in a study for the design",
-            )
     vector = study.vector(parameters)
     models, left_out = _candidate_models(context, depths_mm)
     cache = experiment_cache(context, folder)
@@ -75,7 +106,7 @@ def run_design(
         found.append(
             (build_candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max())
         )
-    content = _content(context, found, sites, vector, left_out)
+    content = _content(context, found, wanted_sites(study, sites), vector, left_out)
     content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
     write_json(folder / "design.json", content)
     _write_tables(folder, content)
@@ -97,8 +128,6 @@ def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[lis
                 left_out.append(f"site {own.site} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
             else:
                 models.append(_at_depth(own, depth))
-    if not models:
-        raise StudyError("no depth fits any site", file=study.file, remedy="give smaller --depths")
     return models, left_out
 
 

@@ -36,9 +36,10 @@ from ...indentation import (
     waves_under,
 )
 from ...mesh import read_vtu
-from ...study import Site
+from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
 from ..shared.planned import Planned, press, write_records
 from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
 from ..stages.deviations import expected_share, is_modulus, surface_error_mm
@@ -50,6 +51,30 @@ Array = NDArray[np.float64]
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
 READING_S = 1.0
 DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
+
+
+def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse unknown parameters, and a session too short for set-up, rest and hold alone.
+
+    Raises
+    ------
+    InputError
+    """
+    _named(unknowns(study), options["determine"])
+    budget = Budget(60.0 * options["minutes"], options["setup_s"])
+    _check_minutes([options["rest_s"] + min(options["holds_s"], default=0.0)], budget)
+
+
+def _check_minutes(seconds: Sequence[float], budget: Budget) -> None:
+    """Refuse a session into which no record of so many ``seconds``, or more, fits."""
+    least = budget.setup_s + min(seconds)
+    if least > budget.seconds:
+        raise InputError(
+            f"no record fits into {budget.seconds / 60:g} min: the shortest takes {least / 60:.1f} min or "
+            "more, set-up included",
+            place="--minutes",
+            remedy="allow more time",
+        )
 
 
 def run_protocol(
@@ -84,10 +109,11 @@ def run_protocol(
     tissues = sample_tissues(known, study.vector(parameters), draws, seed)
     noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
     planned, left_out = _planned(context, speeds_mm_s, holds_s, depths_mm, noises)
+    budget = Budget(60.0 * minutes, setup_s)
+    _check_minutes([one.seconds + rest_s for one in planned], budget)
     found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
-    budget = Budget(60.0 * minutes, setup_s)
     stiffness = is_modulus(study).astype(np.float64)
     wanted = DesignTarget(
         compute_bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness
@@ -143,13 +169,7 @@ def _plans_told(
     """The plans by name, and what their records tell; ``blind``: by force alone, if more is seen."""
     plans = _plans(found, options, budget, wanted)
     if DESIGNED not in plans:
-        least = min(compute_duration_s(options, [i], budget) for i in range(len(options)))
-        minutes = budget.seconds / 60.0
-        raise InputError(
-            f"no record fits into {minutes:g} min: the shortest takes {least / 60:.1f} min, set-up included",
-            place="--minutes",
-            remedy="allow more time",
-        )
+        raise RunError(f"no record that could be simulated fits into {budget.seconds / 60:g} min")
     told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
     if blind is not None:
         plans[UNSEEN] = _plans(found, blind, budget, wanted)[DESIGNED]

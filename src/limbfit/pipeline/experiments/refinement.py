@@ -2,32 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
 from ...indentation import Simulation
+from ...study import Study
 from ..shared.artefacts import file_digest, read_json
 from ..shared.context import Context
 from ..shared.extrapolation import MESH_ORDERS, richardson
+from ..shared.limb import LimbGeometry
 from ..shared.simulations import experiment_cache
 from ..stages.mesh import make_mesh, mesh_job, mesh_settings
 from .sensitivity import identified_parameters, store_runs
-from .variants import ChosenSite, Variant, choose_sites, compared, run_variants, write_variants
+from .variants import (
+    ChosenSite,
+    Variant,
+    check_variants,
+    choose_sites,
+    compared,
+    run_variants,
+    write_variants,
+)
 
 FACTORS = (1.4, 1.0, 0.7)  # of the edge lengths of the study's meshes
 FARTHEST = 0.1  # of the force on the finest mesh: a limit farther away is no limit
+
+
+def check_refinement(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse one mesh alone, and what `check_variants` does.
+
+    Raises
+    ------
+    InputError
+    """
+    check_variants(study, limb, options)
+    wanted = _factors(options["factors"])
+    if len(wanted) < 2 or wanted[-1] <= 0.0:
+        raise InputError("one mesh cannot be compared", place="factors", remedy="give another edge length")
+
+
+def _factors(given: Sequence[float]) -> list[float]:
+    """Of the edges, the coarsest first; the study's own among them."""
+    return sorted({1.0, *map(float, given)}, reverse=True)
 
 
 def run_refinement(
     context: Context, folder: Path, *, sites: Sequence[str], factors: Sequence[float]
 ) -> dict[str, Any]:
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
-    wanted = sorted({1.0, *map(float, factors)}, reverse=True)
-    if len(wanted) < 2 or wanted[-1] <= 0.0:
-        raise InputError("one mesh cannot be compared", place="factors", remedy="give another edge length")
+    wanted = _factors(factors)
     parameters = identified_parameters(context)
     chosen = choose_sites(context, sites)
     facts = _meshes(context, folder, chosen, wanted)

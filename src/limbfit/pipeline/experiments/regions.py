@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.state import Calibration
-from ...study import Site
+from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
 from ..shared.simulations import SimulationCache, experiment_cache
 from ..stages.laboratory import Laboratory, groupings, unknowns
 from ..stages.records import SiteRecord, as_response, site_record
@@ -60,20 +61,29 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     return {}
 
 
-def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
-    """By region: the sites that it is fitted on, and all that have a record."""
-    if sites not in CHOICES:
+def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse a study whose recorded sites have no region, and an unknown choice of sites.
+
+    Raises
+    ------
+    InputError
+    """
+    if (sites := options["sites"]) not in CHOICES:
         raise InputError(f"{sites!r} is not a choice of sites", place="sites", remedy="use all or fitted")
-    study = context.study
-    recorded = [site for site in study.sites if study.records_at(site)]
-    names = list(dict.fromkeys(site.region for site in recorded if site.region))
-    if not names:
+    if not any(record.site.region for record in study.recorded):
         raise StudyError(
             "no site has a region",
             file=study.file,
             place="sites",
             remedy='give each a region, such as region = "tibia"',
         )
+
+
+def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
+    """By region: the sites that it is fitted on, and all that have a record."""
+    study = context.study
+    recorded = [site for site in study.sites if study.records_at(site)]
+    names = list(dict.fromkeys(site.region for site in recorded if site.region))
     found = {}
     for name in names:
         mine = [site for site in recorded if site.region == name]

@@ -16,14 +16,28 @@ from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
 from ...socket.published import published
+from ...study import Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Begun, Kept
-from ..shared.socket_shape import socket_of
+from ..shared.limb import LimbGeometry
+from ..shared.socket_shape import check_at_rest, loadable_socket
 from .socket_intervals import CHANGE_PERCENT, FRICTION, drawn, tell_change, widen
 from .socket_limb import SocketLimb, Wearing, wear_all, worn
 
 NAME = "socket"
+
+
+def check_socket(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse tissues that are not at rest, and a shape or load that the limb cannot have.
+
+    Raises
+    ------
+    StudyError
+    """
+    check_at_rest(study)
+    if limb is not None:
+        loadable_socket(study, limb.anatomy, limb.anatomy.skin)
 
 
 def run_socket(
@@ -46,7 +60,7 @@ def run_socket(
         derivatives miss.
     """
     limb = SocketLimb.of(context, NAME)
-    socket = socket_of(context.study, limb.anatomy, limb.outer.skin)
+    socket = loadable_socket(context.study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(context, NAME, folder, socket)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...anatomy.frame import Frame, limb_frame
-from ...anatomy.surfaces.surfaces import write_surface
+from ...anatomy.surfaces.surfaces import Anatomy, write_surface
 from ...anatomy.surfaces.triangles import Surface
 from ...donning import outer_surface, press, pressed_problem
 from ...donning.model import OUTER
@@ -30,11 +30,23 @@ from ...socket.offsets import offsets
 from ...socket.rays import profile
 from ...socket.rectify import reduced_to
 from ...socket.targets import Target, zone
-from ...socket.wall import thickness, wall
+from ...socket.wall import thickness
+from ...study import Study
 from ..shared.artefacts import digest, write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Kept, Made
-from ..shared.socket_shape import blaming, check_regions, recipe_of
+from ..shared.limb import LimbGeometry
+from ..shared.socket_shape import (
+    blaming,
+    check_at_rest,
+    check_regions,
+    covered_regions,
+    load_of,
+    recipe_of,
+    regions_of,
+    target_of,
+    wall_of,
+)
 from ..shared.sources import code_digest
 from .socket_limb import SocketLimb, Wearing, wear_all, worn
 
@@ -42,6 +54,45 @@ Array = NDArray[np.float64]
 
 NAME, PLACE = "socket_design", "socket.design"
 CONTROL, DESIGN, OPTIMISED = "control", "design", "optimised"
+
+
+def check_socket_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse tissues that are not at rest, and a shape, load, region or target that the limb cannot have.
+
+    Raises
+    ------
+    StudyError
+    """
+    check_at_rest(study)
+    if limb is not None:
+        undeformed_socket(study, limb.anatomy, limb.anatomy.skin, options["optimise"])
+
+
+def undeformed_socket(
+    study: Study, anatomy: Anatomy, outer: Surface, optimise: Sequence[str]
+) -> tuple[Recipe, Socket]:
+    """The recipe of all designs, and the face on the limb as it is, with whose shape a wall can be made.
+
+    Raises
+    ------
+    StudyError
+        Where loads, regions or the target pressure are not those of this limb, or the wall cannot be made.
+    """
+    with blaming(study, PLACE):
+        recipe, frame = recipe_of(study, anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
+        plain = rectified(outer, frame, replace(recipe, reduction_percent=0.0))
+        for load in study.socket.loads:
+            load_of(study, load, anatomy)
+        regions, middles = regions_of(study, anatomy), outer.triangles.mean(axis=1)
+        covered = covered_regions(middles, anatomy.skin, regions, plain)
+        check_regions(study, [one.region for one in study.socket.design.regions], f"{PLACE}.regions", covered)
+        check_regions(study, optimise, "--optimise", covered)
+        if not target_of(study).at(middles, anatomy, regions, plain).any():
+            raise SurfaceError(
+                "no pressure is stated anywhere on the limb", remedy="state one below the brim"
+            )
+        wall_of(study, anatomy, plain)
+    return recipe, plain
 
 
 def run_socket_design(
@@ -61,12 +112,8 @@ def run_socket_design(
     simulations : at most so many for that, beside those of control and design.
     """
     with blaming(context.study, PLACE):
-        bench = _Bench.of(context, folder, parameters, simulations if optimise else 0)
-        covered = bench.limb.faces(bench.mesh, bench.plain)
-        stated = [one.region for one in context.study.socket.design.regions]
-        check_regions(context.study, stated, f"{PLACE}.regions", covered)
-        check_regions(context.study, optimise, "--optimise", covered)
-        target = bench.target()
+        bench = _Bench.of(context, folder, parameters, optimise, simulations)
+        target = target_of(context.study)
         recipe = bench.designed(target)
         design = bench.made(DESIGN, recipe)
         control_face, reduction = reduced_to(
@@ -79,7 +126,7 @@ def run_socket_design(
             best, found = _optimised(bench, recipe, done, optimise, simulations)
             done[OPTIMISED] = best
     last = list(done.values())[-1]
-    walled = bench.wall(last.face)
+    walled = wall_of(context.study, bench.limb.anatomy, last.face)
     write_surface(folder / "socket.stl", walled)
     content = {
         "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa}
@@ -127,15 +174,16 @@ class _Bench:
     count: int = 0
 
     @classmethod
-    def of(cls, context: Context, folder: Path, parameters: Parameters, more: int) -> _Bench:
-        study, limb = context.study, SocketLimb.of(context, NAME)
-        recipe = recipe_of(study, limb.anatomy)
-        frame = limb_frame(limb.anatomy.cut_point, limb.anatomy.cut_normal)
-        plain = rectified(limb.outer.skin, frame, replace(recipe, reduction_percent=0.0))
+    def of(
+        cls, context: Context, folder: Path, parameters: Parameters, optimise: Sequence[str], count: int
+    ) -> _Bench:
+        limb = SocketLimb.of(context, NAME)
+        recipe, plain = undeformed_socket(context.study, limb.anatomy, limb.outer.skin, optimise)
         mesh, facts = limb.mesh(context, NAME, folder, plain)
         kept = Kept(folder, also=[context.store[NAME]])
         laws = limb.materials(parameters)
-        return cls(context, limb, mesh, facts, laws, recipe, plain, kept, parameters, 3 + more)
+        total = 3 + (count if optimise else 0)
+        return cls(context, limb, mesh, facts, laws, recipe, plain, kept, parameters, total)
 
     @property
     def frame(self) -> Frame:
@@ -143,11 +191,6 @@ class _Bench:
 
     def tell(self, share: float, words: str) -> None:
         self.context.tell(NAME, self.count + share, self.total, words)
-
-    def target(self) -> Target:
-        table = self.limb.study.socket.design
-        stated = {one.region: one.pressure_kPa for one in table.regions if one.pressure_kPa is not None}
-        return Target(table.pressure, table.pressure_kPa, stated)
 
     def designed(self, target: Target) -> Recipe:
         """How the limb's shape becomes that under the target pressure."""
@@ -184,18 +227,8 @@ class _Bench:
             for region, depth in (depths or {}).items()
         ]
         face = rectified(self.limb.outer.skin, self.frame, replace(recipe, areas=zones))
-        self.wall(face)
+        wall_of(self.limb.study, self.limb.anatomy, face)
         return _Made(name, face, {"depths_mm": dict(depths or {})})
-
-    def wall(self, face: Socket) -> Surface:
-        table = self.limb.study.socket.design
-        return wall(
-            face,
-            self.limb.anatomy.cut_normal,
-            table.wall_mm,
-            adapter_diameter_mm=table.adapter_diameter_mm,
-            adapter_mm=table.adapter_mm,
-        )
 
     def put_on(self, *made: _Made) -> list[_Made]:
         """With what happens when each is put on and loaded: several side by side on the study's workers."""

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,12 +28,11 @@ from ...donning import (
     unpack,
 )
 from ...donning.model import OUTER
-from ...errors import InputError, RunError
+from ...errors import RunError
 from ...execution import Executor, SerialExecutor, report_progress
 from ...fe import Doubt
 from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
-from ...laws import FIBRED
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
 from ...socket.landmarks import directions, knee_centre
@@ -44,7 +42,7 @@ from ..shared.artefacts import digest, file_digest, read_json
 from ..shared.context import Context
 from ..shared.kept import Begun, Kept, Made
 from ..shared.simulations import fibres_of
-from ..shared.socket_shape import load_of, regions_of
+from ..shared.socket_shape import covered_regions, load_of, regions_of
 from ..shared.sources import code_digest
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
 from .socket_intervals import Spread, spread_facts
@@ -80,13 +78,6 @@ class SocketLimb:
     def of(cls, context: Context, name: str) -> SocketLimb:
         """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
         study, surfaces = context.study, context.store["surfaces"]
-        for place, states, remedy in (
-            ("material.law", study.material.course, f'give a study of its own with the law "{FIBRED}"'),
-            ("material.prestretch", study.material.prestretch, "give a study of its own without it"),
-        ):
-            if states:
-                what = "the limb in a socket is at rest, without contraction and pre-stretch"
-                raise InputError(what, file=study.file, place=place, remedy=remedy)
         anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
         outer, depth = anatomy, stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:
@@ -148,12 +139,8 @@ class SocketLimb:
 
     def faces(self, mesh: Mesh, socket: Socket) -> dict[str, Mask]:
         """Which faces (f,) under a socket belong to each region: those whose nearest skin does."""
-        skin, middles = self.anatomy.skin, mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
-        below = igl.point_mesh_squared_distance(middles, skin.points, skin.faces)[1]
-        nearest = igl.point_mesh_squared_distance(middles, socket.points, socket.faces)[1]
-        covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
-        masks = {name: region.faces[below] & covered for name, region in self.regions.items()}
-        return {name: mask for name, mask in masks.items() if mask.any()}
+        middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
+        return covered_regions(middles, self.anatomy.skin, self.regions, socket)
 
     def key(self, folder: Path, parameters: Parameters, socket: Socket, sensitivities: bool = False) -> str:
         """Of all that decides what a socket does to this limb, whose `mesh` is kept in the folder."""

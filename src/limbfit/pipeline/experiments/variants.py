@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
-from ...study import Indentation, Record, Site
+from ...study import Indentation, Record, Site, Study
 from ..shared.artefacts import write_curves
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
 from ..stages.deviations import bone_distance_mm
 
@@ -69,15 +70,21 @@ class Variant:
         return self.model.curve_times(CURVE_POINTS)
 
 
-def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
-    """The named indentations; none named: one where the tissue over the bone is thinnest, one where thickest.
+def check_variants(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse ``sites`` that cannot be varied, and a limb without a bone to measure the tissue from.
 
     Raises
     ------
     InputError
-        For a site or record that the study does not have, and a site with several.
     """
-    study = context.study
+    _driven(study, options["sites"])
+    if limb is not None and not limb.anatomy.bones:
+        what = "the limb has no bone, and this compares tissue by its thickness over bone"
+        raise InputError(what, file=study.file)
+
+
+def _driven(study: Study, names: Sequence[str]) -> list[Indentation]:
+    """The named indentations, or all, under a stated displacement."""
     chosen = [study.indentation(name) for name in names] or list(study.indentations)
     driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
     if not driven or (names and len(driven) < len(chosen)):
@@ -86,7 +93,18 @@ def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
             file=study.file,
             remedy="name records under a stated displacement",
         )
-    every = [_chosen(context, one) for one in driven]
+    return driven
+
+
+def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
+    """The named indentations; none named: one where the tissue over the bone is thinnest, one where thickest.
+
+    Raises
+    ------
+    InputError
+        For a site or record that the study does not have, and a site with several.
+    """
+    every = [_chosen(context, one) for one in _driven(context.study, names)]
     if names:
         return every
     thin, thick = min(every, key=_tissue), max(every, key=_tissue)

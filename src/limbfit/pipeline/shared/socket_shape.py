@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,12 +14,15 @@ from ...anatomy.frame import limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...anatomy.surfaces.triangles import Surface
 from ...errors import StudyError, SurfaceError
+from ...laws import FIBRED
 from ...socket import Area, Recipe, Socket, read_socket, rectified
 from ...socket.bones import refuse_bones
 from ...socket.landmarks import bone, directions, knee_centre
 from ...socket.loads import STANDARD_LOADS
 from ...socket.regions import SkinRegion, default_regions, stated_region
+from ...socket.targets import Target
 from ...socket.trim import Trim
+from ...socket.wall import wall
 from ...study import Study
 from ...study.socket import SocketAreaTable, SocketLoadTable
 
@@ -152,6 +156,68 @@ def load_of(study: Study, load: SocketLoadTable, anatomy: Anatomy) -> tuple[Arra
     with blaming(study):
         known = directions(anatomy, study.socket.side)
         return standard.force(weight, known), standard.moment(weight, known), point
+
+
+def check_at_rest(study: Study) -> None:
+    """Refuse tissues that contract or are stretched at rest.
+
+    Raises
+    ------
+    StudyError
+    """
+    for place, states, remedy in (
+        ("material.law", study.material.course, f'give a study of its own with the law "{FIBRED}"'),
+        ("material.prestretch", study.material.prestretch, "give a study of its own without it"),
+    ):
+        if states:
+            what = "the limb in a socket is at rest, without contraction and pre-stretch"
+            raise StudyError(what, file=study.file, place=place, remedy=remedy)
+
+
+def loadable_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
+    """`socket_of` a limb on which the study's loads are known, too.
+
+    Raises
+    ------
+    StudyError
+        With the key and the remedy.
+    """
+    for load in study.socket.loads:
+        load_of(study, load, anatomy)
+    return socket_of(study, anatomy, outer)
+
+
+def covered_regions(
+    middles: Array, skin: Surface, regions: Mapping[str, SkinRegion], socket: Socket
+) -> dict[str, NDArray[np.bool_]]:
+    """Which faces (f,) of an outer surface, with ``middles`` (f, 3) mm, are each region's under a socket.
+
+    A face belongs to a region where the nearest skin does. Regions that no socket reaches are left out.
+    """
+    below = igl.point_mesh_squared_distance(middles, skin.points, skin.faces)[1]
+    nearest = igl.point_mesh_squared_distance(middles, socket.points, socket.faces)[1]
+    covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
+    masks = {name: region.faces[below] & covered for name, region in regions.items()}
+    return {name: mask for name, mask in masks.items() if mask.any()}
+
+
+def target_of(study: Study) -> Target:
+    """The pressure that the limb is to bear."""
+    table = study.socket.design
+    stated = {one.region: one.pressure_kPa for one in table.regions if one.pressure_kPa is not None}
+    return Target(table.pressure, table.pressure_kPa, stated)
+
+
+def wall_of(study: Study, anatomy: Anatomy, face: Socket) -> Surface:
+    """A face with the wall and the adapter of the study."""
+    table = study.socket.design
+    return wall(
+        face,
+        anatomy.cut_normal,
+        table.wall_mm,
+        adapter_diameter_mm=table.adapter_diameter_mm,
+        adapter_mm=table.adapter_mm,
+    )
 
 
 @contextmanager

@@ -24,14 +24,25 @@ from .doubted import contact_record, doubts_record
 from .laboratory import Array, Laboratory, groupings, stage_titles, unknowns
 
 
+def check_fitted(study: Study) -> None:
+    """Refuse a study that has nothing to identify parameters from.
+
+    Raises
+    ------
+    StudyError
+        With the remedy.
+    """
+    if not study.fitted:
+        remedy = "set fitted = true where there is a record, or stop before it: limbfit run --until mesh"
+        raise StudyError("no site is fitted", file=study.file, place="sites", remedy=remedy)
+
+
 def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     """One material, then each tissue its own, on the fitted sites; simulations are kept.
 
     A run taken up again repeats the interrupted one from its kept simulations.
     """
     study, table = context.study, context.study.calibration
-    if not study.fitted:
-        raise StudyError("no site is fitted", file=study.file, place="sites", remedy="set fitted = true")
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
     laboratory = Laboratory(context, cache, study.records_at(*study.fitted))
     stages = groupings(study)

@@ -89,18 +89,9 @@ def acquire_site(
     """
     one = study.indentation(name)
     site = one.site if isinstance(one, Record) else one
-    if _is_made(study, one) and not replace_record:
-        remedy = "give --again to record it once more; the old record is kept"
-        raise InputError(f"{one.trace} exists", file=study.file, place=_place(one), remedy=remedy)
-    if isinstance(one, Record) and one.forced:
-        raise InputError(
-            "the device drives by displacement, and this record is made under force",
-            file=study.file,
-            place=_place(one),
-            remedy='leave out control = "force", or record it elsewhere',
-        )
-    _check_inside(study, one)
-    settings = _settings(study, one, depth_mm, operator is None)
+    settings = check_recording(
+        study, name, depth_mm=depth_mm, unattended=operator is None, replace_record=replace_record
+    )
     device = LineDevice(connect(address))
     try:
         with disk_errors(study.folder):
@@ -129,6 +120,36 @@ def acquire_site(
         "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.completed else None,
     }
     return found | _keep(study, one, folder, ending.completed)
+
+
+def check_recording(
+    study: Study,
+    name: str,
+    *,
+    depth_mm: float | None = None,
+    unattended: bool = False,
+    replace_record: bool = False,
+) -> Settings:
+    """The device's settings for a site, or one of its records; see `acquire_site`.
+
+    Raises
+    ------
+    InputError
+        For what can be known to be wrong before the device is asked.
+    """
+    one = study.indentation(name)
+    if _is_made(study, one) and not replace_record:
+        remedy = "give --again to record it once more; the old record is kept"
+        raise InputError(f"{one.trace} exists", file=study.file, place=_place(one), remedy=remedy)
+    if isinstance(one, Record) and one.forced:
+        raise InputError(
+            "the device drives by displacement, and this record is made under force",
+            file=study.file,
+            place=_place(one),
+            remedy='leave out control = "force", or record it elsewhere',
+        )
+    _check_inside(study, one)
+    return device_settings(study, one, depth_mm, unattended)
 
 
 def judge_recording(file: Path) -> dict[str, Any]:
@@ -180,7 +201,7 @@ def _check_inside(study: Study, one: Indentation) -> None:
             )
 
 
-def _settings(study: Study, one: Indentation, depth_mm: float | None, unattended: bool) -> Settings:
+def device_settings(study: Study, one: Indentation, depth_mm: float | None, unattended: bool) -> Settings:
     """Those of ``[acquire]``, with what the record states of its own."""
     own = {"ramp_speed_mm_s": one.speed_mm_s, "hold_s": one.hold_s} if isinstance(one, Record) else {}
     stated = {key: value for key, value in own.items() if value is not None}

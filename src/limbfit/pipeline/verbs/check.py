@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.imaging import Volume
-from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...anatomy.surfaces.surfaces import Anatomy
 from ...indentation import read_indenter
 from ...study import ClampsTable, Record, Study
 from ...traces import Regularised, SurfaceMotion, Trace
 from ..shared.context import Listener, Progress, quiet
-from ..shared.simulations import pins_met
-from ..shared.socket_shape import check_regions, load_of, regions_of, socket_of
+from ..shared.limb import LimbGeometry
+from ..shared.socket_shape import check_regions, loadable_socket, regions_of
 from ..shared.store import Store
-from ..shared.surface_points import chosen_points
 from ..stages.curves import Beside, read_observed, read_record
 from ..stages.inputs import marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
 from ..stages.surfaces import given_anatomy
+from .refusals import refused_commands
 from .run import keys
 
 
@@ -32,7 +32,8 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     -------
     dict
         ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down of each record),
-        ``flags`` (what looks wrong about records and places, with the evidence).
+        ``flags`` (what looks wrong about records and places, with the evidence), ``refused`` (``commands``
+        that this study cannot have with their defaults, and ``why``).
 
     Raises
     ------
@@ -68,9 +69,9 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
-    placed, anatomy = _places(study, given)
-    motions = {name: one.motion for name, one in seen.items()}
-    facts += _surface_motion_facts(study, motions, placed, anatomy)
+    limb = _limb(study, given)
+    placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
+    facts += _surface_motion_facts(study, {name: one.motion for name, one in seen.items()}, limb)
     facts += [told for name, one in seen.items() for told in _wave_facts(name, one)]
     if records and not placed:
         facts.append(
@@ -80,7 +81,9 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     if "socket" in study.model_fields_set:
         facts += _socket_facts(study, anatomy)
     if study.clamps is not None:
-        facts.append(_clamps_fact(study, study.clamps, placed, anatomy))
+        facts.append(_clamps_fact(study, study.clamps, limb))
+    refused = refused_commands(study, limb)
+    facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
     flags = record_flags(study, records, steps, placed, anatomy)
     listener(Progress("check", 2, 2))
     return {
@@ -88,6 +91,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         "facts": facts,
         "sites": records,
         "flags": [flag.to_dict() for flag in flags],
+        "refused": refused,
     }
 
 
@@ -108,10 +112,10 @@ def _wave_facts(name: str, seen: Beside) -> Iterator[str]:
 def _surface_motion_facts(
     study: Study,
     motions: Mapping[str, SurfaceMotion | None],
-    placed: dict[str, dict[str, Any]],
-    anatomy: Anatomy | None,
+    limb: LimbGeometry | None,
 ) -> Iterator[str]:
     """How the skin around the indenter moves, and which of its points are compared where sites are known."""
+    chosen = {} if limb is None else limb.surface_points(study, motions)
     for record in study.recorded:
         motion = motions[record.name]
         if motion is None:
@@ -120,22 +124,19 @@ def _surface_motion_facts(
             f"site {record.name}: surface of {len(motion.points)} points at {len(motion.time_s)} times in "
             f"contact, up to {motion.largest_mm:.2f} mm"
         )
-        if anatomy is not None and placed:
-            row, skin = placed[record.site.name], (anatomy.skin.points, anatomy.skin.faces)
-            place = tuple(row["position_mm"]), tuple(row["axis"])
-            said += f"; {chosen_points(study, record, place, skin, motion).words}"
+        if record.name in chosen:
+            said += f"; {chosen[record.name].words}"
         yield said
 
 
-def _places(study: Study, given: Anatomy | None) -> tuple[dict[str, dict[str, Any]], Anatomy | None]:
-    """Sites on the skin and the anatomy, of given surfaces or of stages that are done; else none."""
+def _limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
+    """The limb of given surfaces or of stages that are done; else None."""
     if given is not None:
-        return {site.name: place_site(site, study, given, None) for site in study.sites}, given
+        return LimbGeometry(given, {site.name: place_site(site, study, given, None) for site in study.sites})
     store = Store(study.results)
     if store.stamp("sites") is None or store.state("sites", keys(study)["sites"]).state != "done":
-        return {}, None
-    rows = store.read("sites", "sites.json")["sites"]
-    return {row["site"]: row for row in rows}, load_anatomy(store["surfaces"])
+        return None
+    return LimbGeometry.stored(store)
 
 
 def _image_facts(study: Study) -> list[str]:
@@ -152,24 +153,14 @@ def _image_facts(study: Study) -> list[str]:
     return facts
 
 
-def _clamps_fact(
-    study: Study, clamps: ClampsTable, placed: dict[str, dict[str, Any]], anatomy: Anatomy | None
-) -> str:
+def _clamps_fact(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -> str:
     """What ``[clamps]`` says; where the limb is known, how many of the pins hold it at each site."""
     said = (
         f"clamps: {len(clamps.angles)} pins of {clamps.force_N:g} N, {clamps.begun_s:g} s before touch-down"
     )
-    if anatomy is None or not placed:
+    if limb is None:
         return f"{said}; they are placed after limbfit run --until sites"
-    held = []
-    x, y, z = (float(value) for value in anatomy.cut_normal)
-    for site in study.sites:
-        row, one = placed[site.name], (study.records_at(site) or (site,))[0]
-        place, skin = (
-            (tuple(row["position_mm"]), tuple(row["axis"])),
-            (anatomy.skin.points, anatomy.skin.faces),
-        )
-        held.append(f"{pins_met(study, one, place, skin, (x, y, z))} at site {site.name}")
+    held = [f"{count} at site {name}" for name, count in limb.clamping_pins(study).items()]
     return f"{said}; {', '.join(held)} meet the skin"
 
 
@@ -187,9 +178,7 @@ def _socket_facts(study: Study, anatomy: Anatomy | None) -> list[str]:
             *facts,
             "the socket's shape is checked after limbfit run --until sites",
         ]
-    socket = socket_of(study, anatomy, anatomy.skin)
-    for load in table.loads:
-        load_of(study, load, anatomy)
+    socket = loadable_socket(study, anatomy, anatomy.skin)
     named = [one.region for one in table.design.regions]
     check_regions(study, named, "socket.design.regions", regions_of(study, anatomy))
     depth = socket.offset(anatomy.skin)

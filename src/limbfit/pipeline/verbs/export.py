@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ...bench.blocks import block_model, layered_block
 from ...errors import InputError
+from ...execution import SerialExecutor
+from ...fe import ELEMENTS, Problem
 from ...febio import (
     Range,
     check_fitted,
@@ -17,14 +24,21 @@ from ...febio import (
     write_inp,
     write_optimisation,
 )
-from ...indentation import Parameters
+from ...indentation import Parameters, SiteModel, build_problem
+from ...mesh import Mesh, write_vtu
 from ...study import Indentation as Planned
 from ...study import Record, Study
-from ..shared.context import Listener, quiet
+from ..shared.context import Context, Listener, quiet
+from ..shared.store import Store
 from ..stages.records import site_record
-from .simulate import Indentation, feb_settings, prepare_site, site_problem
+from .simulate import Indentation, feb_settings, known_parameters, prepare_site, site_problem
 
-FORMATS = ("feb", "febio-optimize", "inp", "calculix")
+Array = NDArray[np.float64]
+
+FITTED = "febio-optimize"
+FORMATS = ("feb", FITTED, "inp", "calculix")
+_DIVISIONS = 4  # of the block on which an export is tried
+_NO_CURVE = np.array([0.0, 1.0]), np.zeros(2)
 
 
 def export_study(
@@ -52,15 +66,14 @@ def export_study(
     RunError
         Where a file cannot be written.
     """
-    if to not in FORMATS:
-        raise InputError(f"{to!r} is no format", place="--to", remedy=f"give one of {', '.join(FORMATS)}")
-    chosen = _chosen(study, to, site)
+    chosen = check_export(study, to, site=site, parameters=parameters)
     folder = study.results / "export" if output is None else Path(output)
     rows = []
     for one in chosen:
         found = prepare_site(study, one.name, parameters=parameters, listener=listener)
         folder.mkdir(parents=True, exist_ok=True)
-        files, notes = _write(found, to, folder)
+        curve = _curve(found) if to == FITTED else _NO_CURVE
+        files, notes = _write(found, site_problem(found), to, folder, curve)
         rows.append(
             {
                 "site": one.name,
@@ -73,27 +86,99 @@ def export_study(
     return {"format": to, "sites": rows}
 
 
+def check_export(
+    study: Study, to: str, *, site: str | None = None, parameters: Parameters | None = None
+) -> Sequence[Planned]:
+    """The indentations to be written, each of which has been written on a small block in the limb's place.
+
+    Raises
+    ------
+    InputError
+        As `export_study`, before anything is meshed.
+    """
+    if to not in FORMATS:
+        raise InputError(f"{to!r} is no format", place="--to", remedy=f"give one of {', '.join(FORMATS)}")
+    chosen, store = _chosen(study, to, site), Store(study.results)
+    used, origin = (parameters, "given") if parameters else known_parameters(study, store)
+    context = Context(study, store, SerialExecutor(), quiet)
+    kinds = {(one.indenter, _is_forced(one)): one for one in chosen}
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "block.vtu"
+        block = _block(study)
+        write_vtu(block, file)
+        for one in kinds.values():
+            model = _block_model(study, one, file)
+            problem = build_problem(model, block, used)
+            if study.clamps is not None:
+                later = problem.history.later(study.clamps.begun_s)
+                problem = replace(problem, history=later, touch_down_s=study.clamps.begun_s)
+            found = Indentation(context, one, model, used, origin)
+            _write(found, problem, to, Path(folder), _NO_CURVE)
+    return chosen
+
+
+def _is_forced(one: Planned) -> bool:
+    return isinstance(one, Record) and one.forced
+
+
+def _block(study: Study) -> Mesh:
+    """A block in layers of the study's tissues, under a skin, held below."""
+    mesh = layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
+    middles = mesh.points[mesh.corners].mean(axis=1)[:, 2]
+    ranks = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
+    count = len(study.tissues)
+    held = {"fixed_bottom": mesh.node_sets["bottom"]}
+    return replace(mesh, regions=ranks * count // len(ranks), region_names=study.tissues, node_sets=held)
+
+
+def _block_model(study: Study, one: Planned, file: Path) -> SiteModel:
+    """An indentation in the middle of that block's top, without pins."""
+    model = block_model(one.name, file, study.solver, study.mesh.element)
+    along = (0.0, 0.0, 1.0)
+    return replace(
+        model,
+        knots_N=(0.0, 1.0, 0.0) if _is_forced(one) else (),
+        indenter=study.indenter_of(one),
+        kappa_ratio=study.material.kappa_ratio,
+        law=study.material.law,
+        fibres=tuple((tissue, along) for tissue in study.fibres),
+        extensions=study.extensions,
+        course=study.material.course,
+        prestretch=tuple(sorted(study.material.prestretch.items())),
+    )
+
+
+def _curve(found: Indentation) -> tuple[Array, Array]:
+    """Times, s, from touch-down and forces, N, of an indentation's record."""
+    assert isinstance(found.stated, Record)
+    record = site_record(found.context, found.stated)
+    inside = (record.times_s >= 0.0) & (record.times_s <= found.model.knots_s[-1])
+    return record.times_s[inside], record.force_N[inside]
+
+
 def _chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:
     if site is not None:
         one = study.indentation(site)
-        if to == "febio-optimize" and not isinstance(one, Record):
+        if to == FITTED and not isinstance(one, Record):
             raise InputError("has no record to fit", file=study.file, place=f"sites.{site}")
         return (one,)
-    if to == "febio-optimize":
+    if to == FITTED:
         if not study.fitted:
             raise InputError("no site is fitted", file=study.file, remedy="give --site")
         return study.records_at(*study.fitted)
     return study.indentations
 
 
-def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """The files of a site, and what the other solver does otherwise."""
-    name, problem = found.name, site_problem(found)
+def _write(
+    found: Indentation, problem: Problem, to: str, folder: Path, curve: tuple[Array, Array]
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """The files of a site, and what the other solver does otherwise; ``curve``: what its fit compares."""
+    name = found.name
     settings = feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
         write_feb(problem, folder / f"{name}.feb", settings)
         return (folder / f"{name}.feb",), differences(problem, settings)
-    if to == "febio-optimize":
+    if to == FITTED:
         if problem.fibres is not None:
             raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
         check_fitted(problem)
@@ -102,14 +187,9 @@ def _write(found: Indentation, to: str, folder: Path) -> tuple[tuple[Path, ...],
         settings = replace(settings, penalty=None)
         turned = in_indenter_frame(problem)
         write_feb(turned, model, settings)
-        assert isinstance(found.stated, Record)
-        record = site_record(found.context, found.stated)
-        inside = (record.times_s >= 0.0) & (record.times_s <= problem.history.times[-1])
         ranges = _ranges(found, problem.mesh.region_names)
         iterations = found.context.study.calibration.max_iterations
-        write_optimisation(
-            control, ranges, record.times_s[inside], record.force_N[inside], iterations=iterations
-        )
+        write_optimisation(control, ranges, *curve, iterations=iterations)
         return (control, model), differences(turned, settings)
     program = "abaqus" if to == "inp" else to
     write_inp(problem, folder / f"{name}.inp", program, settings)

@@ -55,7 +55,7 @@ def design_study(
         study,
         "design",
         listener=listener,
-        sites=sites or len(study.fitted) or 4,
+        sites=sites,
         depths_mm=[float(depth) for depth in depths_mm],
         parameters=used,
         parameters_from=origin,

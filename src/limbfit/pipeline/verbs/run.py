@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ..._version import __version__
@@ -10,6 +10,7 @@ from ...errors import InputError
 from ...study import Study
 from ..experiments.catalogue import (
     EXPERIMENTS,
+    check_experiment,
     do_experiment,
     experiment_key,
     experiment_rows,
@@ -21,9 +22,11 @@ from ..shared.context import Context, Listener, executor_of, quiet
 from ..shared.hand_labels import keep_hand_labels
 from ..shared.kernels import kernels_compiling
 from ..shared.keys import Keys, Stage
+from ..shared.limb import LimbGeometry
 from ..shared.provenance import input_digests, machine, settings_record, versions
 from ..shared.store import Store, lock
-from ..stages.calibrate import run_calibrate
+from ..shared.surface_points import read_motion
+from ..stages.calibrate import check_fitted, run_calibrate
 from ..stages.curves import run_traces
 from ..stages.mesh import run_mesh
 from ..stages.plausible import tell_flags
@@ -175,6 +178,18 @@ def run_study(
     RunError
         When another run holds the study, or the disk is full.
     """
+    return _run_stages(study, until, start, force, listener)
+
+
+def _run_stages(
+    study: Study,
+    until: str | None,
+    start: str | None,
+    force: Sequence[str],
+    listener: Listener,
+    check: Callable[[LimbGeometry], None] | None = None,
+) -> dict[str, Any]:
+    """See `run_study`; ``check`` is given the limb before anything is meshed."""
     anew = _anew(study, until, start, force)
     store = Store(study.results)
     with (
@@ -190,8 +205,13 @@ def run_study(
         chain = _chain(known)
         wanted = list(chain) if until is None else list(chain)[: list(chain).index(until) + 1]
         missing = {name for name in wanted if name in anew or store.state(name, chain[name]).state != "done"}
+        if "calibrate" in missing:
+            check_fitted(study)
+        wanted.sort(key=lambda name: name != "traces")  # records need no limb: what is wrong is said at once
         with kernels_compiling("calibrate" in missing) as compiled:
             for name in wanted:
+                if name == "mesh":
+                    _check_limb(context, check, name in missing)
                 if name == "calibrate":
                     compiled()
                 if name in missing:
@@ -204,6 +224,21 @@ def run_study(
     if until is not None:
         summary["until"] = until
     return summary
+
+
+def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, meshing: bool) -> None:
+    """Refuse what surfaces, sites and records rule out, before anything is meshed."""
+    study, store = context.study, context.store
+    if not (meshing or check):
+        return
+    limb = LimbGeometry.stored(store)
+    if meshing:
+        facts = store.read("traces", "traces.json")["sites"]
+        moving = [one for one in study.recorded if facts[one.name].get("surface", {}).get("compared")]
+        limb.clamping_pins(study)
+        limb.surface_points(study, {one.name: read_motion(store["traces"], one) for one in moving})
+    if check is not None:
+        check(limb)
 
 
 def _anew(study: Study, until: str | None, start: str | None, force: Sequence[str]) -> set[str]:
@@ -245,9 +280,14 @@ def run_experiment(study: Study, name: str, *, listener: Listener = quiet, **opt
     if name in _FOLDERS:
         raise InputError(f"results/{name} is not for an experiment", remedy="give it another name")
     chosen = options_of(experiment, options)
+    check_experiment(experiment, study, None, chosen)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:
-        run_study(study, until=last[0], listener=listener)
+
+        def check(limb: LimbGeometry) -> None:
+            check_experiment(experiment, study, limb, chosen)
+
+        _run_stages(study, last[0], None, (), listener, check)
     store = Store(study.results)
     with (
         lock(study.results),

@@ -1,0 +1,171 @@
+"""What inputs decide is said by ``limbfit check``, and by commands before anything is meshed or simulated."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbfit import (
+    check_study,
+    design_socket,
+    design_study,
+    export_study,
+    fit_socket,
+    load_study,
+    plan_protocol,
+    run_experiment,
+    run_study,
+)
+from limbfit.errors import InputError
+
+UNFITTED = ("fitted = true", "")
+BOTH_FITTED = ('trace = "2.csv"', 'trace = "2.csv"\nfitted = true')
+FORCED = ('trace = "2.csv"', 'trace = "2.csv"\ncontrol = "force"')
+FIBRED = ("[[sites]]", '[material]\nlaw = "ogden-fibres"\n[[sites]]')
+STRETCHED = ("[[sites]]", "[material]\nprestretch = { skin = 1.1 }\n[[sites]]")
+RUBBED = ("[[sites]]", "[indenter]\nfriction = 0.3\n[[sites]]")
+FAST = ("[[sites]]", '[[records]]\nsite = "1"\nname = "f"\ntrace = "1.csv"\nspeed_mm_s = 9.0\n[[sites]]')
+WIDE = ("[[sites]]", "[socket]\ntrim_mm = 40.0\n[socket.design]\nadapter_diameter_mm = 200.0\n[[sites]]")
+HEEL = (
+    "[[sites]]",
+    '[socket]\ntrim_mm = 40.0\n[[socket.design.regions]]\nregion = "heel"\npressure_kPa = 5.0\n[[sites]]',
+)
+BONELESS = ('bones = { tibia = "tibia.stl" }', "")
+
+
+def with_change(folder: Path, change: tuple[str, str]):
+    file = folder / "study.toml"
+    text = file.read_text()
+    assert change[0] in text
+    file.write_text(text.replace(*change, 1))
+    return load_study(folder)
+
+
+def begun(study) -> list[str]:
+    """The stages that were begun; a log is none."""
+    return [path.name for path in study.results.glob("*") if path.name != "log" and path.is_dir()]
+
+
+def experiment(name: str, **options):
+    return lambda study: run_experiment(study, name, **options)
+
+
+BY_STUDY = {
+    "run": (UNFITTED, run_study, "no site is fitted"),
+    "uncertainty": (UNFITTED, experiment("uncertainty"), "no site is fitted"),
+    "crossvalidate": (BOTH_FITTED, experiment("crossvalidate"), "leave none to be predicted"),
+    "regions": (FORCED, experiment("regions"), "no site has a region"),
+    "cube": (FIBRED, experiment("cube"), "has fibres"),
+    "design": (FORCED, design_study, "one indentation per site"),
+    "socket": (STRETCHED, fit_socket, "at rest, without contraction and pre-stretch"),
+    "socket design": (STRETCHED, design_socket, "at rest, without contraction and pre-stretch"),
+    "export --to calculix": (FORCED, lambda s: export_study(s, "calculix"), "is not written for Calculix"),
+    "export --to inp": (RUBBED, lambda s: export_study(s, "inp"), "friction is not written for Abaqus"),
+    "export --to febio-optimize": (
+        FIBRED,
+        lambda s: export_study(s, "febio-optimize"),
+        "fit is written for tissues without fibres",
+    ),
+}
+
+
+@pytest.mark.parametrize("command", BY_STUDY)
+def test_what_the_study_file_decides_is_said_at_once(study, command):
+    change, call, words = BY_STUDY[command]
+    given = with_change(study, change)
+    rows = [row for row in check_study(given)["refused"] if command in row["commands"]]
+    assert len(rows) == 1
+    assert words in rows[0]["why"]
+    with pytest.raises(InputError, match=re.escape(words)):
+        call(given)
+    assert not begun(given)
+
+
+def test_options_are_judged_at_once(study):
+    given = load_study(study)
+    for call, words in (
+        (experiment("crossvalidate", fit=2), "2 of 2 recorded sites"),
+        (experiment("sensitivity-mesh", factors=[1.0]), "one mesh cannot be compared"),
+        (experiment("sensitivity-c", sites=["9"]), "no site is named '9'"),
+        (experiment("cube", compression_percent=90.0), "is not possible here"),
+        (lambda s: design_study(s, sites=3), "3 sites are wanted of 2"),
+        (lambda s: plan_protocol(s, determine=("bone.c_kPa",)), r"no parameter is named 'bone\.c_kPa'"),
+        (lambda s: plan_protocol(s, minutes=1), "no record fits into 1 min"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call(given)
+    assert not begun(given)
+
+
+BY_LIMB = {
+    "design": (UNFITTED, lambda s: design_study(s, depths_mm=(40.0,)), "40 mm is no deeper than half", None),
+    "sensitivity": (BONELESS, experiment("sensitivity-c"), "the limb has no bone", "sensitivity --only c"),
+    "socket design": (WIDE, design_socket, "200 mm is as wide as the socket", "socket design"),
+}
+
+
+@pytest.mark.parametrize("case", BY_LIMB)
+def test_what_the_limb_decides_is_said_before_meshing(study, case):
+    change, call, words, command = BY_LIMB[case]
+    given = with_change(study, change)
+    if command is not None:
+        assert any(
+            command in one["commands"] and words in one["why"] for one in check_study(given)["refused"]
+        )
+    with pytest.raises(InputError, match=words):
+        call(given)
+    assert not list(given.results.rglob("*.vtu"))
+
+
+def test_a_region_that_the_limb_has_not_is_said_before_meshing(study):
+    given = with_change(study, HEEL)
+    for call in (check_study, design_socket):
+        with pytest.raises(InputError, match=r"socket\.design\.regions: no region is named 'heel'"):
+            call(given)
+    assert not list(given.results.rglob("*.vtu"))
+
+
+def test_pins_that_miss_the_limb_are_said_before_meshing(study):
+    given = with_change(study, ("[[sites]]", "[clamps]\nangles_degrees = [10.0]\n[[sites]]"))
+    for call in (check_study, run_study):
+        with pytest.raises(InputError, match="clamps: site 1: "):
+            call(given)
+    assert not (given.results / "mesh").exists()
+
+
+def test_a_surface_that_is_elsewhere_is_said_before_meshing(study):
+    time, far = np.arange(0.0, 12.0, 0.2), 500.0
+    rows = [[t, far, far, far, 0.0, 0.0, 0.1 * t] for t in time]
+    header = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
+    np.savetxt(study / "skin.csv", rows, delimiter=",", header=header, comments="")
+    given = with_change(study, ('trace = "2.csv"', 'trace = "2.csv"\nsurface = "skin.csv"'))
+    for call in (check_study, run_study):
+        with pytest.raises(InputError, match=r"no point lies within 40 mm of site 2"):
+            call(given)
+    assert not (given.results / "mesh").exists()
+
+
+def test_records_are_read_before_the_limb_is_made(study):
+    (study / "2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n")
+    with pytest.raises(InputError, match=r"2\.csv"):
+        run_study(load_study(study))
+    assert not (study / "results" / "surfaces").exists()
+
+
+def test_all_records_are_judged_before_the_first_is_made(study, limbfit):
+    """The first needs a device that is not there: who asks for it ends with exit code 1."""
+    (study / "1.csv").unlink()
+    with_change(study, ("[[sites]]", FAST[1].replace('trace = "1.csv"', 'trace = "f.csv"')))
+    words = ("acquire", study, "--unattended", "--depth", "5", "--device", "tcp://127.0.0.1:9")
+    code, _, errors = limbfit(*words)
+    assert code == 2
+    assert "ramp_speed_mm_s is over speed_limit_mm_s" in errors
+
+
+def test_a_record_that_no_device_makes_is_said_by_the_check(study):
+    refused = check_study(with_change(study, FAST))["refused"]
+    (row,) = [row for row in refused if "acquire --site 1-f" in row["commands"]]
+    assert "ramp_speed_mm_s is over speed_limit_mm_s" in row["why"]
