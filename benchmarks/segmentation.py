@@ -2,10 +2,15 @@
 
     python benchmarks/segmentation.py --seeds 0 1 2 3 4 5 6 7 8 9 --json segmentation.json
     python benchmarks/segmentation.py --detail coarse --seeds 0          # a quick look
+    python benchmarks/segmentation.py --voxels 2 1 0.5 --contrast CT     # how time and memory grow
 
 Each seed is another limb in an image of the paper's resolution and noise. Surface errors are distances (mm)
 of the triangulated surfaces' vertices to the implicit truth, at least 3 mm distal of the proximal cut; Dice
 is over voxels whose centres lie inside. One process and one thread; seconds are CPU seconds.
+
+With ``--voxels`` (mm) one limb is imaged in a field of 256 x 256 x 300 mm, which 0.5 mm make 512 x 512 x 600
+voxels, and only cost is measured: of the check for one limb, labels, surfaces, and the facts about labels.
+The largest memory is that of the process so far, so voxels go from large to small.
 """
 
 from __future__ import annotations
@@ -21,13 +26,16 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from limbfit.anatomy.grid import FAT, LabelMap
+from limbfit.anatomy.labels.quality import assess
+from limbfit.anatomy.segmentation.one_limb import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, signed_distance
 from limbfit.phantom.geometry import BONES, Limb, gradient_of, make_limb
-from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, image_of, make_grid
+from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, image_of, make_grid
 from limbfit.phantom.surfaces import true_anatomy
 
 BELOW_CUT_MM = 3.0
+FIELD_MM = np.array([300.0, 256.0, 256.0])  # k, j, i
 
 
 def dice(a: np.ndarray, b: np.ndarray) -> float:
@@ -83,6 +91,40 @@ def surface_errors(anatomy: Anatomy, limb: Limb) -> dict[str, dict[str, float]]:
     return errors
 
 
+def cover_field(limb: Limb, voxel_mm: float, seed: int) -> ScanGrid:
+    """Cubic voxels in the whole field, which lies as the scanner's box does."""
+    box = make_grid(limb, "paper", seed)
+    shape = np.round(FIELD_MM / voxel_mm).astype(int)
+    half = (np.array(box.shape) - 1)[::-1] / 2 * box.spacing - (shape - 1)[::-1] / 2 * voxel_mm
+    size = (int(shape[0]), int(shape[1]), int(shape[2]))
+    return ScanGrid(size, (voxel_mm,) * 3, box.origin + box.direction @ half, box.direction)
+
+
+def measure_cost(voxel_mm: float, contrast: str, seed: int) -> dict[str, Any]:
+    """CPU seconds of each step and the largest memory (GB) until its end."""
+    limb = make_limb(seed)
+    image = image_of(limb, cover_field(limb, voxel_mm, seed), seed=seed, levels=CONTRASTS[contrast])
+    row: dict[str, Any] = {"voxel_mm": voxel_mm, "contrast": contrast, "seed": seed, "shape": image.size}
+    start, begun = time.process_time(), time.perf_counter()
+
+    def note(step: str) -> None:
+        nonlocal start
+        row[f"{step}_cpu_s"] = round(time.process_time() - start, 1)
+        row[f"{step}_GB"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2, 2)
+        start = time.process_time()
+
+    check_one_limb(image)
+    note("one_limb")
+    labels = segment(image)
+    note("segment")
+    build_anatomy(labels)
+    note("surfaces")
+    assess(labels)
+    note("quality")
+    row["wall_s"] = round(time.perf_counter() - begun, 1)
+    return row
+
+
 def one(detail: str, contrast: str, seed: int) -> dict[str, Any]:
     limb = make_limb(seed)
     image = image_of(limb, make_grid(limb, detail, seed), seed=seed, levels=CONTRASTS[contrast])
@@ -124,11 +166,16 @@ def main() -> None:
     parser.add_argument("--detail", choices=list(DETAIL_GRIDS), default="paper")
     parser.add_argument("--contrast", choices=list(CONTRASTS), default="UTE")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
+    parser.add_argument("--voxels", type=float, nargs="+", default=[], help="mm; measure cost only")
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(options.threads)
     rows = []
-    for seed in options.seeds:
+    for voxel_mm in options.voxels:
+        rows.append(measure_cost(voxel_mm, options.contrast, options.seeds[0]))
+        print(rows[-1], flush=True)
+    for seed in [] if options.voxels else options.seeds:
         rows.append(one(options.detail, options.contrast, seed))
         show(rows[-1])
         if options.json:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import SimpleITK as sitk  # noqa: N813
+from limbs import write_dicom
 
 from limbfit.anatomy.grid import FAT, Volume
+from limbfit.anatomy.imaging import read_volume
+from limbfit.anatomy.morphology import compute_depth
 from limbfit.anatomy.segmentation.body import limb_mask, smoothed
 from limbfit.anatomy.segmentation.contrast import is_ct
-from limbfit.anatomy.segmentation.fat import bright_fat, depth_below, subcutaneous
+from limbfit.anatomy.segmentation.fat import bright_fat, subcutaneous
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.segmentation.supports import without_supports
 from limbfit.errors import ImageError
@@ -126,6 +132,54 @@ def test_contrast_is_told_by_the_grey_values_and_must_not_contradict_them(images
             segment(images[image], contrast=stated)
 
 
+FULL_SCALE = 2000.0  # of MRI's grey values, of which air has none below zero
+
+
+def test_an_overshoot_of_resampling_is_no_hounsfield_unit(images):
+    """B-splines put voxels of MRI below -200; one there decides nothing, nor do a few thousand at -300."""
+    image = images["T1"].with_array(FULL_SCALE * (images["T1"].array > 0.2))
+    steps = (0.45 * image.spacing).tolist()
+    size = [int(n / 0.45) for n in image.size]
+    fine = sitk.Resample(
+        image.to_sitk(), size, sitk.Transform(), sitk.sitkBSpline3, image.origin.tolist(), steps,
+        image.direction.ravel().tolist(), 0.0,
+    )  # fmt: skip
+    resampled = Volume.from_sitk(fine)
+    assert (resampled.array < -200).sum() > 1000
+    assert not is_ct(resampled)
+    few = image.array.copy()
+    few.ravel()[:: few.size // 3000] = -300.0
+    assert not is_ct(image.with_array(few))
+
+
+def test_ct_is_told_by_its_air_wherever_a_window_cut_it_off(images):
+    image = images["CT"]
+    assert is_ct(image.with_array(np.clip(image.array, -500, 500)))
+    outside = np.where(image.array < -900, -3024.0, image.array)  # beyond the circle of reconstruction
+    outside[:, 10:-10, 10:-10] = image.array[:, 10:-10, 10:-10]
+    assert is_ct(image.with_array(outside))
+    narrow = image.with_array(np.clip(image.array, -250, 250))
+    assert not is_ct(narrow)
+    assert is_ct(narrow, "CT")
+
+
+def test_the_dicom_modality_decides_and_must_not_be_contradicted(images, tmp_path):
+    """An MR series with air at -1000, as of an offset, is MR; a CT without Hounsfield units is refused."""
+    image = images["CT"]
+    small = replace(image, array=np.rint(image.array[::12] + 1024), spacing=image.spacing * [1, 1, 12])
+    for modality, intercept in (("MR", "-1024"), ("CT", "-1024"), ("CT", "0")):
+        write_dicom(tmp_path / f"{modality}{intercept}", small, Modality=modality, RescaleIntercept=intercept)
+    found = read_volume(tmp_path / "MR-1024")
+    assert found.modality == "MR"
+    assert (found.array < -900).mean() > 0.5
+    assert not is_ct(found)
+    assert is_ct(read_volume(tmp_path / "CT-1024"))
+    with pytest.raises(ImageError, match="modality MR does not fit CT"):
+        is_ct(found, "CT")
+    with pytest.raises(ImageError, match="not Hounsfield units"):
+        is_ct(read_volume(tmp_path / "CT0"))
+
+
 def test_seeds_part_bones_that_were_found_as_one(images, limb):
     """A bridge of bone across the knee joins femur and tibia; a seed in each parts them in the gap."""
     image, array = images["CT"], images["CT"].array.copy()
@@ -162,7 +216,7 @@ def test_a_septum_is_no_subcutaneous_fat_and_a_vessel_in_the_fat_is():
     vessel = layer & (np.hypot(j - 29.5, i - 5.5) < 1.2)
     levels[septum | deep] = 2.0
     levels[vessel] = 0.1
-    bones, depth = np.zeros(shape, dtype=bool), depth_below(limb, spacing)
+    bones, depth = np.zeros(shape, dtype=bool), compute_depth(limb, spacing)
     fat = subcutaneous(bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing)
     assert dice(fat, layer) > 0.95
     assert not fat[deep].any()
@@ -177,7 +231,7 @@ def test_dark_fat_far_from_the_coil_is_fat():
     radius = np.hypot(j - 29.5, i - 29.5)
     limb, layer = radius < 27, (radius < 27) & (radius > 22)
     levels = (np.where(layer, 2.0, 1.0) * limb * (1 - 0.6 * k / 79)).astype(np.float32)
-    bones, depth = np.zeros(shape, dtype=bool), depth_below(limb, spacing)
+    bones, depth = np.zeros(shape, dtype=bool), compute_depth(limb, spacing)
     fat = subcutaneous(bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing)
     for end in (slice(0, 10), slice(-10, None)):
         assert dice(fat[end], layer[end]) > 0.9

@@ -8,7 +8,7 @@ from limbs import CALF, DIRECTIONS, leg_image
 from scipy.ndimage import label
 
 from limbfit.anatomy.imaging import BONES, LabelMap, Volume, read_volume
-from limbfit.anatomy.segmentation.body import ball, bias_field, limb_mask, smoothed
+from limbfit.anatomy.segmentation.body import bias_field, limb_mask, smoothed
 from limbfit.anatomy.segmentation.bones import escape_level, find_bones, name_bones
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
@@ -174,10 +174,6 @@ def test_a_leak_in_the_cortex_does_not_part_a_bone():
     levels[14:16, 20, 24:30] = 2.0
     (bone,) = find_bones(levels, limb, np.ones(3), 100.0)
     assert (bone & (radius < 6)).any(axis=(1, 2)).all()
-
-
-def test_ball_is_round_in_millimetres():
-    assert ball(3.0, np.array([1.0, 1.5, 3.0])).shape == (3, 5, 7)
 
 
 @pytest.mark.slow

@@ -174,7 +174,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Volume(Grid):
-    """A scalar image, ``array`` float32; see :class:`Grid`. ``modality`` is DICOM's code where it is known."""
+    """A scalar image, ``array`` float32; see :class:`Grid`; ``modality`` is DICOM's code, if known."""
 
     modality: str = ""
 

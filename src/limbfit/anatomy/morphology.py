@@ -34,7 +34,7 @@ def compute_distance(mask: Mask, spacing: Spacing) -> Field:
 
 
 def compute_depth(mask: Mask, spacing: Spacing) -> Field:
-    """Distance to the nearest voxel outside the mask, mm; the mask goes on beyond its first and last slice."""
+    """Distance to the nearest voxel outside the mask, mm; it goes on beyond its first and last slice."""
     padded = np.pad(mask, 1)
     padded[0], padded[-1] = padded[1], padded[-2]
     return compute_distance(~padded, spacing)[1:-1, 1:-1, 1:-1]

@@ -12,6 +12,7 @@ from scipy.ndimage import label as connected
 
 from ..ends import longest_axis
 from ..grid import SOFT_TISSUE, LabelMap
+from ..morphology import find_box
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -66,10 +67,12 @@ def assess(labels: LabelMap) -> LabelQuality:
 
 def _facts(mask: Mask, labels: LabelMap) -> dict[str, Any]:
     """Volume, pieces that share faces, closed holes, and the slices from first to last."""
+    box = find_box(mask)
+    mask = mask[box]
     parts, count = connected(mask)
-    sizes = np.bincount(parts.ravel())[1:]
+    sizes = np.bincount(parts[mask])[1:]
     holes = binary_fill_holes(mask) & ~mask
-    filled = np.flatnonzero(mask.any(axis=(1, 2)))
+    filled = box[0].start + np.flatnonzero(mask.any(axis=(1, 2)))
     return {
         "volume_cm3": round(float(mask.sum()) * labels.voxel_mm3 / 1000, 3),
         "pieces": int(count),

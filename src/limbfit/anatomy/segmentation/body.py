@@ -88,8 +88,8 @@ def bias_field(volume: Volume, limb: Mask) -> Field:
     n4 = sitk.N4BiasFieldCorrectionImageFilter()
     n4.SetMaximumNumberOfIterations(_BIAS_ITERATIONS)
     n4.Execute(sitk.Shrink(image, factors), sitk.Shrink(mask, factors))
-    log_field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(image))
-    return np.exp(np.clip(log_field, -1.5, 1.5))
+    field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(image))
+    return np.exp(np.clip(field, -1.5, 1.5, out=field), out=field)
 
 
 def muscle_level(smooth: Field, limb: Mask) -> float:

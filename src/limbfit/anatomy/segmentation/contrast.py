@@ -16,9 +16,9 @@ Contrast = Literal["auto", "T1", "UTE", "CT"]
 
 AIR_HU, MUSCLE_HU = -1000.0, 50.0
 _LIGHTEST_HU = -200.0  # every CT of a limb shows something lighter than fat
-_AIR_WINDOW_HU = -400.0  # no air is denser, where a grey-value window cut it off
-_AIR_WIDTH_HU = 200.0  # of the peak of air in the histogram
-_AIR_SHARE = 0.01  # of the voxels: fewer are an artefact of resampling
+_DENSEST_AIR_HU = -400.0  # no air is denser, where a grey-value window cut it off
+_AIR_WIDTH_HU = 100.0  # half the width of its peak in the histogram
+_AIR_SHARE = 0.03  # of the voxels: fewer are an artefact of resampling
 _TOP_HU = 100.0  # the outline does not tell bone from soft tissue
 
 
@@ -59,9 +59,9 @@ def _shows_air(volume: Volume, low: float) -> bool:
     Resampling of MRI by B-splines overshoots to negative values too, but in few voxels, the fewer the lower.
     """
     air = max(low, AIR_HU)
-    span = (air - _AIR_WIDTH_HU / 2, air + 1.5 * _AIR_WIDTH_HU)
-    peak, beside = np.histogram(volume.array, bins=2, range=span)[0]
-    return bool(air < _AIR_WINDOW_HU and peak > beside and peak > _AIR_SHARE * volume.array.size)
+    span = (air - _AIR_WIDTH_HU, air + _AIR_WIDTH_HU)
+    count = int(np.histogram(volume.array, bins=1, range=span)[0][0])
+    return air < _DENSEST_AIR_HU and count > _AIR_SHARE * volume.array.size
 
 
 def above_air(volume: Volume) -> Volume:

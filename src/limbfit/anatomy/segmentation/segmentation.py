@@ -120,9 +120,7 @@ def _segment(
     return _labels(found.limb, found.fat(volume.spacing), bones, names, volume, box)
 
 
-def _in_mri(
-    smooth: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float
-) -> _Tissues:
+def _in_mri(smooth: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float) -> _Tissues:
     levels = smooth / np.float32(muscle_level(smooth, limb))
     found = find_bones(end.along(levels), end.along(limb), spacing, smallest_mm3)
     return _Tissues(limb, [end.along(bone) for bone in found], levels, ct=False)
@@ -143,9 +141,7 @@ def _fill_piece(mask: Mask) -> Mask:
     return filled
 
 
-def _labels(
-    limb: Mask, fat: Mask, bones: list[Mask], names: list[str], volume: Volume, box: Box
-) -> LabelMap:
+def _labels(limb: Mask, fat: Mask, bones: list[Mask], names: list[str], volume: Volume, box: Box) -> LabelMap:
     array = limb.astype(np.uint8)
     known = dict(DEFAULT_NAMES)
     values = {name: value for value, name in known.items()}

@@ -13,11 +13,11 @@ import numpy as np
 import pyvista as pv
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
-from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter
-from scipy.ndimage import label as connected
+from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from ...errors import LabelError
 from ..grid import Grid, LabelMap, Volume
+from ..morphology import compute_distance, find_box, find_largest_piece
 from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
 
 Mask = NDArray[np.bool_]
@@ -66,16 +66,15 @@ def fine_surface(labels: LabelMap, which: str | None, edge_mm: float) -> Surface
 
 def _body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
     """The largest connected body without inner holes, cropped with a margin of empty voxels."""
-    parts, count = connected(mask)
-    if count == 0:
+    if not mask.any():
         raise LabelError(f"no voxel is labelled {name!r}")
-    sizes = np.bincount(parts.ravel())[1:]
-    best = int(np.argmax(sizes)) + 1
-    box = find_objects(parts)[best - 1]
-    body = binary_fill_holes(parts[box] == best)
+    outer = find_box(mask)
+    largest = find_largest_piece(mask[outer])
+    inner = find_box(largest)
+    body = binary_fill_holes(largest[inner])
     pad = np.ceil(_MARGIN_MM / grid.spacing).astype(int) + 2
     padded = np.pad(body, [(p, p) for p in pad[::-1]])
-    start = np.array([part.start for part in box])[::-1] - pad
+    start = np.array([a.start + b.start for a, b in zip(outer, inner)])[::-1] - pad
     crop = Grid(padded, grid.spacing, grid.index_to_point(start), grid.direction)
     return padded, crop
 
@@ -96,14 +95,8 @@ def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]
 def signed_distance_to(body: Mask, grid: Grid) -> Field:
     """Distance of each voxel to the nearest one on the other side, mm, positive inside, clamped."""
     reach = 3 * grid.spacing.max()
-
-    def outside(mask: Mask) -> Field:
-        image = sitk.GetImageFromArray(mask.astype(np.uint8))
-        image.SetSpacing(grid.spacing.tolist())
-        distance = sitk.SignedMaurerDistanceMap(image, squaredDistance=False, useImageSpacing=True)
-        return np.clip(sitk.GetArrayFromImage(distance), 0, reach)
-
-    return outside(~body) - outside(body)
+    inside, outside = (compute_distance(mask, grid.spacing) for mask in (~body, body))
+    return np.minimum(inside, reach, out=inside) - np.minimum(outside, reach, out=outside)
 
 
 def _cubic(field: Volume, edge_mm: float) -> Volume:

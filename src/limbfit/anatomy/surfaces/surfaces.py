@@ -136,16 +136,17 @@ def _placed(surface: Surface, grid: LabelMap) -> Surface:
 
 def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array) -> Anatomy:
     extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
-    _check_sides(labels, end, point, normal)
+    distal = labels.heights(point, normal) < 0
+    _check_sides(labels.limb & distal, end)
     skin = capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)
     reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
     bones = {}
     for name in labels.bone_names:
-        if _distal_volume(labels, name, point, normal) >= _STUMP_MM3:
+        if (labels.mask(name) & distal).sum() * labels.voxel_mm3 >= _STUMP_MM3:
             bones[name] = extract_surface(reach, name, edge_mm)
     regions = {}
     for label, name in labels.regions.items():
-        if _distal_volume(labels, label, point, normal) <= 0.0:
+        if not (labels.mask(label) & distal).any():
             raise LabelError(
                 f"nothing of {label!r} is left in the limb",
                 place=f"geometry.regions.{name}",
@@ -182,13 +183,12 @@ def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
     return np.asarray(point, dtype=float), vector / length
 
 
-def _check_sides(labels: LabelMap, end: ProximalEnd, point: Array, normal: Array) -> None:
-    """Refuse a limb that a side of the image cuts off distal of the cut."""
-    limb = labels.limb & (labels.heights(point, normal) < 0)
+def _check_sides(limb: NDArray[np.bool_], end: ProximalEnd) -> None:
+    """Refuse a limb, distal of the cut, that a side of the image cuts off."""
     for axis in range(3):
         if axis == end.axis:
             continue
-        for index in (0, labels.size[axis] - 1):
+        for index in (0, -1):
             if layer(limb, axis, index).sum() > 20:
                 raise LabelError(
                     "the limb runs out of the side of the image",
@@ -199,11 +199,6 @@ def _check_sides(labels: LabelMap, end: ProximalEnd, point: Array, normal: Array
 def _within(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
     """Only what lies distal of a plane."""
     return labels.with_array(np.where(labels.heights(point, normal) <= 0, labels.array, 0))
-
-
-def _distal_volume(labels: LabelMap, name: str, point: Array, normal: Array) -> float:
-    inside = labels.mask(name) & (labels.heights(point, normal) < 0)
-    return float(inside.sum()) * labels.voxel_mm3
 
 
 def capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.ndimage import label as connected
 from scipy.sparse import coo_array, diags_array
 from scipy.spatial import KDTree
 
 from ...errors import LabelError, SurfaceError
 from ..grid import LabelMap
+from ..morphology import find_largest_piece, open_mask
 from .extraction import extract_surface
 from .surfaces import Anatomy, signed_distance
 from .triangles import Surface, half_edges
@@ -70,16 +69,10 @@ def fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array
 def _core(labels: LabelMap) -> LabelMap:
     """What the subcutaneous fat encloses, as a label map of one label."""
     inside = labels.limb & ~labels.mask(FAT)
-    spacing = labels.spacing[::-1]
-    # Opened by a ball: a thin shell of skin outside the fat goes.
-    eroded = distance_transform_edt(np.pad(inside, 1, mode="edge"), sampling=spacing) > SHELL_MM
-    if not eroded.any():
+    opened = open_mask(inside, SHELL_MM, labels.spacing)  # a thin shell of skin outside the fat goes
+    if not opened.any():
         raise LabelError("nothing but fat lies under the skin", remedy="correct the label 'fat'")
-    opened = distance_transform_edt(~eroded, sampling=spacing) <= SHELL_MM
-    opened = opened[1:-1, 1:-1, 1:-1] & inside
-    parts = connected(opened)[0]
-    largest = parts == np.bincount(parts[opened]).argmax()
-    return labels.with_array(largest.astype(np.uint8), {1: "core"})
+    return labels.with_array(find_largest_piece(opened).astype(np.uint8), {1: "core"})
 
 
 def _along_normals(skin: Surface, inner: Surface) -> Array:
