@@ -45,7 +45,16 @@ def write_outcome(results, error: float = 3.0) -> None:
         for name in ("one material", "two materials")
     ]
     (results / "calibrate" / "calibration.json").write_text(json.dumps({"stages": stages}))
-    rows = [{"site": "1", "region": "", "fitted": True, "error_percent": error, "peak_force_N": 6.0}]
+    rows = [
+        {
+            "site": "1",
+            "record": "1",
+            "region": "",
+            "fitted": True,
+            "error_percent": error,
+            "peak_force_N": 6.0,
+        }
+    ]
     content = {"sites": rows, "mean_error_fitted_percent": error, "mean_error_heldout_percent": None}
     (results / "predict" / "predict.json").write_text(json.dumps(content))
     (results / "predict" / "1.csv").write_text(

@@ -1,4 +1,4 @@
-"""Every view in a real browser where it has nothing to show: it is being read, is missing, or cannot be read."""
+"""Every view in a real browser with nothing to show: it is being read, is missing, or cannot be read."""
 
 from __future__ import annotations
 
