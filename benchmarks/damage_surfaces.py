@@ -134,7 +134,7 @@ def inside_out(random: Random, whole: Whole, folder: Path) -> Inputs:
     return spoiled(random, whole, folder, lambda surface: surface.flipped)
 
 
-@kind("surfaces", "refused", "oriented against")
+@kind("surfaces", "repaired", "looked inward and were turned")
 def some_faces_flipped(random: Random, whole: Whole, folder: Path) -> Inputs:
     def flipped(surface: Surface) -> Surface:
         faces = surface.faces.copy()

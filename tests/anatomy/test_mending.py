@@ -10,9 +10,9 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.surfaces.mending import closed_anatomy, mended, open_loops
+from limbfit.anatomy.surfaces.mending import closed_anatomy, flat_ends, mended, open_loops
 from limbfit.anatomy.surfaces.surfaces import Surface, check_anatomy, check_closed
-from limbfit.anatomy.surfaces.triangles import compacted
+from limbfit.anatomy.surfaces.triangles import compacted, from_pyvista
 from limbfit.errors import SurfaceError
 
 
@@ -35,6 +35,63 @@ def test_a_closed_surface_is_left_alone(whole):
     assert found.surface is whole.skin
     assert found.cap is None
     assert found.notes == ()
+
+
+def turned(surface: Surface, which: slice) -> Surface:
+    faces = surface.faces.copy()
+    faces[which] = faces[which, ::-1]
+    return replace(surface, faces=faces)
+
+
+@pytest.mark.parametrize("which", [slice(0, None, 2), slice(1, None, 2), slice(0, 1), slice(0, 3000)])
+def test_turned_triangles_are_turned_back_and_counted(whole, which):
+    found = mended(turned(whole.skin, which), "skin")
+    assert found.surface.volume == pytest.approx(whole.skin.volume, rel=1e-12)
+    check_closed(found.surface)
+    count = len(whole.skin.faces[which])
+    assert found.notes == (
+        f"skin: {count} of {len(whole.skin.faces)} triangles looked inward and were turned",
+    )
+
+
+def test_an_open_surface_with_turned_triangles_is_capped_as_one_without(whole):
+    skin = opened(whole.skin, whole.cut_point - 3 * whole.cut_normal, whole.cut_normal)
+    plain, found = mended(skin, "skin"), mended(turned(skin, slice(0, None, 2)), "skin")
+    assert found.surface.volume == pytest.approx(plain.surface.volume, rel=1e-9)
+    assert found.cap.normal == pytest.approx(plain.cap.normal, abs=1e-9)
+
+
+def test_a_surface_that_looks_inward_as_a_mirrored_one_does_is_refused(whole):
+    for surface in (whole.skin.flipped, turned(whole.skin.flipped, slice(0, None, 5))):
+        with pytest.raises(SurfaceError, match=r"inverted|oriented against each other"):
+            closed_anatomy(surface, whole.bones)
+
+
+def test_the_cut_of_a_closed_skin_is_the_flat_end_that_bones_reach_out_of(whole):
+    anatomy, notes = closed_anatomy(whole.skin, whole.bones)
+    assert anatomy.cut_normal == pytest.approx(whole.cut_normal, abs=1e-9)
+    assert abs(whole.height(anatomy.cut_point)) < 1e-9
+    assert len(notes) == 1
+    assert notes[0].startswith("skin: the proximal cut is its flat end at (12.0, -80.0, 300.0) mm")
+
+
+def segment_along_x(length: float) -> tuple[Surface, Surface]:
+    """The proximal part of a limb along x, flat at both ends, and its bone, whose tip is 70 mm below."""
+    upright = limb()
+    skin, bone = (Surface(s.points[:, [2, 0, 1]], s.faces) for s in (upright.skin, upright.bones["tibia"]))
+    cut = skin.to_pyvista().clip_closed_surface("x", origin=(300.0 - length, 0, 0)).triangulate().clean()
+    return from_pyvista(cut), bone
+
+
+def test_of_two_flat_ends_it_is_the_one_that_bones_reach_out_of():
+    skin, bone = segment_along_x(80.0)
+    assert len(flat_ends(skin)) == 2
+    anatomy, notes = closed_anatomy(skin, {"tibia": bone})
+    assert anatomy.cut_normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert anatomy.cut_point[0] == pytest.approx(300.0, abs=1e-6)
+    assert sum("the proximal cut is its flat end" in note for note in notes) == 1
+    with pytest.raises(SurfaceError, match="lies outside the skin"):  # through both: no guess is made
+        closed_anatomy(segment_along_x(60.0)[0], {"tibia": bone})
 
 
 def test_open_skin_and_bone_are_capped_and_cut_below_both(whole):

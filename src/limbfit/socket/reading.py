@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
-from ..anatomy.surfaces.mending import open_loops
+from ..anatomy.surfaces.mending import count_turned, open_loops, orient_faces
 from ..anatomy.surfaces.surfacefiles import read_surface
 from ..anatomy.surfaces.triangles import (
     Surface,
@@ -74,7 +74,11 @@ def read_socket(
 def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Surface]) -> Socket:
     _check_size(surface, outer)
     limb = profile(outer, frame)
-    whole, notes = _one_piece(surface)
+    piece, notes = _one_piece(surface)
+    whole = orient_faces(piece)
+    if turned := count_turned(piece, whole):
+        against = min(turned, len(whole.faces) - turned)
+        notes.append(f"{against} of its triangles were oriented against their neighbours and were turned")
     check_sides(whole, "the socket")
     face = Surface(frame.to_limb(whole.points), whole.faces)
     _check_place(face, limb.rays, limb.stations[-1])

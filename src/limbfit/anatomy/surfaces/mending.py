@@ -13,9 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import igl
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ...errors import SurfaceError
 from .extraction import untangled
@@ -27,10 +30,13 @@ Ints = NDArray[np.int64]
 
 SMALL_MM = 10.0  # a hole that is no wider is filled
 FEW_EDGES, FEW_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
+MOST_TURNED = 0.75  # of the faces: a surface of which more look inward is inverted, as one that is mirrored
 LOOSE_SHARE = 0.01  # of the faces: open pieces that hold less are left out
 MOST_CROSSING, MOST_SMOOTHED_MM = 200, 4.0  # pairs of faces that are smoothed until they do not cross
 GENTLE, FIRM = 0.1, 0.5  # of the way to the neighbours' mean, each time; long triangles need little
-END_SHARE = 0.03  # of the skin's area: a smaller opening is a hole in its side and not its proximal end
+END_SHARE = 0.03  # of the skin's area: a smaller opening, or flat part, is not its proximal end
+FLAT_MM = 0.05  # within which a flat end lies in its plane
+LEVEL_RAD = 3e-3  # between neighbours in it
 WIDENED = 2.0  # a cap so much larger than the opening cuts through the body
 INSIDE_MM = 0.5  # of the loop's lowest point, where the cap lies
 JOIN_MM = 1e-6
@@ -56,7 +62,9 @@ class Mended:
 
 
 def mended(surface: Surface, name: str, file: Path | None = None) -> Mended:
-    """A surface without loose pieces and small holes, its one open end capped, few crossing faces smoothed.
+    """A surface whose faces look outward, without loose pieces and small holes, its one open end capped.
+
+    Few crossing faces are smoothed.
 
     Whatever else keeps it from bounding a body is left for `triangles.check_closed`.
 
@@ -65,7 +73,9 @@ def mended(surface: Surface, name: str, file: Path | None = None) -> Mended:
     SurfaceError
         For more than one open loop of notable size, or one whose outline crosses itself.
     """
-    surface, notes = _without_loose(surface, name)
+    surface, loose = _without_loose(surface, name)
+    surface, turned = orient_outward(surface, name)
+    notes = loose + turned
     loops = open_loops(surface)
     small = [loop for loop in loops if _is_small(surface, loop)]
     large = [loop for loop in loops if not _is_small(surface, loop)]
@@ -105,7 +115,7 @@ def closed_anatomy(
     ----------
     skin, bones : LPS mm.
     cut : point and proximal normal of the proximal cut; by default just inside the caps of skin and bones,
-        across the skin's, or the highest (z) of a skin that is closed.
+        across the skin's; of a skin that is closed its flat end, or its highest (z).
     files : by the surfaces' names, for the text of errors.
 
     Raises
@@ -116,22 +126,93 @@ def closed_anatomy(
     files = files or {}
     outer = mended(skin, "skin", files.get("skin"))
     inner = {name: mended(bone, name, files.get(name)) for name, bone in bones.items()}
+    found: tuple[str, ...] = ()
     if cut is None:
-        cut = _default_cut(outer, list(inner.values()))
+        cut, found = _default_cut(outer, list(inner.values()))
     closed = {name: part.surface for name, part in inner.items()}
     anatomy = Anatomy(outer.surface, closed, np.asarray(cut[0]), np.asarray(cut[1]))
     check_anatomy(anatomy, files)
-    return anatomy, tuple(note for part in (outer, *inner.values()) for note in part.notes)
+    return anatomy, (*(note for part in (outer, *inner.values()) for note in part.notes), *found)
 
 
-def _default_cut(skin: Mended, bones: Sequence[Mended]) -> tuple[Array, Array]:
-    """Below all caps at the proximal end, so that bones stick out of it; point and normal."""
+def _default_cut(skin: Mended, bones: Sequence[Mended]) -> tuple[tuple[Array, Array], tuple[str, ...]]:
+    """Point and normal below all caps at the proximal end, so that bones stick out of it; notes on it."""
     if skin.cap is None or _area(skin.cap.outline) < END_SHARE * skin.surface.area:
-        return np.array([0.0, 0.0, skin.surface.points[:, 2].max()]), np.array([0.0, 0.0, 1.0])
+        return _closed_cut(skin.surface, [bone.surface for bone in bones])
     normal, middle = skin.cap.normal, skin.cap.outline.mean(axis=0)
     caps = [bone.cap for bone in bones if bone.cap is not None and bone.cap.normal @ normal > 0]
     heights = [((cap.outline - middle) @ normal).min() for cap in (skin.cap, *caps)]
-    return middle + (min(h for h in heights if h > -PROXIMAL_MM) - BELOW_MM) * normal, normal
+    return (middle + (min(h for h in heights if h > -PROXIMAL_MM) - BELOW_MM) * normal, normal), ()
+
+
+def _closed_cut(skin: Surface, bones: Sequence[Surface]) -> tuple[tuple[Array, Array], tuple[str, ...]]:
+    """The plane of a closed skin's one flat end (of several: of the one that bones reach out of), or its
+    highest (z)."""
+    ends = flat_ends(skin)
+    beyond = [
+        (point, normal)
+        for point, normal in ends
+        if any(((bone.points - point) @ normal).max() > FLAT_MM for bone in bones)
+    ]
+    up = np.array([0.0, 0.0, 1.0])
+    chosen = beyond or ends
+    if len(chosen) != 1 or chosen[0][1] @ up > 1.0 - 1e-6:
+        return (skin.points[:, 2].max() * up, up), ()
+    point, normal = chosen[0]
+    note = (
+        f"skin: the proximal cut is its flat end at {_place(point)}, as geometry.proximal_cut does not say it"
+    )
+    return (point, normal), (note,)
+
+
+def flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
+    """Point and outward unit normal of planes that hold a notable part of a surface, the rest behind."""
+    normals, areas, middles = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
+    edges = np.sort(half_edges(surface.faces), axis=1)
+    order = np.lexsort(edges.T)
+    same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+    one, other = order[:-1][same] % len(areas), order[1:][same] % len(areas)
+    level = np.einsum("ij,ij->i", normals[one], normals[other]) > np.cos(LEVEL_RAD)
+    graph = coo_array((level[level], (one[level], other[level])), shape=(len(areas), len(areas)))
+    patch = connected_components(graph, directed=False)[1]
+    ends = []
+    for which in np.flatnonzero(np.bincount(patch, areas) > END_SHARE * surface.area):
+        weights = areas * (patch == which)
+        normal = weights @ normals / np.linalg.norm(weights @ normals)
+        point = weights @ middles / weights.sum()
+        inside = ((surface.points - point) @ normal).max() < FLAT_MM
+        if inside and np.abs((middles[patch == which] - point) @ normal).max() < FLAT_MM:
+            ends.append((point, normal))
+    return ends
+
+
+def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
+    """With outward faces, where neighbours are oriented against each other; else as it is."""
+    alike = orient_faces(surface)
+    outward = alike if alike.volume > 0.0 else alike.flipped
+    count = count_turned(surface, outward)
+    if alike is surface or count > MOST_TURNED * len(surface.faces):
+        return surface, ()
+    return outward, (f"{name}: {count} of {len(surface.faces)} triangles looked inward and were turned",)
+
+
+def orient_faces(surface: Surface) -> Surface:
+    """The surface with all faces on one side, whichever; itself where they are, or where none is possible."""
+    if not _has_turned(surface.faces):
+        return surface
+    faces, patches = igl.bfs_orient(surface.faces)
+    return surface if patches.max() > 0 or _has_turned(faces) else Surface(surface.points, faces)
+
+
+def count_turned(before: Surface, after: Surface) -> int:
+    """How many faces look the other way."""
+    return int((np.einsum("ij,ij->i", before.face_normals, after.face_normals) < 0.0).sum())
+
+
+def _has_turned(faces: Ints) -> bool:
+    """True where two faces run along an edge in the same direction."""
+    edges = half_edges(faces)
+    return len(np.unique(edges, axis=0)) < len(edges)
 
 
 def _place(point: Array) -> str:

@@ -49,6 +49,7 @@ Array = NDArray[np.float64]
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
+_END_SHARE = 0.15  # of the skin's length
 _OVERLAP_MM = 3.0  # of a region with a bone, or with the air: voxels and smoothing come to that
 _JOIN_MM = 1e-3
 # Passes of remeshing before and after the cap is cut: the rim gets better triangles from even ones, and its
@@ -285,12 +286,24 @@ def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
     distance = signed_distance(anatomy.skin, inner)
     outside = distance > _SKIN_TOLERANCE_MM
     if outside.any():
-        raise SurfaceError(
-            f"{name} lies outside the skin: {int(outside.sum())} of its {len(points)} points,"
-            f" by up to {distance.max():.1f} mm",
-            file=file,
-            remedy="check that skin and bone are in the same coordinates (LPS or RAS, mm)",
+        what = (
+            f"{name} lies outside the skin: {int(outside.sum())} of its {len(points)} points, by up to "
+            f"{distance.max():.1f} mm"
         )
+        remedy = "check that skin and bone are in the same coordinates (LPS or RAS, mm)"
+        if _is_at_one_end(anatomy.skin, inner[outside]):
+            what += ", all at one end of the limb"
+            remedy = f"if the bone is cut there, say where: geometry.proximal_cut; else {remedy}"
+        raise SurfaceError(what, file=file, remedy=remedy)
+
+
+def _is_at_one_end(skin: Surface, points: Array) -> bool:
+    """True for points near one end of the skin, or beyond it, along its longest axis."""
+    middle = skin.points.mean(axis=0)
+    axis = np.linalg.svd(skin.points - middle, full_matrices=False)[2][0]
+    along, here = (skin.points - middle) @ axis, (points - middle) @ axis
+    margin = _END_SHARE * np.ptp(along)
+    return bool(here.min() > along.max() - margin or here.max() < along.min() + margin)
 
 
 def signed_distance(surface: Surface, points: ArrayLike) -> Array:

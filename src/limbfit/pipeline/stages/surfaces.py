@@ -12,7 +12,7 @@ from ...anatomy.imaging import LabelMap, read_labels
 from ...anatomy.labels.naming import plain_name
 from ...anatomy.segmentation.amputation import amputate
 from ...anatomy.segmentation.voxels import amputated
-from ...anatomy.surfaces.mending import closed_anatomy
+from ...anatomy.surfaces.mending import closed_anatomy, orient_outward
 from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
 from ...anatomy.surfaces.thickness import fat_depth, write_thickness
 from ...study import Study
@@ -26,15 +26,14 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     context.tell("surfaces", 0, 2, "building surfaces")
     if study.surfaces is not None:
         anatomy, notes = given_anatomy(study)
-        for note in notes:
-            context.tell("surfaces", 0, 2, note)
     else:
-        notes = ()
         labels = _limb_labels(context)
-        anatomy = _imaged_anatomy(study, labels)
+        anatomy, notes = _imaged_anatomy(study, labels)
         if any(layer.thickness == "map" for layer in study.geometry.model_layers):
             depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
             write_thickness(folder / THICKNESS, anatomy.skin, depth)
+    for note in notes:
+        context.tell("surfaces", 1, 2, note)
     save_anatomy(folder, anatomy, notes)
     return {}
 
@@ -51,7 +50,7 @@ def _limb_labels(context: Context) -> LabelMap:
     return amputate(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
 
 
-def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
+def _imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tuple[str, ...]]:
     geometry = study.geometry
     cut = geometry.proximal_cut
     with naming(labelled_file(study)):
@@ -60,21 +59,25 @@ def _imaged_anatomy(study: Study, labels: LabelMap) -> Anatomy:
             edge_mm=geometry.surface_edge_mm,
             proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
         )
-    anatomy, files = _with_given_regions(study, anatomy)
+    anatomy, files, notes = _with_given_regions(study, anatomy)
     with naming(labelled_file(study)):
         check_anatomy(anatomy, files)
-    return anatomy
+    return anatomy, notes
 
 
-def _with_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[str, Path]]:
-    """The anatomy with the regions that come as surfaces, in the study's order, and their files by name."""
+def _with_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[str, Path], tuple[str, ...]]:
+    """The anatomy with the regions that come as surfaces, in the study's order, their files by name, and
+    what was mended in them."""
     files = {one.name: study.path(one.surface) for one in study.geometry.regions if one.surface is not None}
     tables = study.surfaces
     coordinates, unit = (None, "mm") if tables is None else (tables.coordinates, tables.unit)
-    found = {name: read_surface(file, coordinates, unit) for name, file in files.items()}
-    found |= anatomy.regions
+    mended = {
+        name: orient_outward(read_surface(file, coordinates, unit), name) for name, file in files.items()
+    }
+    found = {name: surface for name, (surface, _) in mended.items()} | dict(anatomy.regions)
     order = [one.name for one in study.geometry.regions]
-    return replace(anatomy, regions={name: found[name] for name in order}), files
+    notes = tuple(note for _, told in mended.values() for note in told)
+    return replace(anatomy, regions={name: found[name] for name in order}), files, notes
 
 
 def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
@@ -92,7 +95,8 @@ def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
     skin, cut = surfaces.pop("skin"), geometry.proximal_cut
     anatomy, notes = closed_anatomy(skin, surfaces, None if cut is None else (cut.point, cut.normal), files)
     if geometry.regions:
-        anatomy, region_files = _with_given_regions(study, anatomy)
+        anatomy, region_files, told = _with_given_regions(study, anatomy)
+        notes += told
         check_anatomy(anatomy, files | region_files)
     if geometry.amputation is None:
         return anatomy, notes
