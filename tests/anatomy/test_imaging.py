@@ -10,7 +10,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 from limbs import DIRECTIONS, volume
 
-from limbfit.anatomy.imaging import LabelMap, Volume, read_volume, write_volume
+from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_volume
 from limbfit.errors import ImageError, LabelError
 
 TOLERANCE_MM = 0.01
@@ -55,6 +55,59 @@ def test_nifti_is_turned_from_ras_to_lps(tmp_path):
     ras = affine @ [2, 1, 3, 1]
     assert np.allclose(image.index_to_point([2, 1, 3]), ras[:3] * [-1, -1, 1])
     assert image.array[3, 1, 2] == array[2, 1, 3]
+
+
+def two_forms(file, qform, sform, *, codes=(1, 1)):
+    """A NIfTI file of a limb's size that says twice where it lies."""
+    nibabel = pytest.importorskip("nibabel")
+    image = nibabel.Nifti1Image(np.random.default_rng(0).random((20, 22, 24), np.float32), sform)
+    image.header.set_xyzt_units("mm")
+    image.set_qform(qform, codes[0])
+    image.set_sform(sform, codes[1])
+    image.to_filename(file)
+    return file
+
+
+def placed(turn, origin=(10.0, 20.0, 30.0)):
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = turn * [3.0, 2.0, 4.0], origin
+    return affine
+
+
+@pytest.mark.parametrize("turn", DIRECTIONS.values(), ids=DIRECTIONS.keys())
+def test_nifti_whose_forms_agree_needs_no_word(tmp_path, turn):
+    assert read_volume(two_forms(tmp_path / "a.nii.gz", placed(turn), placed(turn))).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("codes", "used", "other"),
+    [((1, 1), "sform", "qform"), ((1, 2), "qform", "sform")],
+    ids=["scanner", "aligned"],
+)
+def test_nifti_whose_forms_differ_says_which_is_used(tmp_path, codes, used, other):
+    turn = DIRECTIONS["oblique"]
+    forms = {"qform": placed(turn), "sform": placed(turn, (40.0, 20.0, 30.0))}
+    found = read_volume(two_forms(tmp_path / "a.nii", *forms.values(), codes=codes))
+    assert found.affine == pytest.approx(np.diag([-1.0, -1.0, 1.0, 1.0]) @ forms[used], abs=1e-4)
+    assert len(found.notes) == 1
+    assert f"its qform and sform differ by up to 30.0 mm; the {used} is used" in found.notes[0]
+    assert f"set the {used}'s code to 0, and the {other} is" in found.notes[0]
+    # As it says: without the code it is the other that is read, and nothing is said.
+    again = [0 if name == used else code for name, code in zip(forms, codes)]
+    other_read = read_volume(two_forms(tmp_path / "b.nii", *forms.values(), codes=again))
+    assert other_read.affine == pytest.approx(np.diag([-1.0, -1.0, 1.0, 1.0]) @ forms[other], abs=1e-4)
+    assert other_read.notes == ()
+
+
+def test_nifti_whose_forms_mirror_each_other_is_refused(tmp_path):
+    turn = DIRECTIONS["oblique"]
+    file = two_forms(tmp_path / "a.nii", placed(turn), placed(turn * [-1.0, 1.0, 1.0]))
+    for read in (read_volume, read_labels):
+        with pytest.raises(
+            (ImageError, LabelError), match=r"mirror each other: left in one .*; convert .* code"
+        ) as caught:
+            read(file)
+        assert str(file) in str(caught.value)
 
 
 def test_nifti_without_a_stated_orientation_is_refused(tmp_path):

@@ -174,9 +174,13 @@ class Grid:
 
 @dataclass(frozen=True)
 class Volume(Grid):
-    """A scalar image, ``array`` float32; see :class:`Grid`; ``modality`` is DICOM's code, if known."""
+    """A scalar image, ``array`` float32; see :class:`Grid`.
+
+    ``modality`` is DICOM's code where it is known, ``notes`` are what to know of its file, in words.
+    """
 
     modality: str = ""
+    notes: tuple[str, ...] = ()
 
     def _as_array(self, array: ArrayLike) -> NDArray[Any]:
         return np.asarray(array, dtype=np.float32)

@@ -6,6 +6,7 @@ RTSTRUCT.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..errors import ImageError, LabelError
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
 from .images.dicom import Series, describe_series, list_series, read_series
 from .images.formats import format_of, read_image
+from .images.nifti import describe_forms
 from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
 from .labels.labelcheck import cleaned
 from .labels.labelfiles import (
@@ -65,6 +67,8 @@ def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
         volume = read_series(path, series_uid)
     else:
         volume = _as_volume(read_image(path), path)
+        if format_of(path).name == "NIfTI":
+            volume = replace(volume, notes=describe_forms(path, volume.affine))
     if not np.all(np.isfinite(volume.array)):
         bad = int((~np.isfinite(volume.array)).sum())
         raise ImageError(f"{bad} voxels are not numbers", file=path, remedy="export the image again")

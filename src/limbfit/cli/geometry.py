@@ -54,6 +54,8 @@ def show_labels(found: dict[str, Any]) -> None:
     line(f"{found['method']}; volumes in cm3: {volumes}")
     for repair in found.get("repairs", ()):
         line(f"repaired: {repair}")
+    for warning in found.get("warnings", ()):
+        line(f"warning: {warning}")
     if "markers_removed" in found:
         line(f"markers taken off the skin: {found['markers_removed']}")
     if "motion" in found:

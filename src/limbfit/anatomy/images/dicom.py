@@ -1,12 +1,13 @@
 """DICOM series on disk: which there are, whether one is a whole volume, and its voxels.
 
 Headers are read with pydicom and only the tags that geometry needs, so that no identity enters the program.
-Nothing said to the user names a file inside the folder or a tag that could identify a person: slices are
-named by their number along the normal.
+Nothing said to the user could identify a person: slices are named by their number along the normal, files by
+their number in the order of names, and by name only where that holds nothing but counters.
 """
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,29 @@ from ..grid import Volume
 from .dicom_headers import SliceHeader, read_headers
 from .dicom_pixels import read_pixels
 from .dicom_stack import same_plane_geometry, stacked
+
+_PLAIN_WORDS = frozenset(
+    [
+        "dcm",
+        "dicom",
+        "ima",
+        "im",
+        "img",
+        "image",
+        "i",
+        "slice",
+        "mr",
+        "ct",
+        "pt",
+        "ser",
+        "series",
+        "s",
+        "se",
+        "frame",
+        "z",
+    ]
+)
+_MAX_COUNT = 9999  # of files; a larger number may be that of a person
 
 
 @dataclass(frozen=True)
@@ -37,11 +61,24 @@ class Series:
 def list_series(folder: str | Path) -> list[Series]:
     """The image series in a folder and those below it, ordered by UID; other files are passed over."""
     groups: dict[str, list[SliceHeader]] = defaultdict(list)
-    for path in sorted(Path(folder).rglob("*")):
-        for header in (path.is_file() and read_headers(path)) or ():
+    files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
+    for number, path in enumerate(files, 1):
+        try:
+            headers = read_headers(path)
+        except ImageError as error:
+            place = f"file {number} of {len(files)} by name{_shown_name(path.relative_to(folder))}"
+            raise ImageError(error.what, file=folder, place=place, remedy=error.remedy) from None
+        for header in headers or ():
             groups[header.series_uid].append(header)
     series = [Series(uid, tuple(slices)) for uid, slices in sorted(groups.items())]
     return [_joined(series)] if _is_one_stack(series) else series
+
+
+def _shown_name(path: Path) -> str:
+    """The name of a file in brackets, if it holds words of machines and counters only, nothing of a person."""
+    words, numbers = re.findall(r"[^\W\d_]+", str(path)), re.findall(r"\d+", str(path))
+    is_plain = all(word.lower() in _PLAIN_WORDS for word in words)
+    return f" ({path.as_posix()})" if is_plain and all(int(n) <= _MAX_COUNT for n in numbers) else ""
 
 
 def describe_series(folder: str | Path) -> list[dict[str, Any]]:

@@ -100,13 +100,9 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
     Raises
     ------
     ImageError
-        For a damaged file; its text names the folder only.
+        For a damaged file; its text does not name it.
     """
-    damaged = ImageError(
-        "a DICOM file of this folder is cut short or damaged",
-        file=path.parent,
-        remedy="export the series again",
-    )
+    damaged = ImageError("the DICOM file is cut short or damaged", remedy="export the series again")
     try:
         with quiet():
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))

@@ -24,6 +24,8 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     assert study.image is not None
     context.tell("segment", 0, 3, "reading the image")
     volume, removed = without_own_markers(study, study_image(study), folder)
+    for note in volume.notes:
+        context.tell("segment", 0, 3, f"warning: image: {note}")
     context.tell("segment", 1, 3, "labelling tissues")
     given = study_labels(study, volume)
     if given is not None:
@@ -39,6 +41,7 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     draw_sheet(folder / "quality.png", volume, labels, quality)
     context.tell("segment", 2, 3, "outlining the skin with markers")
     facts = {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
+    facts["warnings"] = [f"image: {note}" for note in volume.notes]
     facts[DIGEST] = file_digest(folder / LABELS)
     write_json(folder / "segment.json", facts | removed | second_skin(study, volume, labels, folder))
     return {}

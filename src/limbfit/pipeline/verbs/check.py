@@ -141,10 +141,11 @@ def _limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
 
 def _image_facts(study: Study) -> list[str]:
     volume = study_image(study)
-    facts = [_sampling("image", volume)]
+    facts = [_sampling("image", volume), *(f"warning: image: {note}" for note in volume.notes)]
     marked = marked_image(study)
     if marked is not None:
         facts.append(_sampling("image with markers", marked))
+        facts += [f"warning: image with markers: {note}" for note in marked.notes]
     given = study_labels(study, volume)
     if given is not None:
         labels, notes = given

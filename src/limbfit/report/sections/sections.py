@@ -78,6 +78,7 @@ def _blocks(*blocks: Block | None, otherwise: str) -> tuple[Block, ...]:
 
 def model(store: Results) -> Section:
     """Surfaces, sites and volumes."""
+    notes = (*(store.segment.get("warnings") or ()), *(store.surfaces.get("notes") or ()))
     blocks = _blocks(
         explorer(store),
         slices_figure(store),
@@ -85,7 +86,7 @@ def model(store: Results) -> Section:
         pictures.marker_figure(store),
         tables.volume_table(store),
         tables.place_table(store) if store.sites else None,
-        Bullets(tuple(store.surfaces["notes"])) if store.surfaces.get("notes") else None,
+        Bullets(notes) if notes else None,
         otherwise="No surfaces and sites are stored yet.",
     )
     source = store.segment.get("method")
