@@ -19,7 +19,9 @@ from limbfit import (
     run_experiment,
     run_study,
 )
+from limbfit.anatomy.imaging import LabelMap, Volume, write_labels, write_volume
 from limbfit.errors import InputError
+from limbfit.pipeline.verbs.refusals import refused_commands
 
 UNFITTED = ("fitted = true", "")
 BOTH_FITTED = ('trace = "2.csv"', 'trace = "2.csv"\nfitted = true')
@@ -28,7 +30,7 @@ FIBRED = ("[[sites]]", '[material]\nlaw = "ogden-fibres"\n[[sites]]')
 STRETCHED = ("[[sites]]", "[material]\nprestretch = { skin = 1.1 }\n[[sites]]")
 RUBBED = ("[[sites]]", "[indenter]\nfriction = 0.3\n[[sites]]")
 FAST = ("[[sites]]", '[[records]]\nsite = "1"\nname = "f"\ntrace = "1.csv"\nspeed_mm_s = 9.0\n[[sites]]')
-WIDE = ("[[sites]]", "[socket]\ntrim_mm = 40.0\n[socket.design]\nadapter_diameter_mm = 200.0\n[[sites]]")
+WIDE = ("[[sites]]", "[socket]\ntrim_mm = 40.0\n[socket.design]\nadapter_diameter_mm = 120.0\n[[sites]]")
 HEEL = (
     "[[sites]]",
     '[socket]\ntrim_mm = 40.0\n[[socket.design.regions]]\nregion = "heel"\npressure_kPa = 5.0\n[[sites]]',
@@ -62,7 +64,11 @@ BY_STUDY = {
     "design": (FORCED, design_study, "one indentation per site"),
     "socket": (STRETCHED, fit_socket, "at rest, without contraction and pre-stretch"),
     "socket design": (STRETCHED, design_socket, "at rest, without contraction and pre-stretch"),
-    "export --to calculix": (FORCED, lambda s: export_study(s, "calculix"), "is not written for Calculix"),
+    "export --to calculix": (
+        RUBBED,
+        lambda s: export_study(s, "calculix"),
+        "friction is not written for Calculix",
+    ),
     "export --to inp": (RUBBED, lambda s: export_study(s, "inp"), "friction is not written for Abaqus"),
     "export --to febio-optimize": (
         FIBRED,
@@ -76,7 +82,7 @@ BY_STUDY = {
 def test_what_the_study_file_decides_is_said_at_once(study, command):
     change, call, words = BY_STUDY[command]
     given = with_change(study, change)
-    rows = [row for row in check_study(given)["refused"] if command in row["commands"]]
+    rows = [row for row in refused_commands(given, None) if command in row["commands"]]
     assert len(rows) == 1
     assert words in rows[0]["why"]
     with pytest.raises(InputError, match=re.escape(words)):
@@ -103,7 +109,7 @@ def test_options_are_judged_at_once(study):
 BY_LIMB = {
     "design": (UNFITTED, lambda s: design_study(s, depths_mm=(40.0,)), "40 mm is no deeper than half", None),
     "sensitivity": (BONELESS, experiment("sensitivity-c"), "the limb has no bone", "sensitivity --only c"),
-    "socket design": (WIDE, design_socket, "200 mm is as wide as the socket", "socket design"),
+    "socket design": (WIDE, design_socket, "120 mm is as wide as the socket", "socket design"),
 }
 
 
@@ -137,8 +143,8 @@ def test_pins_that_miss_the_limb_are_said_before_meshing(study):
 
 
 def test_a_surface_that_is_elsewhere_is_said_before_meshing(study):
-    time, far = np.arange(0.0, 12.0, 0.2), 500.0
-    rows = [[t, far, far, far, 0.0, 0.0, 0.1 * t] for t in time]
+    time, far = np.arange(0.0, 11.0, 0.2), 500.0
+    rows = [[t, far + off, far, far, 0.0, 0.0, 0.1 * t] for t in time for off in (0.0, 10.0)]
     header = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
     np.savetxt(study / "skin.csv", rows, delimiter=",", header=header, comments="")
     given = with_change(study, ('trace = "2.csv"', 'trace = "2.csv"\nsurface = "skin.csv"'))
@@ -158,7 +164,8 @@ def test_records_are_read_before_the_limb_is_made(study):
 def test_all_records_are_judged_before_the_first_is_made(study, limbfit):
     """The first needs a device that is not there: who asks for it ends with exit code 1."""
     (study / "1.csv").unlink()
-    with_change(study, ("[[sites]]", FAST[1].replace('trace = "1.csv"', 'trace = "f.csv"')))
+    text = (study / "study.toml").read_text()
+    (study / "study.toml").write_text(text.replace(FAST[0], FAST[1].replace("1.csv", "f.csv"), 1))
     words = ("acquire", study, "--unattended", "--depth", "5", "--device", "tcp://127.0.0.1:9")
     code, _, errors = limbfit(*words)
     assert code == 2
@@ -169,3 +176,29 @@ def test_a_record_that_no_device_makes_is_said_by_the_check(study):
     refused = check_study(with_change(study, FAST))["refused"]
     (row,) = [row for row in refused if "acquire --site 1-f" in row["commands"]]
     assert "ramp_speed_mm_s is over speed_limit_mm_s" in row["why"]
+
+
+@pytest.mark.parametrize(
+    ("geometry", "words"),
+    [
+        ('layers = [{ name = "fat", thickness = "map" }]', "no voxel is labelled 'fat'"),
+        (
+            'regions = [{ name = "tendon", label = "patellar tendon" }]',
+            "no voxel is labelled 'patellar tendon'",
+        ),
+    ],
+)
+def test_a_label_that_the_geometry_needs_is_missed_by_the_check(tmp_path, geometry, words):
+    z, y, x = np.meshgrid(*(np.arange(n) - n / 2 for n in (40, 30, 30)), indexing="ij")
+    away = np.hypot(x, y)
+    array = ((away < 12) & (z > -18)).astype(np.uint8) + ((away < 4) & (z > -12)).astype(np.uint8)
+    grid = np.full(3, 4.0), np.zeros(3), np.eye(3)
+    write_volume(tmp_path / "mri.nii.gz", Volume(100.0 * array.astype(np.float32), *grid))
+    write_labels(tmp_path / "labels.nii.gz", LabelMap(array, *grid, {1: "soft tissue", 2: "tibia"}))
+    head = (
+        '[study]\nname = "labelled"\n[image]\npath = "mri.nii.gz"\n[segmentation]\nlabels = "labels.nii.gz"\n'
+    )
+    site = '[[sites]]\nname = "1"\ndepth_mm = 3.0\nposition = [48.0, 0.0, 0.0]\n'
+    (tmp_path / "study.toml").write_text(f"{head}[geometry]\n{geometry}\n{site}")
+    with pytest.raises(InputError, match=words):
+        check_study(load_study(tmp_path))

@@ -30,6 +30,15 @@ CUT_MM = 3.0  # below the proximal cut, from where depth is measured
 MARCHES = 30
 
 
+def check_fat(labels: LabelMap) -> None:
+    """Raise `LabelError` where the map has no fat."""
+    if FAT not in labels.names.values() or not labels.mask(FAT).any():
+        raise LabelError(
+            "no voxel is labelled 'fat', which a layer's thickness map needs",
+            remedy="label the fat, or give the layer a thickness_mm",
+        )
+
+
 def fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array:
     """Depth (n,) of the fat's inner face below the vertices of an anatomy's skin, mm.
 
@@ -48,11 +57,7 @@ def fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array
     LabelError
         When the map has no fat, or nothing but fat.
     """
-    if FAT not in labels.names.values() or not labels.mask(FAT).any():
-        raise LabelError(
-            "no voxel is labelled 'fat', which a layer's thickness map needs",
-            remedy="label the fat, or give the layer a thickness_mm",
-        )
+    check_fat(labels)
     core = _core(labels)
     inner = extract_surface(core, None, edge_mm)
     skin = anatomy.skin

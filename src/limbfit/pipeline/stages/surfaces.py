@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, read_labels
-from ...anatomy.labels.naming import plain_name
 from ...anatomy.segmentation.amputation import amputate
 from ...anatomy.segmentation.voxels import amputated
 from ...anatomy.surfaces.mending import closed_anatomy, orient_outward
@@ -18,6 +17,7 @@ from ...anatomy.surfaces.thickness import fat_depth, write_thickness
 from ...study import Study
 from ..shared.context import Context
 from .files import THICKNESS, labelled_file, naming
+from .inputs import labelled_regions, maps_fat
 
 
 def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     else:
         labels = _limb_labels(context)
         anatomy, notes = _imaged_anatomy(study, labels)
-        if any(layer.thickness == "map" for layer in study.geometry.model_layers):
+        if maps_fat(study):
             depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
             write_thickness(folder / THICKNESS, anatomy.skin, depth)
     for note in notes:
@@ -41,7 +41,7 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
 def _limb_labels(context: Context) -> LabelMap:
     """The label map of the segment stage, after the virtual amputation where there is one."""
     geometry = context.study.geometry
-    named = {one.name: plain_name(one.label) for one in geometry.regions if one.label is not None}
+    named = labelled_regions(context.study)
     with naming(labelled_file(context.study)):
         labels = read_labels(context.store["segment"] / "labels.seg.nrrd").with_regions(named)
     if geometry.amputation is None:

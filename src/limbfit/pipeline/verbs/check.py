@@ -17,7 +17,7 @@ from ..shared.limb import LimbGeometry
 from ..shared.socket_shape import check_regions, loadable_socket, regions_of
 from ..shared.store import Store
 from ..stages.curves import Beside, read_observed, read_record
-from ..stages.inputs import marked_image, study_image, study_labels
+from ..stages.inputs import check_labels, marked_image, study_image, study_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
 from ..stages.surfaces import given_anatomy
@@ -149,6 +149,7 @@ def _image_facts(study: Study) -> list[str]:
     given = study_labels(study, volume)
     if given is not None:
         labels, notes = given
+        check_labels(study, labels)
         facts.append("corrected labels: " + ", ".join(labels.names.values()))
         facts += [f"label map: {note}" for note in notes]
     return facts
