@@ -24,7 +24,7 @@ FLOORS = [
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},
     {"extensions"},
-    {"errors", "_version"},
+    {"errors", "arrays", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
 # Floors inside a room, from the top; "" is what stands in the room's own folder.

@@ -12,7 +12,7 @@ from scipy.special import bdtr
 
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import Unknowns, build_search_space, group_separately
+from limbfit.identify.fit.parameters import Unknowns, build_space, group_separately
 from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.intervals import EvaluationStore, restate_from_samples, sample_uncertainty
 from limbfit.identify.uncertainty.likelihood import ForceSurrogate, Likelihood
@@ -46,6 +46,11 @@ class Coverage:
     def share(self) -> float:
         """Of the determined combinations whose interval holds the truth."""
         return float(np.mean(np.abs(self.deviations[self.determined]) < 1))
+
+    @property
+    def by_combination(self) -> Array:
+        """The share (k,) for every combination, determined or not."""
+        return np.mean(np.abs(self.deviations) < 1, axis=0)
 
     @property
     def by_parameter(self) -> Array:
@@ -107,7 +112,7 @@ def coverage_study(
     clean = [response.force_N for response in simulate(truth)]
     settings = CalibrationSettings(relative_tolerance=1e-4, max_iterations=60)
     stages = (group_separately(unknowns.names),)
-    space = build_search_space(unknowns, stages[0])
+    space = build_space(unknowns, stages[0])
     linear, stated, sampled, misfit, further = [], [], [], [], []
     for repeat in range(repeats):
         measured, noise = record(repeat, clean)
@@ -159,7 +164,7 @@ def _posterior(
     steps: int,
 ) -> Posterior:
     """Sampled from the most probable parameters on, as ``explore`` does."""
-    space = build_search_space(unknowns, group_separately(unknowns.names))
+    space = build_space(unknowns, group_separately(unknowns.names))
     likelihood = Likelihood(simulate, measured, known.residual_model, unknowns, space)
     best = likelihood.find_best((known.parameters, known.centre))
     return sample_posterior(likelihood, best.z, likelihood.compute_covariance(best.z), steps=steps)

@@ -21,13 +21,7 @@ from bars import (
 from limbfit.errors import CalibrationError, ProblemError
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import (
-    FIXED,
-    Unknowns,
-    build_search_space,
-    group_by_kind,
-    group_separately,
-)
+from limbfit.identify.fit.parameters import FIXED, Unknowns, build_space, group_by_kind, group_separately
 from limbfit.identify.fit.state import CalibrationSettings, SearchState
 
 
@@ -265,7 +259,7 @@ def test_search_space_round_trip_and_derivatives():
         group_separately(PAPER.names),
         (0, 1, 2, FIXED, 3, 1, 2, FIXED),
     ):
-        space = build_search_space(PAPER, grouping)
+        space = build_space(PAPER, grouping)
         z = (space.lower + space.upper) / 2
         assert space.reduce(space.to_logarithms(z)) == pytest.approx(z)
         jacobian = space.pull_back(np.eye(8), space.expand(z))
@@ -278,7 +272,7 @@ def test_impossible_bounds_are_bad_input():
     with pytest.raises(ProblemError, match=r"skin.gamma.*0 < lower"):
         Unknowns(PAPER.names, PAPER.start, PAPER.lower * [1, 1, 0, 1, 1, 1, 1, 1], PAPER.upper)
     with pytest.raises(ProblemError, match="no parameter is left"):
-        build_search_space(PAPER, (FIXED,) * 8)
+        build_space(PAPER, (FIXED,) * 8)
 
 
 class Doubtful:

@@ -16,7 +16,7 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import (
     FIXED,
     Prior,
-    constrain_grouping,
+    constrain,
     group_by_kind,
     group_separately,
     stage_groupings,
@@ -29,7 +29,7 @@ GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
 def test_fixed_names_move_in_no_stage():
     start = PAPER.start.copy()
     start[GAMMA] = TRUTH[GAMMA]
-    stages = [constrain_grouping(grouping, NAMES, ["skin.gamma"]) for grouping in stage_groupings(NAMES)]
+    stages = [constrain(grouping, NAMES, ["skin.gamma"]) for grouping in stage_groupings(NAMES)]
     assert [stage[GAMMA] for stage in stages] == [FIXED, FIXED]
     tight = CalibrationSettings(relative_tolerance=1e-4)
     found = calibrate(simulate, records(), replace(PAPER, start=start), tight, stages=stages)
@@ -41,7 +41,7 @@ def test_fixed_names_move_in_no_stage():
 def test_tied_names_stay_equal_and_reach_a_truth_in_which_they_are():
     truth = TRUTH.copy()
     truth[TAU] = truth[TAU + 4]
-    grouping = constrain_grouping(group_separately(NAMES), NAMES, tied=[["skin.tau_s", "muscle.tau_s"]])
+    grouping = constrain(group_separately(NAMES), NAMES, tied=[["skin.tau_s", "muscle.tau_s"]])
     assert len(set(grouping)) == 7
     stages = (group_by_kind(NAMES), grouping)
     found = calibrate(simulate, records(truth=truth), PAPER, stages=stages)
@@ -51,7 +51,7 @@ def test_tied_names_stay_equal_and_reach_a_truth_in_which_they_are():
 
 def test_all_tied_is_one_material():
     ties = [[f"skin.{name}", f"muscle.{name}"] for name in ("c_kPa", "m", "gamma", "tau_s")]
-    assert constrain_grouping(group_separately(NAMES), NAMES, tied=ties) == group_by_kind(NAMES)
+    assert constrain(group_separately(NAMES), NAMES, tied=ties) == group_by_kind(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_all_tied_is_one_material():
 )
 def test_impossible_constraints_are_bad_input(fixed, tied, words):
     with pytest.raises(ProblemError, match=words):
-        constrain_grouping(group_separately(NAMES), NAMES, fixed, tied)
+        constrain(group_separately(NAMES), NAMES, fixed, tied)
 
 
 def test_a_prior_holds_what_the_data_do_not_show_and_hardly_what_they_do():
@@ -142,7 +142,7 @@ def test_random_starts_are_of_their_seed_and_within_the_bounds():
 
 def test_random_starts_leave_what_is_fixed_and_keep_what_is_tied():
     names = list(PAPER.names)
-    grouping = constrain_grouping(group_by_kind(names), names, fixed=[names[1]], tied=[[names[3], names[7]]])
+    grouping = constrain(group_by_kind(names), names, fixed=[names[1]], tied=[[names[3], names[7]]])
     drawn = np.array(draw_starts(PAPER, 6, 1, grouping))
     assert np.all(drawn[:, 1] == PAPER.start[1])
     assert drawn[:, 3] == pytest.approx(drawn[:, 7])

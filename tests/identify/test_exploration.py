@@ -9,14 +9,14 @@ from coverage_study import coverage_study
 
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import SiteResponse
-from limbfit.identify.fit.parameters import build_search_space, group_by_kind, group_separately
+from limbfit.identify.fit.parameters import build_space, group_by_kind, group_separately
 from limbfit.identify.uncertainty.estimator import FitSensitivity
 from limbfit.identify.uncertainty.exploration import ExplorationSettings, explore_posterior
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
 from limbfit.identify.uncertainty.posterior import Posterior, compute_principal_axes
 from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 
-SPACE = build_search_space(PAPER, group_separately(NAMES))
+SPACE = build_space(PAPER, group_separately(NAMES))
 
 
 def calibrated(noise=0.03, seed=4, **extra):
@@ -113,7 +113,7 @@ def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
     assert (np.diff(widths) > 0).all()
     assert widths[-2] == pytest.approx(np.sqrt(0.5) * 0.6**2, rel=0.1)  # of half the square
     assert abs(axes[-2, 1]) > 0.95
-    tied = build_search_space(PAPER, group_by_kind(NAMES))
+    tied = build_space(PAPER, group_by_kind(NAMES))
     rows = compute_principal_axes(posterior, tied)
     assert rows.shape == (4, TRUTH.size)
     assert rows[:, :4] == pytest.approx(rows[:, 4:])

@@ -9,7 +9,7 @@ from coverage_study import coverage_study
 
 from limbfit.identify.fit.calibration import calibrate, move_answer
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import Unknowns, build_search_space, group_separately
+from limbfit.identify.fit.parameters import Unknowns, build_space, group_separately
 from limbfit.identify.fit.state import Calibration
 from limbfit.identify.uncertainty.intervals import (
     EvaluationStore,
@@ -68,7 +68,7 @@ def near_the_truth(noise=0.03, grouping=None):
         estimate_curve_noise(found.responses, data),
         grouping=grouping,
     )
-    return data, kept, known, build_search_space(bounds, grouping)
+    return data, kept, known, build_space(bounds, grouping)
 
 
 def test_further_simulations_are_few_and_asked_for_again_alike():

@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 from bars import PAPER, TRUTH, Bars
 
-from limbfit.identify.checks.leave_one_out import LogLinearModel
-from limbfit.identify.checks.outliers import (
-    approximate_response,
-    find_outliers,
-    guess_force_unit,
-    leave_one_out,
-)
+from limbfit.identify.checks.leave_one_out import LeaveOutFits, LogLinearModel
+from limbfit.identify.checks.outliers import approximate_response, find_outliers, guess_force_unit
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve
 
@@ -153,11 +148,12 @@ def test_a_site_of_other_tissue_is_warned_of_with_the_evidence(seed):
 def test_cooks_distance_is_largest_where_the_fit_leans_on_a_bad_record():
     bars = limb(2)
     data = [MeasuredCurve(f"s{k}", bar.force(TRUTH)) for k, bar in enumerate(bars)]
-    clean = leave_one_out(LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars]), data, TRUTH)
+    model = LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars])
+    clean = LeaveOutFits(model, data, TRUTH).leave_one_out()
     data[3] = MeasuredCurve("s3", 1.4 * data[3].force_N)
     found = calibrate(lambda p: [bar.respond(p) for bar in bars], data, PAPER)
     simulate = LogLinearModel(found.parameters, [bar.respond(found.parameters) for bar in bars])
-    left = leave_one_out(simulate, data, found.parameters)
+    left = LeaveOutFits(simulate, data, found.parameters).leave_one_out()
     assert max(entry.cook for entry in clean) < 0.1 * left[3].cook
     assert max(left, key=lambda entry: entry.standardised).site == "s3"
 

@@ -7,7 +7,7 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate
 
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import Unknowns, build_search_space, group_by_kind, group_separately
+from limbfit.identify.fit.parameters import Unknowns, build_space, group_by_kind, group_separately
 from limbfit.identify.uncertainty.discrepancy import ResidualModel
 from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.likelihood import Likelihood
@@ -35,7 +35,7 @@ def linear_case(seed=0, sd=SD):
     model = ResidualModel((noise,), np.array([ABOUT]), np.zeros(1), 0.2, 0.0)
     points = np.exp(np.random.default_rng(1).uniform(-1, 1, (5, 3)))
     emulator = Emulator.fit(WIDE.names, points, [line(p) for p in points], softening=1e4)
-    space = build_search_space(WIDE, group_separately(WIDE.names))
+    space = build_space(WIDE, group_separately(WIDE.names))
     exact = np.linalg.lstsq(X, data[0].force_N - ABOUT, rcond=None)[0]
     return Likelihood(emulator, data, model, WIDE, space), exact, sd**2 * np.linalg.inv(X.T @ X)
 
@@ -94,7 +94,7 @@ def test_uninformative_data_open_the_profile():
 
 def test_bars_all_three_intervals_agree_and_hold_the_truth():
     emulator, data, u = bars_case(0.003)
-    space = build_search_space(PAPER, group_separately(NAMES))
+    space = build_space(PAPER, group_separately(NAMES))
     likelihood = Likelihood(emulator, data, u.residual_model, PAPER, space)
     best = likelihood.find_optimum(np.log(TRUTH))
     found = sample_posterior(likelihood, best.z, u.covariance, steps=1500, seed=2)
@@ -130,7 +130,7 @@ def two_models(truth, noise=0.003):
         ("one material", group_by_kind(NAMES)),
         ("two materials", group_separately(NAMES)),
     ):
-        space = build_search_space(PAPER, grouping)
+        space = build_space(PAPER, grouping)
         likelihood = Likelihood(emulator, data, u.residual_model, PAPER, space)
         found.append(
             fit_alternative(name, likelihood, space.reduce(np.log(middle if len(found) == 0 else truth)))[0]

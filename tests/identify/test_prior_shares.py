@@ -9,7 +9,7 @@ import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records, storing
 
 from limbfit.identify.fit.calibration import calibrate
-from limbfit.identify.fit.parameters import Prior, build_search_space, group_separately
+from limbfit.identify.fit.parameters import Prior, build_space, group_separately
 from limbfit.identify.uncertainty.estimator import PriorPrecision
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
@@ -46,7 +46,7 @@ def told(unknowns, seed=0):
     known = estimate_uncertainty(
         found.parameters, found.responses, data, unknowns, estimate_curve_noise(found.responses, data)
     )
-    space = build_search_space(unknowns, group_separately(NAMES))
+    space = build_space(unknowns, group_separately(NAMES))
     return np.log(found.parameters), sample_uncertainty(known, data, unknowns, space, kept, simulate)
 
 

@@ -10,8 +10,7 @@ import pytest
 
 from limbfit.errors import StudyError, TraceError
 from limbfit.identify.checks.crossvalidation import Fold, average_by_site, expand_to_records, list_choices
-from limbfit.identify.checks.leave_one_out import LeaveOutFits
-from limbfit.identify.checks.outliers import _list_pairs
+from limbfit.identify.checks.leave_one_out import LeaveOutFits, list_pairs
 from limbfit.identify.checks.plausibility import RecordFacts, check_plausibility
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.prediction import PredictionModel
@@ -304,4 +303,4 @@ def test_records_of_force_and_depth_are_never_exchanged() -> None:
         MeasuredCurve("2-creep", curve, site="2", unit="mm"),
         MeasuredCurve("3", curve, unit="mm"),
     ]
-    assert _list_pairs(measured, [3, 0, 1, 2]) == [(0, 1), (2, 3)]
+    assert list_pairs(measured, [3, 0, 1, 2]) == [(0, 1), (2, 3)]

@@ -52,7 +52,7 @@ def block(tmp_path):
 def test_the_solver_s_own_folds_and_slips_reach_the_search(block):
     (clean,), (doubtful,) = block(TRUTH), block(SLIPPING)
     assert clean.completed
-    assert not clean.doubts
+    assert not clean.warnings
     assert doubtful.completed
     assert "the force falls from" in doubtful.slipped
     assert "elements are inside out" in doubtful.folded

@@ -18,8 +18,8 @@ from math import comb
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.calibration import calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
@@ -27,11 +27,14 @@ from ..fit.parameters import Unknowns, group_separately
 from ..fit.prediction import ErrorSummary, compute_error_percent, summarise_errors
 from ..fit.state import Calibration, CalibrationSettings
 
-Array = NDArray[np.float64]
 Choice = tuple[int, ...]
-
+Identify = Callable[[Unknowns], Calibration]
 
 _MAX_LISTED_CHOICES = 20_000  # choices that are listed before some are drawn
+_CANDIDATES = 600
+# Least and largest standard deviations of log(parameters) by which fits scatter along the covariance's axes.
+_MIN_SD_LOG, _MAX_SD_LOG = 0.08, 0.45
+_WIDENING = 2.0  # than the fit's own covariance: fewer records, or others, tell less
 
 
 @dataclass(frozen=True)
@@ -185,15 +188,15 @@ class FoldRanking:
     high_percent: float
 
 
-def rank_fold(own: Fold, folds: Sequence[Fold]) -> FoldRanking:
+def rank_fold(ranked: Fold, folds: Sequence[Fold]) -> FoldRanking:
     """Rank the mean held-out error of a fold in the distribution over ``folds`` (5, 50 and 95 %)."""
     means = np.array([fold.mean_heldout for fold in folds])
     low, middle, high = np.percentile(means, [5, 50, 95])
     # Ties, itself above all, count half.
-    better = np.mean(means < own.mean_heldout - 1e-9) + 0.5 * np.mean(
-        np.abs(means - own.mean_heldout) <= 1e-9
+    better = np.mean(means < ranked.mean_heldout - 1e-9) + 0.5 * np.mean(
+        np.abs(means - ranked.mean_heldout) <= 1e-9
     )
-    return FoldRanking(own.mean_heldout, float(better), float(middle), float(low), float(high))
+    return FoldRanking(ranked.mean_heldout, float(better), float(middle), float(low), float(high))
 
 
 def summarise_errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[ErrorSummary, ...]:
@@ -202,9 +205,6 @@ def summarise_errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[ErrorSu
         summarise_errors([fold.errors_percent[i] for fold in folds if i not in fold.fitted])
         for i in range(sites)
     )
-
-
-Identify = Callable[[Unknowns], Calibration]
 
 
 @dataclass(frozen=True)
@@ -235,19 +235,19 @@ class RegionFit:
 
 
 def fit_regions(
-    regions: Mapping[str, RegionRecords], unknowns: Unknowns, whole: Array
+    regions: Mapping[str, RegionRecords], unknowns: Unknowns, whole_parameters: Array
 ) -> dict[str, RegionFit]:
     """Fit the parameters of each region, started from those of the whole limb.
 
     Parameters
     ----------
     unknowns : names and bounds; their start is not used.
-    whole : (p,) the parameters identified for the whole limb.
+    whole_parameters : (p,) those identified for the whole limb.
     """
-    start = unknowns.with_start(np.clip(whole, unknowns.lower, unknowns.upper))
+    start = unknowns.with_start(np.clip(whole_parameters, unknowns.lower, unknowns.upper))
     fits = {}
     for name, region in regions.items():
-        whole_percent = compute_site_errors(region.simulate, whole, region.measured)
+        whole_percent = compute_site_errors(region.simulate, whole_parameters, region.measured)
         found = region.identify(start)
         own_percent = compute_site_errors(region.simulate, found.parameters, region.measured)
         fits[name] = RegionFit(found, own_percent, whole_percent)
@@ -268,13 +268,6 @@ def average_errors(errors_percent: Mapping[str, float | None]) -> float | None:
     """Return the mean over the sites that have an error; None if none has."""
     known = [error for error in errors_percent.values() if error is not None]
     return float(np.mean(known)) if known else None
-
-
-_CANDIDATES = 600
-# Standard deviations of log(parameters) along the axes of the covariance: what fits scatter by at least, at
-# most.
-_MIN_SD_LOG, _MAX_SD_LOG = 0.08, 0.45
-_WIDENING = 2.0  # than the fit's own covariance: fewer records, or others, tell less
 
 
 def spread_points(centre: Array, covariance_log: Array, unknowns: Unknowns, count: int, seed: int) -> Array:

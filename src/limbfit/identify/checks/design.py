@@ -16,15 +16,14 @@ from math import comb, prod
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz, toeplitz
 
+from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import Unknowns
 from ..uncertainty.uncertainty import NORMAL_95
 
-Array = NDArray[np.float64]
 Criterion = Literal["D", "A"]
 
 MAX_EXHAUSTIVE_CHOICES = 20_000  # choices that are all looked at; more are searched by exchanges

@@ -4,31 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 
-Array = NDArray[np.float64]
-
-MAX_STANDARDISED_ERROR, MAX_ERROR_SHARE = (
-    4.0,
-    0.12,
-)  # standardised error and prediction error over the peak that are warned of
-MIN_GAIN = 4.0  # by which a correction must lower the squared misfit of all sites
-
-_PRIOR_SD = 0.5  # of log(parameters) about the answer: keeps what few sites leave open where it was
-
-
-_ASSUMED_ERROR_SHARE = 0.03  # force error, as a fraction of the peak, that data and prior are weighed by
-
-
-_MAX_STEPS = 6
-
-
+MAX_STANDARDISED_ERROR = 4.0  # a larger error of a site that is left out is warned of
+MAX_ERROR_SHARE = 0.12  # the same for its prediction error as a fraction of the peak
 MIN_ERROR_SHARE = 0.02  # prediction error, as a fraction of the peak, below which sites are not told apart
+MIN_GAIN = 4.0  # by which a correction must lower the squared misfit of all sites
+MIN_SITES = 4  # fewer sites cannot tell which one is wrong
+_PRIOR_SD = 0.5  # of log(parameters) about the answer: keeps what few sites leave open where it was
+_ASSUMED_ERROR_SHARE = 0.03  # force error, as a fraction of the peak, that data and prior are weighed by
+_MAX_STEPS = 6
+_MAX_WORST_SITES = 8  # sites of which pairs and units are tried
 
 
 class LogLinearModel:
@@ -101,6 +93,11 @@ class LeaveOutFits:
     """All records with their simulation: regularised fits to some of them, and errors at the others.
 
     A record is left out with all others of its site, because these tell the same.
+
+    Parameters
+    ----------
+    simulate : returns all sites of ``measured``, in order; cheap.
+    start : the answer (p,), from which the fits start, and which they keep where the data say nothing.
     """
 
     def __init__(self, simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array) -> None:
@@ -108,16 +105,16 @@ class LeaveOutFits:
         self.peaks = [site.peak_N for site in measured]
         self._fits: dict[tuple[int, ...], Array] = {}
 
-    def fit_without(self, *left: int) -> Array:
+    def fit_without(self, *left_out: int) -> Array:
         """Return the parameters (p,) of the fit without the sites of some records."""
-        key = self._of_sites(left)
+        key = self._of_sites(left_out)
         if key not in self._fits:
             self._fits[key] = self._fit([i for i in range(len(self.measured)) if i not in key])
         return self._fits[key]
 
-    def _of_sites(self, some: Sequence[int]) -> tuple[int, ...]:
-        """Return all records of the sites of some."""
-        sites = {self.measured[i].site_name for i in some}
+    def _of_sites(self, indices: Sequence[int]) -> tuple[int, ...]:
+        """Return all records of the sites of some records."""
+        sites = {self.measured[i].site_name for i in indices}
         return tuple(i for i, one in enumerate(self.measured) if one.site_name in sites)
 
     def _fit(self, chosen: Sequence[int]) -> Array:
@@ -159,13 +156,86 @@ class LeaveOutFits:
             ]
         )
 
-    def compute_ratio(self, i: int, parameters: Array) -> float:
-        force = self.simulate(parameters)[i].force_N
-        return float(force @ self.measured[i].force_N / (force @ force))
-
-    def compute_expected_error(self, *left: int) -> float:
-        """Return the root mean square error of sites predicted without themselves and ``left``."""
-        out = self._of_sites(left)
+    def compute_expected_error(self, *left_out: int) -> float:
+        """Return the root mean square error of sites predicted without themselves and ``left_out``."""
+        out = self._of_sites(left_out)
         rest = [j for j in range(len(self.measured)) if j not in out]
-        errors = [self.compute_errors(self.fit_without(*left, j))[j] for j in rest]
+        errors = [self.compute_errors(self.fit_without(*left_out, j))[j] for j in rest]
         return max(float(np.sqrt(np.mean(np.square(errors)))), MIN_ERROR_SHARE)
+
+    def leave_one_out(self) -> tuple[LeaveOneOutError, ...]:
+        """Predict every site from all others."""
+        whole = [r.force_N for r in self.simulate(self.fit_without())]
+        misfit = max(float(np.mean(self.compute_errors(self.fit_without()) ** 2)), (MIN_ERROR_SHARE / 2) ** 2)
+        found = []
+        for i, site in enumerate(self.measured):
+            parameters = self.fit_without(i)
+            force = self.simulate(parameters)[i].force_N
+            moved = [
+                np.mean((r.force_N - w) ** 2) / peak**2
+                for r, w, peak in zip(self.simulate(parameters), whole, self.peaks)
+            ]
+            found.append(
+                LeaveOneOutError(
+                    site=site.name,
+                    error=float(self.compute_errors(parameters)[i]),
+                    expected=self.compute_expected_error(i),
+                    ratio=float(force @ site.force_N / (force @ force)),
+                    cook=float(np.sum(moved) / (len(self.start) * misfit)),
+                )
+            )
+        return tuple(found)
+
+
+def find_misfitting_sites(
+    simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array
+) -> tuple[tuple[LeaveOneOutError, ...], tuple[int, ...]]:
+    """Leave every site out; return the errors and the indices of the sites that do not fit: none, one or two.
+
+    With fewer than four sites nobody can tell which one is wrong.
+    """
+    number = count_sites(measured)
+    if number < MIN_SITES:
+        return (), ()
+    sites = LeaveOutFits(simulate, measured, start)
+    singles = sites.leave_one_out()
+    best = int(np.argmax([single.standardised for single in singles]))
+    alone = singles[best].standardised if singles[best].error > MAX_ERROR_SHARE else 0.0
+    pair, together = _find_worst_pair(sites, singles)
+    if together > MAX_STANDARDISED_ERROR and together > 1.5 * alone and number > MIN_SITES:
+        return singles, pair
+    return singles, (best,) if alone > MAX_STANDARDISED_ERROR else ()
+
+
+def _find_worst_pair(
+    sites: LeaveOutFits, singles: Sequence[LeaveOneOutError]
+) -> tuple[tuple[int, ...], float]:
+    """Return the two sites that, both left out, are predicted worst by the rest; 0 if one of them is fine."""
+    everyone = sites.compute_errors(sites.fit_without())
+    if max(everyone.max(), *(single.error for single in singles)) <= MAX_ERROR_SHARE / 2:
+        return (), 0.0
+    found: tuple[tuple[int, ...], float] = ((), 0.0)
+    for i, j in list_pairs(sites.measured, find_worst_sites(sites, everyone)):
+        errors = sites.compute_errors(sites.fit_without(i, j))[[i, j]]
+        if errors.min() < MAX_ERROR_SHARE:
+            continue
+        size = float(np.sqrt(np.mean(errors**2))) / sites.compute_expected_error(i, j)
+        if size > found[1]:
+            found = ((i, j), size)
+    return found
+
+
+def count_sites(measured: Sequence[MeasuredCurve]) -> int:
+    return len({one.site_name for one in measured})
+
+
+def list_pairs(measured: Sequence[MeasuredCurve], indices: Sequence[int]) -> list[tuple[int, int]]:
+    """List pairs of records that are of two sites and compare the same, force or depth."""
+    pairs = [(i, j, measured[i], measured[j]) for i, j in combinations(sorted(indices), 2)]
+    return [(i, j) for i, j, one, two in pairs if one.site_name != two.site_name and one.unit == two.unit]
+
+
+def find_worst_sites(sites: LeaveOutFits, before: Array) -> list[int]:
+    """Return the sites that are predicted worst, with or without themselves, at most eight."""
+    alone = [sites.compute_errors(sites.fit_without(i))[i] for i in range(len(before))]
+    return [int(i) for i in np.argsort(-np.maximum(before, alone))[:_MAX_WORST_SITES]]

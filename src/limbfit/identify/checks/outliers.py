@@ -14,123 +14,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...phases import boundaries, find_phases
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse, check_responses
 from .leave_one_out import (
     MAX_ERROR_SHARE,
-    MAX_STANDARDISED_ERROR,
     MIN_ERROR_SHARE,
     MIN_GAIN,
+    MIN_SITES,
     LeaveOneOutError,
     LeaveOutFits,
     LogLinearModel,
     RecordCorrection,
+    count_sites,
+    find_misfitting_sites,
+    find_worst_sites,
+    list_pairs,
 )
 from .plausibility import UNITS, RecordWarning
 
-Array = NDArray[np.float64]
 History = tuple[Array, Array]
 
 _UNIT_TOLERANCE = 0.25  # of the logarithm of a unit's factor: how near the force ratio must come
 _MAX_CORRECTIONS = 3  # corrections that are looked for
 _MAX_SIMULATED_EXCHANGES = 3  # exchanges that are simulated
-_MAX_WORST_SITES = 8  # sites of which pairs and units are tried
-MIN_SITES = 4
 FORCE_UNITS = {name: force for name, (force, travel, time) in UNITS.items() if travel == time == 1.0}
-
-
-def leave_one_out(
-    simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array
-) -> tuple[LeaveOneOutError, ...]:
-    """Predict every site from all others.
-
-    Parameters
-    ----------
-    simulate : returns all sites of ``measured``, in order; cheap.
-    start : the answer (p,), from which the fits start, and which they keep where the data say nothing.
-    """
-    return tuple(_predict_left_out(LeaveOutFits(simulate, measured, start)))
-
-
-def _predict_left_out(sites: LeaveOutFits) -> list[LeaveOneOutError]:
-    whole = [r.force_N for r in sites.simulate(sites.fit_without())]
-    misfit = max(float(np.mean(sites.compute_errors(sites.fit_without()) ** 2)), (MIN_ERROR_SHARE / 2) ** 2)
-    found = []
-    for i, site in enumerate(sites.measured):
-        parameters = sites.fit_without(i)
-        moved = [
-            np.mean((r.force_N - w) ** 2) / peak**2
-            for r, w, peak in zip(sites.simulate(parameters), whole, sites.peaks)
-        ]
-        found.append(
-            LeaveOneOutError(
-                site=site.name,
-                error=float(sites.compute_errors(parameters)[i]),
-                expected=sites.compute_expected_error(i),
-                ratio=sites.compute_ratio(i, parameters),
-                cook=float(np.sum(moved) / (len(sites.start) * misfit)),
-            )
-        )
-    return found
-
-
-def find_misfitting_sites(
-    simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array
-) -> tuple[tuple[LeaveOneOutError, ...], tuple[int, ...]]:
-    """Leave every site out; return the errors and the indices of the sites that do not fit: none, one or two.
-
-    With fewer than four sites nobody can tell which one is wrong.
-    """
-    number = _count_sites(measured)
-    if number < MIN_SITES:
-        return (), ()
-    sites = LeaveOutFits(simulate, measured, start)
-    singles = _predict_left_out(sites)
-    best = int(np.argmax([single.standardised for single in singles]))
-    alone = singles[best].standardised if singles[best].error > MAX_ERROR_SHARE else 0.0
-    pair, together = _find_worst_pair(sites, singles)
-    if together > MAX_STANDARDISED_ERROR and together > 1.5 * alone and number > MIN_SITES:
-        return tuple(singles), pair
-    return tuple(singles), (best,) if alone > MAX_STANDARDISED_ERROR else ()
-
-
-def _find_worst_pair(
-    sites: LeaveOutFits, singles: Sequence[LeaveOneOutError]
-) -> tuple[tuple[int, ...], float]:
-    """Return the two sites that, both left out, are predicted worst by the rest; 0 if one of them is fine."""
-    everyone = sites.compute_errors(sites.fit_without())
-    if max(everyone.max(), *(single.error for single in singles)) <= MAX_ERROR_SHARE / 2:
-        return (), 0.0
-    found: tuple[tuple[int, ...], float] = ((), 0.0)
-    for i, j in _list_pairs(sites.measured, _find_worst_sites(sites, everyone)):
-        errors = sites.compute_errors(sites.fit_without(i, j))[[i, j]]
-        if errors.min() < MAX_ERROR_SHARE:
-            continue
-        size = float(np.sqrt(np.mean(errors**2))) / sites.compute_expected_error(i, j)
-        if size > found[1]:
-            found = ((i, j), size)
-    return found
 
 
 Exchange = Callable[[Array, int, int], tuple[SiteResponse, SiteResponse]]
 
 
-def approximate_response(response: SiteResponse, own: History, other: History) -> SiteResponse:
+def approximate_response(response: SiteResponse, history: History, other_history: History) -> SiteResponse:
     """Approximate a site's response to another site's record.
 
     The curve is stretched in time, and by a power law in depth with the exponent of its own loading.
 
     Parameters
     ----------
-    own, other : times (n,) s and depths (n,) mm of its record and of the other one.
+    history, other_history : times (n,) s and depths (n,) mm of its record and of the other one.
     """
-    (time, depth), (_, other_depth) = own, other
+    (time, depth), (_, other_depth) = history, other_history
     deep = depth.max()
     rising = np.zeros(len(time), dtype=bool)
     for phase in find_phases(time, depth):
@@ -140,20 +67,20 @@ def approximate_response(response: SiteResponse, own: History, other: History) -
     used = (loading > 0.3 * deep) & (force > 0)
     exponent = float(np.polyfit(np.log(loading[used]), np.log(force[used]), 1)[0]) if used.sum() > 2 else 1.0
     factor = (other_depth.max() / deep) ** np.clip(exponent, 0.5, 4.0)
-    at = _match_times(own, other)
+    at = _match_times(history, other_history)
     columns = [np.interp(at, time, column) for column in response.jacobian.T]
     return SiteResponse(factor * np.interp(at, time, response.force_N), factor * np.stack(columns, axis=1))
 
 
-def _match_times(own: History, other: History) -> Array:
+def _match_times(history: History, other_history: History) -> Array:
     """Return the times (n,) at which a site's record has come as far as the other one at its times.
 
     That is as far in the same phase, or in the same share of the whole if their phases differ.
     """
-    mine, theirs = find_phases(*own), find_phases(*other)
-    if [phase.kind for phase in mine] == [phase.kind for phase in theirs]:
-        return np.asarray(np.interp(other[0], boundaries(theirs), boundaries(mine)))
-    return other[0] / other[0][-1] * own[0][-1]
+    phases, other_phases = find_phases(*history), find_phases(*other_history)
+    if [phase.kind for phase in phases] == [phase.kind for phase in other_phases]:
+        return np.asarray(np.interp(other_history[0], boundaries(other_phases), boundaries(phases)))
+    return other_history[0] / other_history[0][-1] * history[0][-1]
 
 
 def find_best_correction(
@@ -177,33 +104,22 @@ def find_best_correction(
     before = fits.compute_errors(fits.fit_without())
     if before.max() <= MAX_ERROR_SHARE / 2:
         return None  # nothing to explain
-    worst = sorted(_find_worst_sites(fits, before))
+    worst = sorted(find_worst_sites(fits, before))
     forces = [i for i in worst if measured[i].unit == "N"]
     units = [
         fit_with_conversion(simulate, measured, start, i, unit, before)
         for i in forces
         for unit in FORCE_UNITS
     ]
-    pairs = _list_pairs(measured, worst)
+    pairs = list_pairs(measured, worst)
     swaps = [fit_with_exchange(simulate, measured, start, pair, exchange, before) for pair in pairs]
     if exactly is not None:
-        likely = sorted((s for s in swaps if s.gain > MIN_GAIN / 2), key=lambda s: -s.gain)[
-            :_MAX_SIMULATED_EXCHANGES
-        ]
-        known = [_get_pair(s) for s in likely if all(r.completed for r in exactly(start, *_get_pair(s)))]
-        swaps = [fit_with_exchange(simulate, measured, start, pair, exactly, before) for pair in known]
+        likely = sorted((s for s in swaps if s.gain > MIN_GAIN / 2), key=lambda s: -s.gain)
+        pairs = [(s.sites[0], s.sites[1]) for s in likely[:_MAX_SIMULATED_EXCHANGES]]
+        pairs = [pair for pair in pairs if all(r.completed for r in exactly(start, *pair))]
+        swaps = [fit_with_exchange(simulate, measured, start, pair, exactly, before) for pair in pairs]
     convincing = [correction for correction in (*units, *swaps) if correction.is_convincing]
     return max(convincing, key=lambda correction: correction.gain, default=None)
-
-
-def _count_sites(measured: Sequence[MeasuredCurve]) -> int:
-    return len({one.site_name for one in measured})
-
-
-def _list_pairs(measured: Sequence[MeasuredCurve], some: Sequence[int]) -> list[tuple[int, int]]:
-    """List pairs of records that are of two sites and compare the same, force or depth."""
-    pairs = [(i, j, measured[i], measured[j]) for i, j in combinations(sorted(some), 2)]
-    return [(i, j) for i, j, one, two in pairs if one.site_name != two.site_name and one.unit == two.unit]
 
 
 def _exchange_records(measured: Sequence[MeasuredCurve], i: int, j: int) -> list[MeasuredCurve]:
@@ -212,17 +128,6 @@ def _exchange_records(measured: Sequence[MeasuredCurve], i: int, j: int) -> list
     found[i] = replace(measured[j], site=measured[i].site_name)
     found[j] = replace(measured[i], site=measured[j].site_name)
     return found
-
-
-def _get_pair(correction: RecordCorrection) -> tuple[int, int]:
-    i, j = correction.sites
-    return i, j
-
-
-def _find_worst_sites(sites: LeaveOutFits, before: Array) -> list[int]:
-    """Return the sites that are predicted worst, with or without themselves, at most eight."""
-    alone = [sites.compute_errors(sites.fit_without(i))[i] for i in range(len(before))]
-    return [int(i) for i in np.argsort(-np.maximum(before, alone))[:_MAX_WORST_SITES]]
 
 
 @dataclass(frozen=True)
@@ -256,14 +161,12 @@ def find_outliers(
     exchange : takes the expansion of all sites and returns the approximate exchange of two records.
     exactly : the same by simulation.
     """
-    if _count_sites(measured) < MIN_SITES:
+    if count_sites(measured) < MIN_SITES:
         return OutlierReport((), ())
     model = LogLinearModel(start, simulate(start))
-    errors = leave_one_out(model, measured, start)
-    if (
-        neutral is not None
-        and LeaveOutFits(model, measured, start).compute_errors(start).max() > MAX_ERROR_SHARE
-    ):
+    fits = LeaveOutFits(model, measured, start)
+    errors = fits.leave_one_out()
+    if neutral is not None and fits.compute_errors(start).max() > MAX_ERROR_SHARE:
         responses = simulate(neutral)
         if not check_responses(responses, measured, len(neutral)):
             model = LogLinearModel(neutral, responses)
@@ -290,16 +193,9 @@ def _find_warnings(
             corrected = _exchange_records(corrected, i, j)
         warnings.append(warn_of_correction(correction, [site.name for site in measured]))
     singles, misfitting = find_misfitting_sites(simulate, corrected, start)
-    warnings += [
-        warn_of_outlier(singles[i], measured[i].unit)
-        for i in misfitting
-        if not _is_named(warnings, measured[i].name)
-    ]
-    return tuple(warnings)
-
-
-def _is_named(warnings: Sequence[RecordWarning], site: str) -> bool:
-    return any(site in warning.sites for warning in warnings)
+    corrected_sites = {site for warning in warnings for site in warning.sites}
+    others = (i for i in misfitting if measured[i].name not in corrected_sites)
+    return (*warnings, *(warn_of_outlier(singles[i], measured[i].unit) for i in others))
 
 
 def _simulate_exchanged(
@@ -341,14 +237,14 @@ def fit_with_exchange(
 
 
 def _build_correction(
-    kind: Literal["swap", "unit"], which: tuple[int, ...], cause: str, before: Array, sites: LeaveOutFits
+    kind: Literal["swap", "unit"], indices: tuple[int, ...], cause: str, before: Array, sites: LeaveOutFits
 ) -> RecordCorrection:
     after = sites.compute_errors(sites.fit_without())
     gain = float(np.sum(before**2) / max(np.sum(after**2), len(after) * (MIN_ERROR_SHARE / 2) ** 2))
-    pairs = [(float(before[i]), float(after[i])) for i in which]
+    pairs = [(float(before[i]), float(after[i])) for i in indices]
     return RecordCorrection(
         kind,
-        which,
+        indices,
         cause,
         gain,
         tuple(b for b, _ in pairs),

@@ -15,9 +15,8 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ...arrays import Array
 
 # Hayes, Keer, Herrmann and Mockros 1972, flat punch, Poisson's ratio 0.5: kappa against a / h.
 _HAYES_FACTORS = (
@@ -35,10 +34,8 @@ _MIN_PAIR_DEVIATION = 4.0  # of two sites together, exchanged
 _MIN_CHI2_DROP = 12.0  # by which a hypothesis must lower chi-square
 _MAX_CHI2_EXPLAINED = 16.0  # the chi-square (of 4) up to which a hypothesis explains what it names
 MAX_AXIS_DEG, MAX_OFF_SKIN_MM, MAX_HINT_MM, MAX_DEPTH_SHARE = 25.0, 3.0, 12.0, 0.8
-SAME_PLACE_MM, MAX_REPEAT_RATIO = (
-    2.0,
-    1.15,
-)  # sites so close are one, and what repeats there differ by at most
+# Sites so close are one, and what repeats there differ by at most
+SAME_PLACE_MM, MAX_REPEAT_RATIO = 2.0, 1.15
 
 # Recorded over true number: force, displacement, time.
 UNITS: dict[str, tuple[float, float, float]] = {
@@ -229,18 +226,14 @@ def _check_all_moduli(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
     return [RecordWarning((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")]
 
 
-def _compute_features(f: RecordFacts) -> Array:
-    return np.log([f.modulus_kPa, f.speed_mm_s, f.step_s, f.depth_mm])
-
-
-def _compute_spreads(rest: Array, known: bool) -> Array:
+def _compute_spreads(features: Array, has_thickness: bool) -> Array:
     """Return robust standard deviations (4,) of sites about the others' median, at least the floors."""
     floors = [
-        _MIN_SDS["modulus" if known else "stiffness"],
+        _MIN_SDS["modulus" if has_thickness else "stiffness"],
         *(_MIN_SDS[k] for k in ("speed", "step", "depth")),
     ]
-    deviation = 1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0)
-    return np.maximum(floors, deviation) * np.sqrt(1 + 1 / len(rest))
+    deviation = 1.4826 * np.median(np.abs(features - np.median(features, axis=0)), axis=0)
+    return np.maximum(floors, deviation) * np.sqrt(1 + 1 / len(features))
 
 
 def _compare_records(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
@@ -249,7 +242,7 @@ def _compare_records(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
     known = all(f.thickness_mm for f in facts)
     if not known:
         facts = [replace(f, thickness_mm=None) for f in facts]
-    table = np.array([_compute_features(f) for f in facts])
+    table = np.log([[f.modulus_kPa, f.speed_mm_s, f.step_s, f.depth_mm] for f in facts])
     away, spread = np.zeros_like(table), np.zeros_like(table)
     for i in range(len(facts)):
         rest = np.delete(table, i, axis=0)

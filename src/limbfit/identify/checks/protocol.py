@@ -13,17 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 
+from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import Unknowns
 from ..uncertainty.noise import compute_skin_similarity
 from ..uncertainty.uncertainty import NORMAL_95
 from .design import Criterion, NoiseModel, compute_field_information, compute_information
-
-Array = NDArray[np.float64]
 
 _MAX_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), however little is known
 

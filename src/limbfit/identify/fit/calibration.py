@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import CalibrationError, ProblemError
 from .objective import (
     MeasuredCurve,
@@ -22,20 +22,15 @@ from .objective import (
     compute_residuals,
     find_new_warnings,
 )
-from .parameters import Grouping, SearchSpace, Unknowns, build_search_space, stage_groupings
+from .parameters import Grouping, SearchSpace, Unknowns, build_space, stage_groupings
 from .prediction import compute_error_percent
 from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .trust_region import FIRST_RADIUS, SearchPoint, SearchStep, minimise
 
-Array = NDArray[np.float64]
-
 # Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
 _START_SHIFTS = (0.0, 0.0, 0.1, 0.25, 0.5)
-_RATIO_SHARES = (
-    1.0,
-    0.5,
-    0.0,
-)  # of the tissues' own starts, put on the start of the next stage until it completes
+# Of the tissues' own starts, put on the start of the next stage until it completes
+_RATIO_SHARES = (1.0, 0.5, 0.0)
 _PAPER_CHANGE = 0.01
 _VALLEY_STEPS = 4  # steps
 _MAX_TRIES = 3  # of a simulation that completed before
@@ -63,7 +58,7 @@ def calibrate(
         in which elements fold that did not fold before.
     measured : the measured curves, at the times at which ``simulate`` gives the force.
     unknowns : names, start and bounds of the full parameters.
-    stages : groupings (see ``build_search_space``), by default ``stage_groupings``. Each stage starts from
+    stages : groupings (see ``build_space``), by default ``stage_groupings``. Each stage starts from
         the end of the one before. If tissues have different starts, which a stage with one material cannot
         represent, the next stage begins with the same ratios between the tissues.
     on_iterate : called after every accepted iterate with the state from which the search can continue.
@@ -125,7 +120,7 @@ class _Search:
         self._stored: dict[bytes, tuple[SiteResponse, ...]] = {}
 
     def build_space(self, stage: int) -> SearchSpace:
-        return build_search_space(self.unknowns, self.stages[stage])
+        return build_space(self.unknowns, self.stages[stage])
 
     def evaluate(self, space: SearchSpace, z: Array, tolerated: tuple[str, ...] = ()) -> SearchPoint | None:
         """Return the point at z, simulated unless its responses are stored; None if a simulation failed.
@@ -147,9 +142,9 @@ class _Search:
         residual, jacobian = compute_residuals(self.settings.objective, responses, self.measured)
         rows, target = self.unknowns.build_prior_rows()
         scale = self.settings.force_error_percent / 100
-        known = scale * (rows @ space.to_logarithms(z) - target)
+        prior_residual = scale * (rows @ space.to_logarithms(z) - target)
         jacobian = np.concatenate([space.pull_back(jacobian, parameters), scale * rows @ space.tie])
-        return SearchPoint(z, np.concatenate([residual, known]), jacobian)
+        return SearchPoint(z, np.concatenate([residual, prior_residual]), jacobian)
 
     def _find_refusal(self, responses: tuple[SiteResponse, ...], tolerated: tuple[str, ...]) -> str:
         """Return why a completed trial counts as failed, or an empty text.
@@ -183,20 +178,20 @@ class _Search:
         """
         space = self.build_space(0)
         start, middle = space.reduce(np.log(self.unknowns.start)), (space.lower + space.upper) / 2
-        found: SearchPoint | None = None
+        first: SearchPoint | None = None
         for share in _START_SHIFTS:
             point = self.evaluate(space, start + share * (middle - start), START_WARNINGS)
             if point is None:
                 continue
             if not any(one.slipped for one in self.responses_at(space.expand(point.z))):
-                found = point
+                first = point
                 break
-            found = found or point
-        if found is None:
+            first = first or point
+        if first is None:
             raise CalibrationError(f"no simulation completes near the start parameters: {self.failure}")
-        self.accept(space.expand(found.z))
-        state = SearchState(0, tuple(found.z.tolist()), FIRST_RADIUS, self.evaluations)
-        return replace(state, history=(self.build_iterate(0, found),)), found
+        self.accept(space.expand(first.z))
+        state = SearchState(0, tuple(first.z.tolist()), FIRST_RADIUS, self.evaluations)
+        return replace(state, history=(self.build_iterate(0, first),)), first
 
     def build_iterate(self, stage: int, point: SearchPoint) -> Iterate:
         parameters = self.build_space(stage).expand(point.z)
@@ -259,22 +254,20 @@ class _Search:
             history = (*history, self.build_iterate(state.stage, step.point))
         stages = state.stages
         if step.reason:
-            iterates = [iterate for iterate in history if iterate.stage == state.stage]
-            counted = self.evaluations - sum(stage.evaluations for stage in stages)
-            stages = (*stages, self._build_stage_result(state.stage, iterates, counted, step))
-        return SearchState(
-            state.stage, tuple(step.point.z.tolist()), step.radius, self.evaluations, history, stages,
-            self.fold_refusals,
-        )  # fmt: skip
-
-    def _build_stage_result(
-        self, stage: int, iterates: list[Iterate], counted: int, step: SearchStep
-    ) -> StageResult:
-        last = iterates[-1]
-        reason = step.reason if step.converged or not self.failure else f"{step.reason} ({self.failure})"
-        return StageResult(
-            self.stages[stage], last.parameters, last.cost, len(iterates) - 1, counted, step.converged, reason
-        )
+            failed = self.failure and not step.converged
+            result = StageResult(
+                grouping=self.stages[state.stage],
+                parameters=history[-1].parameters,
+                cost=history[-1].cost,
+                iterations=sum(1 for iterate in history if iterate.stage == state.stage) - 1,
+                evaluations=self.evaluations - sum(stage.evaluations for stage in stages),
+                converged=step.converged,
+                reason=f"{step.reason} ({self.failure})" if failed else step.reason,
+            )
+            stages = (*stages, result)
+        z = tuple(step.point.z.tolist())
+        evaluations, folds = self.evaluations, self.fold_refusals
+        return SearchState(state.stage, z, step.radius, evaluations, history, stages, folds)
 
     def _begin_stage(self, state: SearchState, logarithms: Array) -> tuple[SearchState, SearchPoint]:
         """Take the same parameters into the next stage, with the ratios of the tissues' own starts.
@@ -282,12 +275,14 @@ class _Search:
         If all tissues start alike, nothing is simulated unless the bounds exclude the parameters.
         """
         stage = state.stage + 1
-        before, space = self.build_space(state.stage), self.build_space(stage)
+        last_space, space = self.build_space(state.stage), self.build_space(stage)
         start = np.log(self.unknowns.start)
-        own = start - before.to_logarithms(before.reduce(start))
-        own[np.abs(own) < 1e-12] = 0.0  # rounding of the mean must not cost a simulation
-        for share in _RATIO_SHARES if own.any() else (0.0,):
-            z = space.reduce(logarithms + share * own)
+        tissue_offsets = start - last_space.to_logarithms(last_space.reduce(start))
+        tissue_offsets[np.abs(tissue_offsets) < 1e-12] = (
+            0.0  # rounding of the mean must not cost a simulation
+        )
+        for share in _RATIO_SHARES if tissue_offsets.any() else (0.0,):
+            z = space.reduce(logarithms + share * tissue_offsets)
             point = self.evaluate(space, z, ("folded",) if share else START_WARNINGS)
             if point is not None:
                 self.accept(space.expand(z))
@@ -311,9 +306,9 @@ class _Search:
             (cost, failures), (now, failed) = track[-1 - _VALLEY_STEPS :][0], track[-1]
             # Small steps after failures tell of the failures, not of the data.
             if len(track) > _VALLEY_STEPS and now > least * cost and failed == failures:
-                return (
-                    f"{_VALLEY_STEPS} steps hardly lowered the error: the data do not separate the parameters"
-                )
+                steps = f"{_VALLEY_STEPS} steps"
+                return f"{steps} hardly lowered the error: the data do not separate the parameters"
+
             return ""
 
         return stop
@@ -322,10 +317,8 @@ class _Search:
         def stop(before: SearchPoint, after: SearchPoint) -> str:
             if np.abs(space.expand(after.z) - space.expand(before.z)).max() < _PAPER_CHANGE:
                 return "no parameter changed by more than 0.01"
-            if (
-                np.abs(self._compute_equation_8(space, after) - self._compute_equation_8(space, before)).max()
-                < _PAPER_CHANGE
-            ):
+            change = self._compute_equation_8(space, after) - self._compute_equation_8(space, before)
+            if np.abs(change).max() < _PAPER_CHANGE:
                 return "no entry of the objective changed by more than 0.01"
             return ""
 
@@ -350,7 +343,7 @@ class _Search:
 
 
 def move_answer(
-    found: Calibration,
+    calibration: Calibration,
     parameters: Array,
     measured: Sequence[MeasuredCurve],
     responses: Sequence[SiteResponse],
@@ -362,10 +355,14 @@ def move_answer(
     """
     if failure := check_responses(responses, measured, len(parameters)):
         return failure
-    left, _ = compute_residuals(found.settings.objective, responses, measured)
+    left, _ = compute_residuals(calibration.settings.objective, responses, measured)
     rows, target = unknowns.build_prior_rows()
-    known = found.settings.force_error_percent / 100 * (rows @ np.log(parameters) - target)
-    cost, before, last = 0.5 * float(left @ left + known @ known), found.history[-1], found.stages[-1]
+    prior_deviations = calibration.settings.force_error_percent / 100 * (rows @ np.log(parameters) - target)
+    cost, before, last = (
+        0.5 * float(left @ left + prior_deviations @ prior_deviations),
+        calibration.history[-1],
+        calibration.stages[-1],
+    )
     errors = tuple(
         compute_error_percent(one.force_N, site.force_N)
         for one, site in zip(responses, measured, strict=True)
@@ -381,10 +378,10 @@ def move_answer(
         reason=f"{last.reason}; then moved from the least squares to what is most probable",
     )
     return replace(
-        found,
+        calibration,
         parameters=np.array(end),
-        stages=(*found.stages[:-1], stage),
-        history=(*found.history, iterate),
-        evaluations=found.evaluations + 1,
+        stages=(*calibration.stages[:-1], stage),
+        history=(*calibration.history, iterate),
+        evaluations=calibration.evaluations + 1,
         responses=tuple(responses),
     )

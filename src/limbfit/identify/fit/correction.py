@@ -17,10 +17,8 @@ import numpy as np
 from ...errors import CalibrationError
 from .objective import SiteResponse
 
-COARSE_MESH, FINE_MESH = (
-    "in the search",
-    "on the whole mesh",
-)  # of the coarse and of the fine simulations, in reasons
+# Of the coarse and of the fine simulations, in reasons
+COARSE_MESH, FINE_MESH = "in the search", "on the whole mesh"
 
 
 @dataclass(frozen=True)
@@ -110,9 +108,9 @@ def _compute_difference_percent(coarse: SiteResponse, fine: SiteResponse) -> flo
     return float(100 * np.mean(np.abs(fine.force_N - coarse.force_N)) / np.max(np.abs(fine.force_N)))
 
 
-def _check_same_sites(ones: Sequence[SiteResponse], others: Sequence[SiteResponse]) -> None:
-    if len(ones) != len(others):
-        raise CalibrationError(f"{len(ones)} and {len(others)} responses are not of the same sites")
-    for one, other in zip(ones, others):
+def _check_same_sites(responses: Sequence[SiteResponse], expected: Sequence[SiteResponse]) -> None:
+    if len(responses) != len(expected):
+        raise CalibrationError(f"{len(responses)} and {len(expected)} responses are not of the same sites")
+    for one, other in zip(responses, expected):
         if (one.site, one.force_N.shape) != (other.site, other.force_N.shape):
             raise CalibrationError(f"responses of sites {one.site!r} and {other.site!r}, or of other times")

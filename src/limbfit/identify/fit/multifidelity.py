@@ -10,16 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from .calibration import calibrate, evaluate_state
 from .correction import MeshCorrection
 from .objective import MeasuredCurve, Simulate, SiteResponse, check_responses, find_new_warnings
-from .parameters import Grouping, Unknowns, build_search_space, stage_groupings
+from .parameters import Grouping, Unknowns, build_space, stage_groupings
 from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .trust_region import FIRST_RADIUS
-
-Array = NDArray[np.float64]
 
 Forces = Callable[[Array], Sequence[SiteResponse]]
 _LOOSENING = 5.0  # times the tolerances where an answer is but the next start
@@ -174,7 +172,7 @@ class _CorrectionLoop:
 
     def begin(self) -> None:
         """Correct at the start if it can be simulated: the ratio of fine to coarse forces changes little."""
-        space = build_search_space(self.unknowns, self.stages[0])
+        space = build_space(self.unknowns, self.stages[0])
         start = space.expand(space.reduce(np.log(self.unknowns.start)))
         if not check_responses(self.model.simulate_coarse(start), self.measured, len(start)):
             self._anchor(-1, start)
@@ -257,7 +255,7 @@ class _CorrectionLoop:
     def _step_half_way_back(self, stage: int, best: _CorrectedIterate) -> None:
         assert self.state is not None
         z = 0.5 * (np.array(self.state.z) + np.array(best.state.z))
-        parameters = build_search_space(self.unknowns, self.stages[stage]).expand(z)
+        parameters = build_space(self.unknowns, self.stages[stage]).expand(z)
         here = replace(self.history[-1], parameters=tuple(parameters.tolist()))
         self.history = (*self.history[:-1], here)
         self.state = replace(self.state, z=tuple(z.tolist()), history=(here,))

@@ -6,20 +6,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import CalibrationError
 from .multifidelity import CorrectionRound
-from .parameters import FIXED, Grouping, Unknowns, build_search_space, group_by_kind
+from .parameters import FIXED, Grouping, Unknowns, build_space, group_by_kind
 from .state import Calibration
 
-Array = NDArray[np.float64]
-
 _SAME_COST = 0.01  # relative: half a per cent of the error
-_SAME_PARAMETERS = (
-    0.01  # relative, of every parameter: searches that stop on their last step end so far apart
-)
+# Relative, of every parameter: searches that stop on their last step end so far apart
+_SAME_PARAMETERS = 0.01
 _SAME_FIT = 1e-4  # rms force error per site, of its largest: fits closer than this are alike, however exact
+SearchResult = tuple[Calibration, tuple[CorrectionRound, ...]]
+Search = Callable[[Unknowns, Sequence[Grouping]], SearchResult]
+MIN_IMPROVEMENT = 0.01  # relative fall of the squared error: less is the same optimum
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def draw_starts(
     Logarithms are uniform between the bounds. ``grouping`` is that of the first stage, by default one
     material: parameters that move together are drawn together, and fixed ones stay at the given start.
     """
-    space = build_search_space(unknowns, group_by_kind(unknowns.names) if grouping is None else grouping)
+    space = build_space(unknowns, group_by_kind(unknowns.names) if grouping is None else grouping)
     random = np.random.default_rng(seed)
     drawn = [space.expand(random.uniform(space.lower, space.upper)) for _ in range(count - 1)]
     return (unknowns.start, *drawn)
@@ -133,30 +133,26 @@ def describe_starts(result: MultistartResult, names: Sequence[str]) -> str:
     return text
 
 
-Search = Callable[[Unknowns, Sequence[Grouping]], tuple[Calibration, tuple[CorrectionRound, ...]]]
-MIN_IMPROVEMENT = 0.01  # relative fall of the squared error: less is the same optimum
-
-
 def continue_from_bound(
-    first: tuple[Calibration, tuple[CorrectionRound, ...]],
+    result: SearchResult,
     start: Unknowns,
     stages: Sequence[Grouping],
     search: Search,
     report: Callable[[str], object],
-) -> tuple[Calibration, tuple[CorrectionRound, ...]]:
+) -> SearchResult:
     """Search the last stage again from inside if it ended at a bound, which may hold a search in a worse
     optimum.
 
     Parameters
     ----------
-    first : the calibration from ``start`` by ``search``, with its corrections. It is returned as it is if
+    result : the calibration from ``start`` by ``search``, with its corrections. It is returned as it is if
         nothing ended at a bound, or if the second search fails.
     report : called with a sentence when the second search begins, and when it fails.
     """
-    calibration, rounds = first
+    calibration, rounds = result
     inside = find_start_inside(calibration, start, stages[-1])
     if inside is None:
-        return first
+        return result
     names, again = inside
     message = f"{', '.join(names)} at a bound: searched again from inside"
     report(message)
@@ -164,7 +160,7 @@ def continue_from_bound(
         second, second_rounds = search(again, stages[-1:])
     except CalibrationError as error:
         report(f"warning: {message}, which fails: {error}")
-        return first
+        return result
     second_rounds = tuple(replace(one, stage=len(stages) - 1) for one in second_rounds)
     return combine_searches(calibration, second, names), (*rounds, *second_rounds)
 

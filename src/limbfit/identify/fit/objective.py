@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import CalibrationError, TraceError
 
-Array = NDArray[np.float64]
 Objective = Literal["pointwise", "paper"]
 
-_MIN_ERROR_SHARE = (
-    1e-4  # of the largest force: where all residuals vanish, equation 8 squared has no curvature
-)
+# Of the largest force: where all residuals vanish, equation 8 squared has no curvature
+_MIN_ERROR_SHARE = 1e-4
 
 
 def largest_magnitude(values: Array) -> float:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
 
-Array = NDArray[np.float64]
 Grouping = tuple[int, ...]
 
 FIXED = -1
@@ -42,7 +42,7 @@ def stage_groupings(names: Sequence[str]) -> tuple[Grouping, ...]:
     return (first,) if first == second else (first, second)
 
 
-def constrain_grouping(
+def constrain(
     grouping: Sequence[int],
     names: Sequence[str],
     fixed: Sequence[str] = (),
@@ -160,7 +160,7 @@ class SearchSpace:
         return (jacobian * parameters) @ self.tie
 
 
-def build_search_space(unknowns: Unknowns, grouping: Sequence[int]) -> SearchSpace:
+def build_space(unknowns: Unknowns, grouping: Sequence[int]) -> SearchSpace:
     """Build the space of a stage, in which parameters of equal group number move together (-1: not at all).
 
     A group stays within the bounds of all its members.

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from ...arrays import Array
 from .objective import SiteResponse, largest_magnitude
-
-Array = NDArray[np.float64]
 
 
 def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...arrays import Array
 from .objective import Objective, SiteResponse
 from .parameters import Grouping
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

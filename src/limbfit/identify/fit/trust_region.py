@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-Array = NDArray[np.float64]
+from ...arrays import Array
 
 FIRST_RADIUS = 0.5  # in logarithms: first steps twice as long were refused on phantom and OpenLimb
 FORCES_UNCHANGED = "the forces would hardly change"

@@ -17,22 +17,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky, eigh, solve_triangular
 from scipy.optimize import minimize
 
+from ...arrays import Array
 from .noise import SiteNoise
 
-Array = NDArray[np.float64]
-
-CORRELATION_LENGTHS = (
-    0.04,
-    0.07,
-    0.12,
-    0.2,
-    0.35,
-    0.6,
-)  # of a record; longer ones cannot be told from an offset
+# Of a record; longer ones cannot be told from an offset
+CORRELATION_LENGTHS = (0.04, 0.07, 0.12, 0.2, 0.35, 0.6)
 _MIN_MISFIT, _MAX_MISFIT = 1e-5, 1.0  # of the largest force
 _SITE_FACTOR_SD_LOG = np.log(2.0)  # of the log of how far sites are off, over what was expected
 _SITE_FACTOR_BOUNDS = (0.2, 10.0)

@@ -15,13 +15,11 @@ from dataclasses import dataclass, field
 from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse, largest_magnitude
 from ..fit.prediction import compute_error_percent
-
-Array = NDArray[np.float64]
 
 _LENGTHS = (1.0, 2.0, 4.0, 8.0)  # of the kernel, in half-widths of the points
 _NUGGETS = (1e-9, 1e-7, 1e-5)  # variance that the solver's own tolerances add, over that of the kernel
@@ -239,21 +237,21 @@ def _is_determined(trend: Array) -> bool:
     return bool(values[0] < _TRUSTED_CONDITION * values[-1])
 
 
-def _evaluate_monomials(at: Array, quadratic: bool) -> Array:
+def _evaluate_monomials(points: Array, quadratic: bool) -> Array:
     """Return 1, x_i and, if quadratic, x_i x_j at points (m, p): (m, features)."""
-    columns = [np.ones(len(at)), *at.T]
+    columns = [np.ones(len(points)), *points.T]
     if quadratic:
-        columns += [at[:, i] * at[:, j] for i, j in _list_pairs(at.shape[1])]
+        columns += [points[:, i] * points[:, j] for i, j in _list_pairs(points.shape[1])]
     return np.stack(columns, axis=1)
 
 
-def _differentiate_monomials(at: Array, quadratic: bool) -> Array:
+def _differentiate_monomials(points: Array, quadratic: bool) -> Array:
     """Return the derivatives of the monomials, (m, p, features)."""
-    m, p = at.shape
+    m, p = points.shape
     eye = np.eye(p)
     columns = [np.zeros((m, p)), *(np.tile(row, (m, 1)) for row in eye)]
     if quadratic:
-        columns += [at[:, [i]] * eye[j] + at[:, [j]] * eye[i] for i, j in _list_pairs(p)]
+        columns += [points[:, [i]] * eye[j] + points[:, [j]] * eye[i] for i, j in _list_pairs(p)]
     return np.stack(columns, axis=2)
 
 
@@ -287,16 +285,16 @@ def _build_kernel(a: Array, b: Array, length: float) -> Array:
     return K.reshape(m * (p + 1), k * (p + 1))
 
 
-def _build_cross_rows(at: Array, unit: Array, length: float, quadratic: bool, order: int) -> Array:
+def _build_cross_rows(points: Array, unit: Array, length: float, quadratic: bool, order: int) -> Array:
     """Return covariances and trend of new points with all observations.
 
-    Order 0 is of the values at ``at`` (m, p), (m, n); order 1 of the derivatives at one point, (p, n).
+    Order 0 is of the values at ``points`` (m, p), (m, n); order 1 of the derivatives at one point, (p, n).
     """
-    at = np.atleast_2d(at)
+    points = np.atleast_2d(points)
     if order == 1:
-        K = _build_kernel(at, unit, length)[1:]
-        return np.hstack([K, _differentiate_monomials(at, quadratic)[0]])
-    difference = (at[:, None, :] - unit[None, :, :]) / length**2
+        K = _build_kernel(points, unit, length)[1:]
+        return np.hstack([K, _differentiate_monomials(points, quadratic)[0]])
+    difference = (points[:, None, :] - unit[None, :, :]) / length**2
     value = np.exp(-0.5 * length**2 * np.sum(difference**2, axis=2))
     K = np.concatenate([value[:, :, None], value[:, :, None] * difference], axis=2)
-    return np.hstack([K.reshape(len(at), -1), _evaluate_monomials(at, quadratic)])
+    return np.hstack([K.reshape(len(points), -1), _evaluate_monomials(points, quadratic)])

@@ -13,13 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..fit.objective import SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from .discrepancy import ResidualModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

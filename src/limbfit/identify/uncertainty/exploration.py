@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from .emulator import Emulator
@@ -22,7 +22,6 @@ from .posterior import Posterior, sample_posterior
 from .profile import Profile, ProfileEndCheck, check_profile_ends, compute_profile, select_profiles_to_check
 from .uncertainty import Uncertainty
 
-Array = NDArray[np.float64]
 SimulateMany = Callable[[Sequence[Array]], Sequence[Sequence[SiteResponse]]]
 
 _CANDIDATES, _DESIGN_WIDENING = 400, 1.2  # the first design is this much wider than the linearised posterior

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from ..fit.prediction import compute_error_percent
@@ -23,14 +23,10 @@ from .likelihood import Likelihood
 from .posterior import Posterior, compute_principal_axes, sample_by_importance, sample_posterior
 from .uncertainty import GIVEN, SAMPLED, Combination, Uncertainty, choose_verdict, format_product
 
-Array = NDArray[np.float64]
-
 _MAX_FURTHER_SIMULATIONS = 10  # of single records
 _MAX_FURTHER_EVALUATIONS = 2  # of all records: further ones hardly changed an interval
-_NEAR_FACTOR, _NEAR_PERCENT = (
-    4.0,
-    3.0,
-)  # runs are used whose error is at most so many times the least, plus this
+# Runs are used whose error is at most so many times the least, plus this
+_NEAR_FACTOR, _NEAR_PERCENT = 4.0, 3.0
 _MAX_EVALUATIONS = 24
 _WALK_STEPS = 1500  # of the sampler, where weighed samples do not do
 _THINNING = 8  # samples among which the most probable is looked for

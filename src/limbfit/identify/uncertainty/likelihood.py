@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from ..fit.trust_region import SearchPoint, minimise
 from .discrepancy import ResidualModel
-
-Array = NDArray[np.float64]
 
 _MAX_ITERATIONS = 60
 _TOLERANCE = 1e-5

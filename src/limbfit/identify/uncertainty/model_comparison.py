@@ -7,18 +7,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import stdtr
 
+from ...arrays import Array
 from .likelihood import MISFIT_FACTOR_BOUNDS, Likelihood, Optimum
 
-Array = NDArray[np.float64]
-
-_CLEAR_DIFFERENCE, _STRONG_DIFFERENCE = (
-    2.0,
-    10.0,
-)  # differences of criteria (Burnham and Anderson 2002; Kass and Raftery 1995)
+# Differences of criteria (Burnham and Anderson 2002; Kass and Raftery 1995)
+_CLEAR_DIFFERENCE, _STRONG_DIFFERENCE = 2.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -97,20 +93,20 @@ def compare_models(
     return ModelComparison(first, second, heldout, better, verdict)
 
 
-def _compare_held_out(one: Array, two: Array) -> dict[str, float]:
-    if not one.size:
+def _compare_held_out(errors_first: Array, errors_second: Array) -> dict[str, float]:
+    if not errors_first.size:
         return {}
     found = {
-        "sites": float(one.size),
-        "first_percent": float(one.mean()),
-        "second_percent": float(two.mean()),
+        "sites": float(errors_first.size),
+        "first_percent": float(errors_first.mean()),
+        "second_percent": float(errors_second.mean()),
     }
-    difference = one - two
+    difference = errors_first - errors_second
     found["difference_percent"] = float(difference.mean())
-    if one.size > 1 and difference.std() > 0:
-        error = float(difference.std(ddof=1) / np.sqrt(one.size))
+    if errors_first.size > 1 and difference.std() > 0:
+        error = float(difference.std(ddof=1) / np.sqrt(errors_first.size))
         found["standard_error_percent"] = error
-        found["p_value"] = float(2 * stdtr(one.size - 1, -abs(difference.mean()) / error))
+        found["p_value"] = float(2 * stdtr(errors_first.size - 1, -abs(difference.mean()) / error))
     return found
 
 

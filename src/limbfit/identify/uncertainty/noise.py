@@ -11,13 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, Indices
 from ...autoregressive import block_covariance, lag_one
 from ...phases import find_phases
 from ..fit.objective import MeasuredCurve, SiteResponse
-
-Array = NDArray[np.float64]
 
 SKIN_CORRELATION_MM = 10.0  # over which a misfit of the skin's moves goes from one point to the next
 _MIN_NOISE_SHARE = 1e-4  # of the largest force: a smaller sd than this no simulation has
@@ -50,7 +48,7 @@ class SiteNoise:
         return self.site or self.name
 
 
-def compute_skin_similarity(points_mm: Array, components: NDArray[np.int64]) -> Array:
+def compute_skin_similarity(points_mm: Array, components: Indices) -> Array:
     """Return `SiteNoise.similarity` of moves of ``points_mm`` (n, 3) along ``components`` (n,).
 
     It falls over `SKIN_CORRELATION_MM`; each component has a misfit of its own.
@@ -111,7 +109,7 @@ def estimate_curve_noise(
     return tuple(found)
 
 
-def _count_samples(times_s: Array, samples: int) -> NDArray[np.int64]:
+def _count_samples(times_s: Array, samples: int) -> Indices:
     """Return how many of the samples belong to each point (n,): its share of the time, and at least one."""
     steps = np.diff(times_s)
     widths = np.r_[steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]]

@@ -11,26 +11,22 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import logsumexp
 
+from ...arrays import Array
 from ..fit.parameters import SearchSpace
 from .likelihood import MISFIT_FACTOR_BOUNDS, Likelihood
 
 if TYPE_CHECKING:
     import emcee
 
-Array = NDArray[np.float64]
 
 _DEFAULT_STEPS, _WALKERS_PER_DIMENSION = 4000, 4
 _MIN_AUTOCORRELATION_TIMES = 50  # autocorrelation times that make a chain long enough (emcee's own rule)
 _KEPT_SAMPLES = 4000  # samples
-_MAX_ROUNDS, _SAMPLES_PER_ROUND, _STUDENT_FREEDOM = (
-    12,
-    1000,
-    6.0,
-)  # of weighed samples; of Student's distribution
+# Of weighed samples; of Student's distribution
+_MAX_ROUNDS, _SAMPLES_PER_ROUND, _STUDENT_FREEDOM = 12, 1000, 6.0
 _TARGET_EFFECTIVE_SIZE, _MIN_EFFECTIVE_SIZE = 1000, 200
 
 
@@ -185,9 +181,9 @@ class _StudentProposal:
         normal = random.standard_normal((count, len(self.mean))) @ self.root.T
         return self.mean + normal / np.sqrt(random.chisquare(_STUDENT_FREEDOM, (count, 1)) / _STUDENT_FREEDOM)
 
-    def log_density(self, at: Array) -> Array:
+    def log_density(self, points: Array) -> Array:
         """Return the log-density at (m, k), up to a constant that all such distributions share."""
-        off = solve_triangular(self.root, (at - self.mean).T, lower=True)
+        off = solve_triangular(self.root, (points - self.mean).T, lower=True)
         power = -0.5 * (_STUDENT_FREEDOM + len(self.mean))
         return power * np.log1p(np.sum(off**2, axis=0) / _STUDENT_FREEDOM) - float(
             np.log(np.diag(self.root)).sum()

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
+from ...arrays import Array
 from ..fit.objective import SiteResponse
 from .likelihood import Likelihood, Optimum
-
-Array = NDArray[np.float64]
 
 _CLOSED, _ONE_SIDED, _OPEN = "determined on both sides", "determined on one side", "not determined"
 _FIRST_STEP, _STEP_GROWTH, _MAX_STEPS = 0.5, 1.5, 25  # in standard deviations

@@ -17,17 +17,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
 
+from ...arrays import Array
 from ..fit.objective import MeasuredCurve, SiteResponse
-from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_search_space, group_separately
+from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
 from ..fit.state import CalibrationSettings
 from .discrepancy import ResidualModel, estimate_discrepancy
 from .estimator import Estimator, PriorPrecision
 from .noise import SiteNoise
-
-Array = NDArray[np.float64]
 
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
 GIVEN = "given, not identified"
@@ -115,7 +113,7 @@ def estimate_uncertainty(
     site_N : (n,) per site, the expected deviation of the site's force as a whole; residuals correct its size.
     """
     residuals = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
-    space = build_search_space(unknowns, grouping or group_separately(unknowns.names))
+    space = build_space(unknowns, grouping or group_separately(unknowns.names))
     scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
     z = space.reduce(np.log(parameters))
     prior = PriorPrecision.from_unknowns(unknowns, space)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.parameters import build_search_space, group_by_kind
+from ...identify.fit.parameters import build_space, group_by_kind
 from ...identify.uncertainty.discrepancy import ResidualModel
 from ...identify.uncertainty.estimator import FitSensitivity
 from ...identify.uncertainty.exploration import Exploration, ExplorationSettings, explore_posterior
@@ -78,7 +78,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     sites = FittedSites(context, folder, best, earlier)
     known = linearised(context, sites.records, best, sites.at_best)
     table, grouping = study.uncertainty, groupings(study)[-1]
-    space = build_search_space(unknowns(study), grouping)
+    space = build_space(unknowns(study), grouping)
     settings = ExplorationSettings(
         table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed
     )
@@ -122,7 +122,7 @@ def _earlier_points(
 def _evidence(context: Context, explored: Exploration, model: ResidualModel) -> ModelComparison:
     """One material against the study's own, on one emulator and covariance, and where nothing was fitted."""
     study, likelihood = context.study, explored.likelihood
-    space = build_search_space(unknowns(study), group_by_kind(unknowns(study).names))
+    space = build_space(unknowns(study), group_by_kind(unknowns(study).names))
     single = Likelihood(explored.emulator, likelihood.measured, model, unknowns(study), space)
     titles = stage_titles(study.tissues)
     calibration = context.stored("calibrate", "calibration.json")

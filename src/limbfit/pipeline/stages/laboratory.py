@@ -16,17 +16,10 @@ from ...anatomy.meshing.meshing import MeshSettings
 from ...errors import RunError
 from ...identify.fit.calibration import calibrate, move_answer
 from ...identify.fit.correction import MeshCorrection
-from ...identify.fit.multifidelity import CorrectionRound, CorrectionSettings, calibrate_with_correction
-from ...identify.fit.multistart import continue_from_bound
+from ...identify.fit.multifidelity import CorrectionSettings, calibrate_with_correction
+from ...identify.fit.multistart import SearchResult, continue_from_bound
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
-from ...identify.fit.parameters import (
-    Grouping,
-    Prior,
-    Unknowns,
-    build_search_space,
-    constrain_grouping,
-    stage_groupings,
-)
+from ...identify.fit.parameters import Grouping, Prior, Unknowns, build_space, constrain, stage_groupings
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
 from ...identify.uncertainty.intervals import EvaluationStore, count_further_evaluations, sample_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
@@ -196,7 +189,7 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, "a further evaluation, for the intervals")
             return anchored.as_fine(self.search(parameters))
 
-        space = build_search_space(bounds := unknowns(study), grouping)
+        space = build_space(bounds := unknowns(study), grouping)
         evaluations = count_further_evaluations(self.simulated, spent)
         about = known, self.measured, bounds, space, kept, simulate, evaluations
         moves = moves and is_moved(study)
@@ -305,9 +298,7 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, f"{what}, site {simulation.site}")
         return found
 
-    def identify(
-        self, start: Unknowns, stages: Sequence[Grouping]
-    ) -> tuple[Calibration, tuple[CorrectionRound, ...]]:
+    def identify(self, start: Unknowns, stages: Sequence[Grouping]) -> SearchResult:
         """The parameters of the sites' records as the study wants them found, and the corrections made.
 
         Where the last stage ends at a bound, it is searched again from inside.
@@ -315,13 +306,10 @@ class Laboratory:
         first = self._identify(start, stages)
         if self.context.study.calibration.stopping == "paper":
             return first
-        return continue_from_bound(
-            first, start, stages, self._identify, partial(self.context.tell, self.title, 0, 0)
-        )
+        report = partial(self.context.tell, self.title, 0, 0)
+        return continue_from_bound(first, start, stages, self._identify, report)
 
-    def _identify(
-        self, start: Unknowns, stages: Sequence[Grouping]
-    ) -> tuple[Calibration, tuple[CorrectionRound, ...]]:
+    def _identify(self, start: Unknowns, stages: Sequence[Grouping]) -> SearchResult:
         study, table = self.context.study, self.context.study.calibration
         titles = stage_titles(study.tissues)[-len(stages) :]
 
@@ -387,9 +375,7 @@ def settings(study: Study) -> CalibrationSettings:
 def groupings(study: Study) -> tuple[Grouping, ...]:
     """Which parameters move together in each stage, as far as the study lets them move."""
     names = unknowns(study).names
-    made = [
-        constrain_grouping(one, names, study.fixed, study.calibration.tied) for one in stage_groupings(names)
-    ]
+    made = [constrain(one, names, study.fixed, study.calibration.tied) for one in stage_groupings(names)]
     return tuple(dict.fromkeys(made))
 
 
