@@ -15,7 +15,7 @@ from identification_copies import NAMES, Record, Study, cpu_s, outcome, quiet
 
 from limbfit import load_study, run_study
 from limbfit.errors import LimbfitError
-from limbfit.execution import SerialExecutor, sharing
+from limbfit.execution import SerialExecutor, share_executor
 from limbfit.fe import solve
 from limbfit.indentation import Simulation, SimulationJob, build_problem, steps_of, to_parameters
 from limbfit.mesh import read_vtu
@@ -41,7 +41,7 @@ class Failing(SerialExecutor):
         function: Callable[[Any], Any],
         jobs: Iterable[Any],
         keys: Sequence[str] | None = None,
-        lost: Callable[[Any, str], Any] | None = None,
+        on_lost: Callable[[Any, str], Any] | None = None,
     ) -> Iterator[Any]:
         return (self._stopped(job) if self._fails(job) else function(job) for job in jobs)
 
@@ -74,7 +74,7 @@ def run_failing(study: Study, rate: float, seed: int) -> Record:
     copy = study.copy(f"failures-{rate:g}-{seed}", study.made)
     told: Record = {"case": f"{100 * rate:g} % fail, draw {seed}", "refused": ""}
     try:
-        with sharing(Failing(rate, seed)):
+        with share_executor(Failing(rate, seed)):
             run_study(load_study(copy), until="predict", listener=quiet)
         told |= outcome(copy) | compared(copy, clean)
     except LimbfitError as error:

@@ -51,7 +51,7 @@ def job_of(model: SiteModel, parameters: tuple[float, ...], sensitivities: bool 
 
 @contextmanager
 def executors(workers: int) -> Iterator[dict[str, Executor]]:
-    with ProcessExecutor(workers) as pool, DaskExecutor.queued("local", workers) as dask:
+    with ProcessExecutor(workers) as pool, DaskExecutor.from_queue("local", workers) as dask:
         yield {"in this process": SerialExecutor(), "processes": pool, "Dask": dask}
 
 

@@ -25,7 +25,7 @@ distributed = pytest.importorskip("distributed")
 
 @pytest.fixture(scope="module")
 def cluster():
-    with DaskExecutor.queued("local", 2, Limits(time_s=8.0)) as executor:
+    with DaskExecutor.from_queue("local", 2, Limits(time_s=8.0)) as executor:
         yield executor
 
 
@@ -38,7 +38,7 @@ def nannies(executor) -> list[int]:
 def test_the_same_answers_in_order_with_threads_pinned(cluster):
     with SerialExecutor() as serial:
         wanted = list(serial.map(solve, range(8)))
-    found = list(cluster.map(solve, range(8), keys=[str(i % 3) for i in range(8)], lost=told))
+    found = list(cluster.map(solve, range(8), keys=[str(i % 3) for i in range(8)], on_lost=told))
     assert all(np.array_equal(a, b) for a, b in zip(wanted, found, strict=True))
     assert next(cluster.map(threads, [0])) == ["1"] * len(THREAD_VARIABLES)
     assert cluster.workers == 2
@@ -56,9 +56,9 @@ def test_what_a_job_reports_comes_back_from_the_cluster(cluster):
 def test_bad_input_and_lost_jobs_come_back_in_words(cluster):
     with pytest.raises(TraceError, match="row 3"):
         list(cluster.map(refuse, range(4)))
-    (answer,) = cluster.map(die, [0], lost=told)
+    (answer,) = cluster.map(die, [0], on_lost=told)
     assert answer.startswith("0: a worker process died")
-    hung, quick = cluster.map(nap, [600, 0], lost=told)
+    hung, quick = cluster.map(nap, [600, 0], on_lost=told)
     assert "time_limit_s = 8 s" in hung
     assert isinstance(quick, int)
 
@@ -67,7 +67,7 @@ def test_bad_input_and_lost_jobs_come_back_in_words(cluster):
 def test_killed_workers_change_nothing():
     """Three workers, of which three are killed while 60 jobs run."""
     stop = threading.Event()
-    with DaskExecutor.queued("local", 3) as executor:
+    with DaskExecutor.from_queue("local", 3) as executor:
         list(executor.map(solve, range(3)))
         killed = []
 
@@ -79,7 +79,7 @@ def test_killed_workers_change_nothing():
 
         thread = threading.Thread(target=murder, daemon=True)
         thread.start()
-        found = list(executor.map(solve_slowly, range(60), lost=told))
+        found = list(executor.map(solve_slowly, range(60), on_lost=told))
         stop.set()
         thread.join(10)
     assert killed
@@ -93,9 +93,9 @@ def solve_slowly(seed):
 
 def test_a_scheduler_or_queue_that_is_not_there_is_one_clear_line():
     with pytest.raises(InputError, match=r"--dask: no batch system is named 'slurmy'; use slurm, .*local"):
-        DaskExecutor.queued("slurmy", 2)
+        DaskExecutor.from_queue("slurmy", 2)
     with pytest.raises(InputError, match="--scheduler: no Dask scheduler answers"):
-        DaskExecutor.at("nonsense://127.0.0.1:1")
+        DaskExecutor.connect("nonsense://127.0.0.1:1")
 
 
 SITES = """[[sites]]

@@ -20,12 +20,12 @@ from limbfit.execution import (
     Placement,
     ProcessExecutor,
     SerialExecutor,
+    count_usable_cores,
     make_executor,
-    meanwhile,
-    placed,
+    place_jobs,
     report_progress,
-    sharing,
-    usable_cores,
+    run_in_background,
+    share_executor,
 )
 
 
@@ -113,7 +113,7 @@ def count(to):
 def heard(executor, jobs):
     """What jobs report, by job, in its order, and their answers."""
     said = {job: [] for job in jobs}
-    answers = list(executor.map(count, jobs, told=lambda job, message: said[job].append(tuple(message))))
+    answers = list(executor.map(count, jobs, on_report=lambda job, message: said[job].append(tuple(message))))
     return said, answers
 
 
@@ -134,33 +134,33 @@ def test_a_listener_that_breaks_off_leaves_no_job_behind(pool):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        list(pool.map(count, [1, 600], told=stop))
+        list(pool.map(count, [1, 600], on_report=stop))
     assert list(pool.map(square, [3, 4])) == [9, 16]
 
 
 def test_jobs_side_by_side_share_the_workers_threads(pool):
     assert [pool.threads_for(jobs) for jobs in (1, 2, 5)] == [2, 1, 1]
     assert ProcessExecutor(8).threads_for(2) == 4
-    assert SerialExecutor().threads_for(2) == usable_cores()
+    assert SerialExecutor().threads_for(2) == count_usable_cores()
 
 
 def test_work_goes_on_meanwhile():
-    with meanwhile(pid, None) as wait:
+    with run_in_background(pid, None) as wait:
         other = wait()
         assert other != os.getpid()
         assert wait() == other  # asked again, not done again
 
 
 def test_failures_and_deaths_of_what_is_done_meanwhile_are_raised_where_it_is_waited_for():
-    with meanwhile(refuse, 2) as wait, pytest.raises(TraceError):
+    with run_in_background(refuse, 2) as wait, pytest.raises(TraceError):
         wait()
-    with meanwhile(die, None) as wait, pytest.raises(RunError, match="died"):
+    with run_in_background(die, None) as wait, pytest.raises(RunError, match="died"):
         wait()
 
 
 def test_what_nobody_waits_for_is_ended():
     start = time.monotonic()
-    with meanwhile(nap, 60.0):
+    with run_in_background(nap, 60.0):
         pass
     assert time.monotonic() - start < 20.0
 
@@ -248,7 +248,7 @@ def test_keys_must_match_jobs(pool):
 def test_the_number_of_workers_is_the_users_or_the_machines():
     assert isinstance(make_executor(1), SerialExecutor)
     assert make_executor(3).workers == 3
-    assert make_executor(0).workers == usable_cores()
+    assert make_executor(0).workers == count_usable_cores()
 
 
 def assert_group_ends(group, within_s=5.0):
@@ -342,23 +342,23 @@ def told(job, reason):
 @pytest.mark.slow
 def test_a_hung_worker_costs_one_retry_and_twice_is_lost_with_the_reason(tmp_path):
     with ProcessExecutor(2, limits=Limits(time_s=20.0)) as executor:
-        answers = list(executor.map(hang_once, [str(tmp_path / "x")], lost=told))
+        answers = list(executor.map(hang_once, [str(tmp_path / "x")], on_lost=told))
     assert answers == ["alive"]
     with ProcessExecutor(1, limits=Limits(time_s=0.1)) as executor:
-        first, second = executor.map(nap, [600, 601], lost=told)
+        first, second = executor.map(nap, [600, 601], on_lost=told)
     assert first == "600: it took longer than execution.time_limit_s = 0.1 s, twice"
     assert second.startswith("601: ")
 
 
 def test_a_worker_over_its_memory_is_ended_and_the_others_go_on():
     with ProcessExecutor(2, limits=Limits(memory_GB=1.2)) as executor:
-        answers = list(executor.map(swell, [1, 1800, 2], lost=told))
+        answers = list(executor.map(swell, [1, 1800, 2], on_lost=told))
     assert answers[::2] == [1.0, 1.0]
     assert answers[1] == "1800: it needed more than execution.memory_limit_GB = 1.2 GB, twice"
 
 
 def test_a_job_that_kills_every_worker_can_be_a_failure_instead_of_an_end(pool):
-    assert list(pool.map(die, [0], lost=told)) == [
+    assert list(pool.map(die, [0], on_lost=told)) == [
         "0: a worker process died: out of memory, killed or crashed, twice"
     ]
 
@@ -376,9 +376,9 @@ def test_code_that_lies_where_a_run_is_started_is_not_run(tmp_path, monkeypatch)
 
 
 def test_placement_and_sharing_decide_the_executor(pool):
-    with placed(Placement(workers=1)):
+    with place_jobs(Placement(workers=1)):
         assert isinstance(make_executor(3), SerialExecutor)
-    with sharing(pool):
+    with share_executor(pool):
         with make_executor(1) as lent:
             assert lent.workers == 2
         assert list(make_executor().map(square, [2])) == [4]  # still runs

@@ -11,7 +11,7 @@ from rich.table import Table
 
 import limbfit
 
-from ..execution import usable_cores
+from ..execution import count_usable_cores
 from .console import STDOUT, AsJson, listening, print_json
 
 app = typer.Typer(
@@ -23,7 +23,7 @@ Reference = Annotated[
     typer.Option(help="folder of FEBio's results; default: shared/reference, here or above"),
 ]
 Threads = Annotated[int, typer.Option(min=1, help="threads of the linear algebra; default: all cores")]
-CORES = usable_cores()
+CORES = count_usable_cores()
 UNKNOWNS, LARGE = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 
 import limbfit
 
-from ..execution import QUEUES, Placement, placed
+from ..execution import QUEUES, Placement, place_jobs
 from .commands import stage_names
 from .console import STDERR, STDOUT, AsJson, listening, print_json
 
@@ -37,7 +37,7 @@ def where(verb: Callable[..., None]) -> Callable[..., None]:
     @wraps(verb)
     def told(**given: Any) -> None:
         chosen = {name: given.pop(name) for name in _OPTIONS}
-        with placed(Placement(**chosen)):
+        with place_jobs(Placement(**chosen)):
             verb(**given)
 
     own = list(inspect.signature(verb, eval_str=True).parameters.values())

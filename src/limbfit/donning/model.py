@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ProblemError
-from ..execution import usable_cores
+from ..execution import count_usable_cores
 from ..fe import History, Motion, Problem, RigidBody, SmoothSurface, StepControl
 from ..fe.materials import Material
 from ..fe.motion import COORDINATES
@@ -161,4 +161,4 @@ def socket_steps(fit: SocketFit, modulus: float, threads: int | None = None) -> 
 
 def most_threads(given: int | None = None) -> int:
     """Threads of one simulation, of those ``given``; by default it has the machine to itself."""
-    return min(given or usable_cores(), MOST_THREADS)
+    return min(given or count_usable_cores(), MOST_THREADS)

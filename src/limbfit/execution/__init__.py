@@ -1,22 +1,22 @@
-"""One face for running jobs: in this process, in worker processes, or on a Dask cluster.
+"""Executors that run jobs: in this process, in worker processes, or on a Dask cluster.
 
-A job is anything that can be pickled, and the function that does it is importable; answers come back in the
-order of the jobs whatever runs them, so a caller cannot tell one executor from another but by the clock.
+A job is anything that can be pickled, and the function that does it is importable. Answers come back in the
+order of the jobs whatever runs them, so a caller cannot tell one executor from another except by the time.
 """
 
-from .background import meanwhile
-from .choice import Placement, make_executor, placed, sharing
-from .cluster import QUEUES, DaskExecutor
-from .face import (
+from .base import (
     SAFE_PATH,
     THREAD_VARIABLES,
     Executor,
     Limits,
     SerialExecutor,
+    count_usable_cores,
     report_progress,
-    usable_cores,
 )
+from .cluster import QUEUES, DaskExecutor
+from .factory import Placement, make_executor, place_jobs, share_executor
 from .processes import ProcessExecutor
+from .worker import run_in_background
 
 __all__ = [
     "QUEUES",
@@ -28,10 +28,10 @@ __all__ = [
     "Placement",
     "ProcessExecutor",
     "SerialExecutor",
+    "count_usable_cores",
     "make_executor",
-    "meanwhile",
-    "placed",
+    "place_jobs",
     "report_progress",
-    "sharing",
-    "usable_cores",
+    "run_in_background",
+    "share_executor",
 ]

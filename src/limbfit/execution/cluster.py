@@ -1,8 +1,8 @@
 """Jobs on a Dask cluster: a scheduler that runs already, workers queued on a batch system, or local ones.
 
-The study's folder must be on a file system that the workers share, under the same path, and limbfit installed
-for them. Every Dask worker does its jobs in a process of its own (`processes`), which pins threads and can be
-ended, as a thread of Dask's cannot.
+The study's folder must be on a file system that the workers share, under the same path, and limbfit must be
+installed for them. Every Dask worker does its jobs in a process of its own (`processes`), which pins threads
+and can be ended, as a thread of Dask cannot.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import InputError, RunError
-from .face import NO_LIMITS, Answer, Job, Limits, paired
+from .base import NO_LIMITS, Answer, Job, Limits, zip_jobs
 from .processes import ProcessExecutor
 
 QUEUES = {
@@ -30,44 +30,46 @@ QUEUES = {
     "oar": "OARCluster",
     "htcondor": "HTCondorCluster",
 }
-LOCAL = "local"
-INSTALL = "pip install 'limbfit[dask]'"
-_GONE = "the Dask scheduler is gone; run again: finished work is kept"
+LOCAL_QUEUE = "local"
+INSTALL_COMMAND = "pip install 'limbfit[dask]'"
+_SCHEDULER_GONE = "the Dask scheduler is gone; run again: finished work is kept"
 _CONNECT_S = 20.0
-_AHEAD = 2  # jobs at the scheduler for every worker: one at work, one that waits
-_LOOK_S = 1.0  # between two looks at which workers there are
-_QUEUED_GB = 4.0  # asked of the batch system for a worker where the study sets no limit
+_JOBS_PER_WORKER = 2  # jobs at the scheduler for every worker: one at work, one that waits
+_POLL_S = 1.0  # between two looks at which workers there are
+_DEFAULT_MEMORY_GB = 4.0  # asked of the batch system for a worker where the study sets no limit
 
 
 @dataclass(frozen=True)
-class _Lost:
-    """Why a job had no answer."""
+class _LostJob:
+    """The reason why a job had no answer."""
 
     reason: str
 
 
-_own = threading.local()  # of a Dask worker: the process that does the jobs of each of its threads
+_local = threading.local()  # of a Dask worker: the process that does the jobs of each of its threads
 
 
-def _guarded(function: Callable, job: Any, limits: Limits, contained: bool, number: int, topic: str) -> Any:
-    """A job in a process of its own on a Dask worker; ``contained``: the answer says why it was lost.
+def _run_contained(
+    function: Callable, job: Any, limits: Limits, contained: bool, number: int, topic: str
+) -> Any:
+    """Do a job in a process of its own on a Dask worker; if ``contained``, the answer says why it was lost.
 
     What it reports goes to those who listen to the ``topic``, with its ``number``.
     """
-    executor: ProcessExecutor | None = getattr(_own, "executor", None)
+    executor: ProcessExecutor | None = getattr(_local, "executor", None)
     if executor is None:
-        executor = _own.executor = ProcessExecutor(1)
+        executor = _local.executor = ProcessExecutor(1)
     executor.limits = limits
-    lost = (lambda _, reason: _Lost(reason)) if contained else None
+    on_lost = (lambda _, reason: _LostJob(reason)) if contained else None
     worker = _dask("distributed").get_worker()
-    told = (lambda _, message: worker.log_event(topic, (number, message))) if topic else None
-    return next(executor.map(function, [job], lost=lost, told=told))
+    on_report = (lambda _, message: worker.log_event(topic, (number, message))) if topic else None
+    return next(executor.map(function, [job], on_lost=on_lost, on_report=on_report))
 
 
 class DaskExecutor:
     """Runs jobs through a ``distributed.Client``, which it owns, with the cluster behind it if that is given.
 
-    A worker that dies costs its jobs another try elsewhere, as often as the scheduler allows
+    The jobs of a worker that dies are tried again elsewhere, as often as the scheduler allows
     (``distributed.scheduler.allowed-failures``).
     """
 
@@ -75,17 +77,17 @@ class DaskExecutor:
         self, client: Any, limits: Limits = NO_LIMITS, cluster: Any = None, workers: int = 0
     ) -> None:
         self._client, self._cluster, self.limits = client, cluster, limits
-        self._asked = workers
+        self._requested = workers
         self._home: dict[str, str] = {}
 
     @classmethod
-    def at(cls, address: str, limits: Limits = NO_LIMITS) -> Self:
-        """On the workers of the scheduler at ``address`` (``tcp://host:8786``).
+    def connect(cls, address: str, limits: Limits = NO_LIMITS) -> Self:
+        """Use the workers of the scheduler at ``address`` (``tcp://host:8786``).
 
         Raises
         ------
         InputError
-            Where Dask is not installed, or no scheduler answers.
+            If Dask is not installed, or no scheduler answers.
         """
         try:
             client = _dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
@@ -98,8 +100,8 @@ class DaskExecutor:
         return cls(client, limits)
 
     @classmethod
-    def queued(cls, queue: str, workers: int, limits: Limits = NO_LIMITS) -> Self:
-        """On ``workers`` jobs of a batch system (`QUEUES`), or on local processes (``local``).
+    def from_queue(cls, queue: str, workers: int, limits: Limits = NO_LIMITS) -> Self:
+        """Use ``workers`` jobs of a batch system (`QUEUES`), or local processes (``local``).
 
         What else the batch system wants (queue, account, walltime) stands in Dask's ``jobqueue.yaml``.
 
@@ -108,12 +110,12 @@ class DaskExecutor:
         InputError
             For an unknown batch system, or one that cannot be used as configured.
         """
-        if queue == LOCAL:
+        if queue == LOCAL_QUEUE:
             cluster = _dask("distributed").LocalCluster(
                 n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0
             )
         elif queue in QUEUES:
-            memory = f"{limits.memory_GB or _QUEUED_GB:g}GB"
+            memory = f"{limits.memory_GB or _DEFAULT_MEMORY_GB:g}GB"
             try:
                 kind = getattr(_dask("dask_jobqueue"), QUEUES[queue])
                 cluster = kind(cores=1, processes=1, memory=memory)
@@ -128,52 +130,52 @@ class DaskExecutor:
             raise InputError(
                 f"no batch system is named {queue!r}",
                 place="--dask",
-                remedy=f"use {', '.join((*QUEUES, LOCAL))}",
+                remedy=f"use {', '.join((*QUEUES, LOCAL_QUEUE))}",
             )
         client = _dask("distributed").Client(cluster, set_as_default=False)
         return cls(client, limits, cluster, workers)
 
     @property
     def workers(self) -> int:
-        """Workers that are there, or as many as were asked for while they wait in a queue."""
-        return max(len(self._addresses()), self._asked, 1)
+        """The number of workers that are there, or that were asked for while they wait in a queue."""
+        return max(len(self._addresses()), self._requested, 1)
 
     def _addresses(self) -> list[str]:
         try:
             return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
         except OSError as error:
-            raise RunError(_GONE) from error
+            raise RunError(_SCHEDULER_GONE) from error
 
     def map(
         self,
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
-        lost: Callable[[Job, str], Answer] | None = None,
-        told: Callable[[Job, Any], None] | None = None,
+        on_lost: Callable[[Job, str], Answer] | None = None,
+        on_report: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return self._answers(function, *paired(jobs, keys), lost, told)
+        return self._yield_answers(function, *zip_jobs(jobs, keys), on_lost, on_report)
 
     def threads_for(self, jobs: int) -> int:
         return 1
 
-    def _answers(
+    def _yield_answers(
         self,
         function: Callable,
         jobs: list,
         keys: Sequence[str | None],
-        lost: Callable | None,
-        told: Callable | None,
+        on_lost: Callable | None,
+        on_report: Callable | None,
     ) -> Iterator[Any]:
-        """Answers in order, with no more jobs at the scheduler than keep its workers busy.
+        """Yield answers in order, with no more jobs at the scheduler than keep its workers busy.
 
-        It blames a dead worker's jobs for the death, also those that only waited there: of a long queue, jobs
-        would be given up that were never begun.
+        The scheduler blames a dead worker's jobs for the death, also those that only waited there. With a
+        long queue, it would give up jobs that never began.
         """
-        name, contained = f"{function.__name__}-{uuid.uuid4().hex}", lost is not None
+        name, contained = f"{function.__name__}-{uuid.uuid4().hex}", on_lost is not None
         futures: dict[int, Any] = {}  # whose answers were not given yet
         news: SimpleQueue[Any] = SimpleQueue()  # None: a job has ended; else its number and what it reports
-        topic = "" if told is None else name
+        topic = "" if on_report is None else name
         submitted, looked, present = 0, -math.inf, list[str]()
         if topic:
             self._client.subscribe_topic(topic, lambda event: news.put(event[1]))
@@ -181,12 +183,12 @@ class DaskExecutor:
             for i, job in enumerate(jobs):
                 while True:
                     under_way = sum(not future.done() for future in futures.values())
-                    if time.monotonic() > looked + _LOOK_S:
+                    if time.monotonic() > looked + _POLL_S:
                         present, looked = self._addresses(), time.monotonic()
-                    room = _AHEAD * max(len(present), self._asked, 1) - under_way
+                    room = _JOBS_PER_WORKER * max(len(present), self._requested, 1) - under_way
                     for j in range(submitted, min(submitted + room, len(jobs))):
                         futures[j] = self._submit(
-                            f"{name}-{j}", self._place(keys[j], present),
+                            f"{name}-{j}", self._choose_workers(keys[j], present),
                             function, jobs[j], self.limits, contained, j, topic,
                         )  # fmt: skip
                         futures[j].add_done_callback(lambda _: news.put(None))
@@ -194,11 +196,11 @@ class DaskExecutor:
                     if futures[i].done():
                         break
                     with suppress(Empty):
-                        said = news.get(timeout=_LOOK_S)
-                        if said is not None and told is not None:
-                            told(jobs[said[0]], said[1])
+                        said = news.get(timeout=_POLL_S)
+                        if said is not None and on_report is not None:
+                            on_report(jobs[said[0]], said[1])
                 answer = self._result(futures.pop(i), contained)
-                yield lost(job, answer.reason) if isinstance(answer, _Lost) and lost else answer
+                yield on_lost(job, answer.reason) if isinstance(answer, _LostJob) and on_lost else answer
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel([future for future in futures.values() if not future.done()])
@@ -207,10 +209,15 @@ class DaskExecutor:
 
     def _submit(self, name: str, place: list[str] | None, *guarded: Any) -> Any:
         return self._client.submit(
-            _guarded, *guarded, key=name, pure=False, workers=place, allow_other_workers=place is not None
+            _run_contained,
+            *guarded,
+            key=name,
+            pure=False,
+            workers=place,
+            allow_other_workers=place is not None,
         )
 
-    def _place(self, key: str | None, present: list[str]) -> list[str] | None:
+    def _choose_workers(self, key: str | None, present: list[str]) -> list[str] | None:
         """Where jobs of a key went before, if that worker lives; else the next worker in turn."""
         if key is None or not present:
             return None
@@ -224,10 +231,10 @@ class DaskExecutor:
             return future.result()
         except distributed.KilledWorker as error:
             if contained:
-                return _Lost("every Dask worker that tried it died: out of memory, killed or crashed")
+                return _LostJob("every Dask worker that tried it died: out of memory, killed or crashed")
             raise RunError(f"every Dask worker that tried a job died: {error}") from error
         except (distributed.CancelledError, distributed.comm.CommClosedError) as error:
-            raise RunError(_GONE) from error
+            raise RunError(_SCHEDULER_GONE) from error
 
     def __enter__(self) -> Self:
         return self
@@ -247,4 +254,4 @@ def _dask(module: str) -> Any:
     try:
         return __import__(module)
     except ImportError as error:
-        raise InputError(f"{module} is not installed", remedy=INSTALL) from error
+        raise InputError(f"{module} is not installed", remedy=INSTALL_COMMAND) from error

@@ -9,26 +9,26 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import RunError
-from .face import NO_LIMITS, Answer, Job, Limits, paired
+from .base import NO_LIMITS, Answer, Job, Limits, zip_jobs
 from .worker import GRACE_S, READY, JobOutcome, JobReport, Worker
 
-TRIES = 2
-_LOOK_S = 0.25  # between two looks at what jobs take
-_DIED = "a worker process died: out of memory, killed or crashed"
+MAX_TRIES = 2
+_POLL_S = 0.25  # between two looks at what jobs take
+_DEATH = "a worker process died: out of memory, killed or crashed"
 
 
 class ProcessExecutor:
     """Worker processes that live as long as the executor, each with ``threads`` threads.
 
     They start when first needed, and never run the caller's script again, guarded or not. A worker that dies
-    (killed, out of memory, crashed) or goes over ``limits`` is replaced, and its job is tried once more.
+    (killed, out of memory, crashed) or exceeds the ``limits`` is replaced, and its job is tried once more.
     """
 
     def __init__(self, workers: int, threads: int = 1, limits: Limits = NO_LIMITS) -> None:
         if workers < 1 or threads < 1:
             raise ValueError("workers and threads must be at least 1")
         self.workers, self.threads, self.limits = workers, threads, limits
-        self._staff: list[Worker | None] = [None] * workers
+        self._seats: list[Worker | None] = [None] * workers
         self._home: dict[str, int] = {}
         self._mapping = False
 
@@ -37,59 +37,59 @@ class ProcessExecutor:
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
-        lost: Callable[[Job, str], Answer] | None = None,
-        told: Callable[[Job, Any], None] | None = None,
+        on_lost: Callable[[Job, str], Answer] | None = None,
+        on_report: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return self._answers(function, *paired(jobs, keys), lost, told)
+        return self._yield_answers(function, *zip_jobs(jobs, keys), on_lost, on_report)
 
     def threads_for(self, jobs: int) -> int:
         return max(self.workers * self.threads // max(jobs, 1), self.threads)
 
-    def _answers(
+    def _yield_answers(
         self,
         function: Callable,
         jobs: list,
         keys: Sequence[str | None],
-        lost: Callable | None,
-        told: Callable | None,
+        on_lost: Callable | None,
+        on_report: Callable | None,
     ) -> Iterator[Any]:
         if self._mapping:
             raise RuntimeError("the executor is already mapping: take all answers of one map before the next")
         self._mapping = True
         waiting, busy, tries = list(range(len(jobs))), dict[int, int](), [0] * len(jobs)
-        limits = self.limits if lost is not None else NO_LIMITS
+        limits = self.limits if on_lost is not None else NO_LIMITS
         answers: dict[int, JobOutcome] = {}
         try:
             for index in range(len(jobs)):
                 while index not in answers:
-                    for seat, job in self._seat(waiting, busy, keys):
+                    for seat, job in self._assign_jobs(waiting, busy, keys):
                         tries[job] += 1
                         busy[seat] = job
-                        self._worker(seat).send(function, jobs[job])
+                        self._get_worker(seat).send(function, jobs[job])
                     for seat, outcome in self._collect(busy, limits):
                         if isinstance(outcome, JobReport):
-                            if told is not None:
-                                told(jobs[busy[seat]], outcome.message)
+                            if on_report is not None:
+                                on_report(jobs[busy[seat]], outcome.message)
                             continue
                         job = busy.pop(seat)
                         if isinstance(outcome, JobOutcome):
                             answers[job] = outcome
-                        elif tries[job] < TRIES:
+                        elif tries[job] < MAX_TRIES:
                             waiting.insert(0, job)
-                        elif lost is not None:
-                            answers[job] = JobOutcome(lost(jobs[job], f"{outcome}, twice"))
+                        elif on_lost is not None:
+                            answers[job] = JobOutcome(on_lost(jobs[job], f"{outcome}, twice"))
                         else:
-                            raise RunError(_obituary(function, job, keys[job]))
+                            raise RunError(_describe_death(function, job, keys[job]))
                 yield answers.pop(index).result()
         finally:
             self._mapping = False
             for seat in busy:  # left in the middle: their answers have no reader any more
                 self._replace(seat)
 
-    def _seat(
+    def _assign_jobs(
         self, waiting: list[int], busy: dict[int, int], keys: Sequence[str | None]
     ) -> Iterator[tuple[int, int]]:
-        """Take jobs that can start now from ``waiting``: (worker, job)."""
+        """Take jobs that can start now from ``waiting``; yield (seat, job)."""
         for job in tuple(waiting):
             free = [seat for seat in range(self.workers) if seat not in busy]
             if not free:
@@ -103,31 +103,31 @@ class ProcessExecutor:
     def _collect(
         self, busy: dict[int, int], limits: Limits
     ) -> Iterator[tuple[int, JobOutcome | JobReport | str]]:
-        """Wait for workers to say something: (worker, outcome or report), or why there will be none."""
-        lines = {self._worker(seat).connection: seat for seat in busy}
+        """Wait for workers to send something; yield (seat, outcome or report), or why there will be none."""
+        lines = {self._get_worker(seat).connection: seat for seat in busy}
         limited = limits.time_s or limits.memory_GB
-        ready = wait(list(lines), _LOOK_S if limited else None)
+        ready = wait(list(lines), _POLL_S if limited else None)
         for line in ready:
             seat = lines[line]  # type: ignore[index]
-            outcome = self._worker(seat).receive()
+            outcome = self._get_worker(seat).receive()
             if outcome == READY:
                 continue
             if outcome is None:
                 self._replace(seat)
-            yield seat, outcome or _DIED
+            yield seat, outcome or _DEATH
         for line, seat in lines.items():
-            if line not in ready and (excess := self._worker(seat).excess(limits)):
+            if line not in ready and (excess := self._get_worker(seat).find_exceeded_limit(limits)):
                 self._replace(seat)
                 yield seat, excess
 
-    def _worker(self, seat: int) -> Worker:
-        worker = self._staff[seat]
+    def _get_worker(self, seat: int) -> Worker:
+        worker = self._seats[seat]
         if worker is None:
-            worker = self._staff[seat] = Worker(self.threads)
+            worker = self._seats[seat] = Worker(self.threads)
         return worker
 
     def _replace(self, seat: int) -> None:
-        worker, self._staff[seat] = self._staff[seat], None
+        worker, self._seats[seat] = self._seats[seat], None
         if worker is not None:
             worker.dismiss(at_once=True)
             worker.end(time.monotonic() + GRACE_S)
@@ -138,7 +138,7 @@ class ProcessExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        staff, self._staff = [worker for worker in self._staff if worker], [None] * self.workers
+        staff, self._seats = [worker for worker in self._seats if worker], [None] * self.workers
         for worker in staff:
             worker.dismiss(at_once=error is not None)
         until = time.monotonic() + GRACE_S  # for all of them together
@@ -146,6 +146,6 @@ class ProcessExecutor:
             worker.end(until)
 
 
-def _obituary(function: Callable, job: int, key: str | None) -> str:
+def _describe_death(function: Callable, job: int, key: str | None) -> str:
     name = f"{key!r}" if key is not None else f"number {job + 1}"
     return f"a worker process died twice in {function.__name__} of {name}: out of memory, killed or crashed"

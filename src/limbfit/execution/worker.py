@@ -1,4 +1,4 @@
-"""A worker process: its line to the parent, and its life at the far end of it."""
+"""A worker process: its connection to the parent, its loop, and one job in the background."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from .face import SAFE_PATH, THREAD_VARIABLES, Limits, reporting_to
+from .base import SAFE_PATH, THREAD_VARIABLES, Limits, send_reports_to
 
 GRACE_S = 2.0  # for workers to end when told so
 READY = "ready"  # a worker's first word: its start is not its first job's time
 
 
 class JobOutcome:
-    """What a job came to: an answer, or an exception with the worker's traceback."""
+    """The outcome of a job: an answer, or an exception with the worker's traceback."""
 
     def __init__(self, answer: Any = None, error: BaseException | None = None, trace: str = "") -> None:
         self.answer, self.error, self.trace = answer, error, trace
@@ -39,7 +39,7 @@ class JobOutcome:
 
 @dataclass(frozen=True)
 class JobReport:
-    """What a job says while it goes on."""
+    """What a job reports while it runs."""
 
     message: Any
 
@@ -50,10 +50,10 @@ class Worker:
     def __init__(self, threads: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, far = context.Pipe()
-        self.process = context.Process(target=serve, args=(far,), daemon=True)
+        self.process = context.Process(target=serve_jobs, args=(far,), daemon=True)
         self.began: float | None = None  # its job; None before it is ready
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | SAFE_PATH
-        with _environment(variables), _no_main(), _may_have_children():
+        with _set_environment(variables), _hide_main(), _allow_children():
             self.process.start()
         far.close()
 
@@ -64,7 +64,7 @@ class Worker:
             self.connection.send((function, job))
 
     def receive(self) -> JobOutcome | JobReport | str | None:
-        """The outcome of the job, what it reports, `READY`, or None where the process is dead."""
+        """Return the outcome of the job, what it reports, `READY`, or None if the process is dead."""
         try:
             message = self.connection.recv()
         except (EOFError, OSError):  # nothing more, or half a message
@@ -73,8 +73,8 @@ class Worker:
             self.began = time.monotonic()
         return message
 
-    def excess(self, limits: Limits) -> str:
-        """Which limit the job at work is over, in words; empty where it is within them."""
+    def find_exceeded_limit(self, limits: Limits) -> str:
+        """Return which limit the running job exceeds, in words; empty if it is within them."""
         began = self.began
         if limits.time_s and began is not None and time.monotonic() - began > limits.time_s:
             return f"it took longer than execution.time_limit_s = {limits.time_s:g} s"
@@ -83,7 +83,7 @@ class Worker:
         return ""
 
     def _memory_GB(self) -> float:
-        """Resident memory of the process and its children (meshers)."""
+        """Return the resident memory of the process and its children (meshers)."""
         total = 0
         with suppress(psutil.Error):
             whole = psutil.Process(self.process.pid)
@@ -93,7 +93,7 @@ class Worker:
         return total / 1e9
 
     def dismiss(self, at_once: bool) -> None:
-        """Close the line, which ends an idle worker; ``at_once`` ends one in the middle of a job."""
+        """Close the connection, which ends an idle worker; ``at_once`` ends one in the middle of a job."""
         self.connection.close()
         if at_once:
             self.process.terminate()
@@ -108,7 +108,7 @@ class Worker:
 
 
 @contextmanager
-def _environment(variables: dict[str, str]) -> Iterator[None]:
+def _set_environment(variables: dict[str, str]) -> Iterator[None]:
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -122,8 +122,8 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _no_main() -> Iterator[None]:
-    """Spawned processes import the caller's main script, which would run an unguarded one again: hide it."""
+def _hide_main() -> Iterator[None]:
+    """Hide the caller's main script, which a spawned process would import, and so run if it is unguarded."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -133,8 +133,8 @@ def _no_main() -> Iterator[None]:
 
 
 @contextmanager
-def _may_have_children() -> Iterator[None]:
-    """Dask's workers are daemons, which may have no children; these end with their parent by themselves."""
+def _allow_children() -> Iterator[None]:
+    """Allow children in Dask's workers, which are daemons; the children end with their parent."""
     config = multiprocessing.current_process()._config  # type: ignore[attr-defined]
     before = config.get("daemon")
     config["daemon"] = False
@@ -144,37 +144,37 @@ def _may_have_children() -> Iterator[None]:
         config["daemon"] = before
 
 
-def serve(connection: Connection) -> None:
-    """A worker's life: do jobs until the line is closed. The terminal's Ctrl-C is the parent's affair."""
+def serve_jobs(connection: Connection) -> None:
+    """Do jobs until the connection is closed; the terminal's Ctrl-C is handled by the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
     with suppress(ConnectionError):
         connection.send(READY)
     while True:
         try:
-            with reporting_to(lambda message: connection.send(JobReport(message))):
-                outcome = _do(*connection.recv())
+            with send_reports_to(lambda message: connection.send(JobReport(message))):
+                outcome = _run_job(*connection.recv())
         except (EOFError, ConnectionError):
             return
         except Exception as error:  # a function or job that this process cannot import
-            outcome = _failure(error)
-        _reply(connection, outcome)
+            outcome = _build_failure(error)
+        _send_outcome(connection, outcome)
 
 
-def _do(function: Callable, job: Any) -> JobOutcome:
+def _run_job(function: Callable, job: Any) -> JobOutcome:
     try:
         return JobOutcome(function(job))
     except MemoryError:
         os._exit(1)  # the parent tries once more in a fresh process
     except Exception as error:
-        return _failure(error)
+        return _build_failure(error)
 
 
-def _failure(error: Exception) -> JobOutcome:
+def _build_failure(error: Exception) -> JobOutcome:
     return JobOutcome(error=error, trace=traceback.format_exc())
 
 
-def _reply(connection: Connection, outcome: JobOutcome) -> None:
+def _send_outcome(connection: Connection, outcome: JobOutcome) -> None:
     try:
         connection.send(outcome)
     except ConnectionError:
@@ -186,8 +186,40 @@ def _reply(connection: Connection, outcome: JobOutcome) -> None:
 
 
 def _die_with_parent() -> None:
-    """An orphan in the middle of an hour's job would keep a core for nothing."""
+    """End this process with its parent: an orphan would keep a core for a job that nobody waits for."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+@contextmanager
+def run_in_background(function: Callable[[Any], Any], job: Any) -> Iterator[Callable[[], Any]]:
+    """Run ``function(job)`` beside the block, which gets a function that waits for the answer.
+
+    An exception of the job is raised where it is waited for. A job that is not done when the block ends is
+    ended.
+
+    Raises
+    ------
+    RunError
+        If the process died.
+    """
+    worker = Worker(threads=1)
+    worker.send(function, job)
+    found: list[JobOutcome] = []
+
+    def wait() -> Any:
+        while not found:
+            outcome = worker.receive()
+            if outcome is None:
+                raise RunError(f"the process of {function.__name__} died: out of memory, killed or crashed")
+            if isinstance(outcome, JobOutcome):
+                found.append(outcome)
+        return found[0].result()
+
+    try:
+        yield wait
+    finally:
+        worker.dismiss(at_once=not found)
+        worker.end(time.monotonic() + GRACE_S)

@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from ..execution import usable_cores
+from ..execution import count_usable_cores
 from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
@@ -149,7 +149,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
             penalty = max(_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
-    most = kept_nodes(psutil.virtual_memory().total, usable_cores())
+    most = kept_nodes(psutil.virtual_memory().total, count_usable_cores())
     while len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > most:
         _prepared.popitem(last=False)
     return known

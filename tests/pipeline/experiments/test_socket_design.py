@@ -14,7 +14,7 @@ import trimesh
 
 from limbfit import design_socket, load_study, report_study
 from limbfit.errors import InputError
-from limbfit.execution import Placement, placed
+from limbfit.execution import Placement, place_jobs
 from small_limb import small_limb
 
 SOCKET = """hold_s = 0.0
@@ -45,7 +45,7 @@ def said() -> list[str]:
 @pytest.fixture(scope="module")
 def designed(folder, said) -> dict:
     """On two workers; ``said`` is its progress."""
-    with placed(Placement(workers=2)):
+    with place_jobs(Placement(workers=2)):
         return design_socket(load_study(folder), listener=lambda progress: said.append(str(progress)))
 
 
@@ -78,7 +78,7 @@ def test_side_by_side_they_are_what_they_are_one_after_the_other(designed, said,
     assert shares[-1] == 3.0
     for file in ("study.toml", "skin.stl", "tibia.stl"):
         shutil.copy(folder / file, tmp_path)
-    with placed(Placement(workers=1)):
+    with place_jobs(Placement(workers=1)):
         alone = design_socket(load_study(tmp_path))
     for one, other in zip(designed["designs"], alone["designs"], strict=True):
         assert one["volume_cm3"] == other["volume_cm3"]
@@ -105,7 +105,7 @@ def test_an_interrupt_ends_both_and_both_go_on_after_donning(designed, folder, t
         if all(max(told, default=0.0) > 2.05 for told in times.values()):
             raise KeyboardInterrupt
 
-    with placed(Placement(workers=2)):
+    with place_jobs(Placement(workers=2)):
         with pytest.raises(KeyboardInterrupt):
             design_socket(load_study(tmp_path), listener=stop)
         assert not [one for one in psutil.Process().children() if "spawn_main" in " ".join(one.cmdline())]

@@ -76,7 +76,7 @@ class Disturbed(SerialExecutor):
     def __init__(self, failing: float = 0.0, seed: int = 0, until: int = 10**6) -> None:
         self.failing, self.random, self.left, self.done = failing, np.random.default_rng(seed), until, 0
 
-    def map(self, function, jobs, keys=None, lost=None) -> Iterator:
+    def map(self, function, jobs, keys=None, on_lost=None) -> Iterator:
         for answer in super().map(function, jobs, keys):
             if self.left == 0:
                 raise KeyboardInterrupt

@@ -63,12 +63,12 @@ class Losing(SerialExecutor):
     def __init__(self, known: dict[str, Simulation], lost: Choice, anew: Choice = nothing) -> None:
         self.known, self.lost, self.anew = known, lost, anew
 
-    def map(self, function, jobs, keys=None, lost=None) -> Iterator:
+    def map(self, function, jobs, keys=None, on_lost=None) -> Iterator:
         for job in jobs:
             if function is not simulate:
                 yield function(job)
             elif self.lost(job):
-                yield lost(job, LIMIT)
+                yield on_lost(job, LIMIT)
             elif self.anew(job):
                 yield simulate(job)
             else:

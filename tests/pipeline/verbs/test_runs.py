@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from limbfit.errors import InputError, RunError
-from limbfit.execution import Limits, SerialExecutor, make_executor, sharing
+from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
 from limbfit.pipeline.verbs.doctor import judge_self_test, squeeze_cube
 from limbfit.pipeline.verbs.journal import discreet
@@ -231,6 +231,6 @@ def test_an_interrupt_ends_a_run_soon_even_where_nobody_listens(how):
 
 
 def test_a_lent_executor_takes_the_limits_of_whoever_uses_it():
-    with SerialExecutor() as executor, sharing(executor):
+    with SerialExecutor() as executor, share_executor(executor):
         make_executor(limits=Limits(time_s=7.0))
         assert executor.limits.time_s == 7.0

@@ -270,7 +270,7 @@ def wear_all(jobs: Sequence[Wearing], executor: Executor, tell: Callable[[float,
         tell(before + sum(shares.values()), f"{job.name}: {words}")
 
     threads = beside.threads_for(len(left))
-    reasons = beside.map(_wear, [replace(job, threads=threads) for job in left], told=told)
+    reasons = beside.map(_wear, [replace(job, threads=threads) for job in left], on_report=told)
     found = dict(zip(shares, reasons, strict=True))
     return [found.get(job.name, "") for job in jobs]
 

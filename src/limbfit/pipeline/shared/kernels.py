@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ...execution import meanwhile
+from ...execution import run_in_background
 from ...fe import are_compiled, compile_kernels
 
 
@@ -19,7 +19,7 @@ def kernels_compiling(wanted: bool = True) -> Iterator[Callable[[], None]]:
     if not wanted or are_compiled():
         yield lambda: None
         return
-    with meanwhile(_compile, None) as wait:
+    with run_in_background(_compile, None) as wait:
         yield wait
 
 

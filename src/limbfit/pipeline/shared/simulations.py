@@ -67,7 +67,7 @@ class SimulationCache:
         if again:
             found = {job: kept for job, kept in found.items() if kept.completed}
         missing = [job for job in dict.fromkeys(jobs) if job not in found]
-        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], lost=_lost)
+        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], on_lost=_lost)
         for job in jobs:
             if job not in found:
                 simulation = found[job] = next(made)

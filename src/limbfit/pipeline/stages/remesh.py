@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ...anatomy.meshing.meshing import MeshSettings
 from ...errors import MeshingError
-from ...execution import meanwhile
+from ...execution import run_in_background
 from ...indentation import SiteModel
 from ..shared.artefacts import file_digest
 from ..shared.context import Context
@@ -70,7 +70,7 @@ def meshed_meanwhile(
     if not missing or context.executor.workers < 2:
         yield lambda: None
         return
-    with meanwhile(_mesh_idly, missing) as wait:
+    with run_in_background(_mesh_idly, missing) as wait:
         yield wait
 
 

@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from ...errors import InputError, LimbfitError
-from ...execution import make_executor, sharing
+from ...execution import make_executor, share_executor
 from ...study import load_study
 from ..shared.context import Listener, Progress, quiet
 from .run import STAGE_NAMES, run_study
@@ -41,7 +41,7 @@ def run_batch(
     """
     if until is not None and until not in STAGE_NAMES:
         raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
-    with make_executor(workers) as executor, sharing(executor):
+    with make_executor(workers) as executor, share_executor(executor):
         for i, path in enumerate(paths):
             start = perf_counter()
             listener(Progress("batch", i, len(paths), str(path)))

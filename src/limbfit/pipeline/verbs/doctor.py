@@ -19,7 +19,7 @@ import psutil
 
 from ..._version import __version__
 from ...errors import InputError, LimbfitError
-from ...execution import THREAD_VARIABLES, ProcessExecutor, usable_cores
+from ...execution import THREAD_VARIABLES, ProcessExecutor, count_usable_cores
 from ...fe import OgdenQLV
 from ...fe.solution.linear import SOLVERS, factors_are_dear, linear_solver
 from ...febio.program import find_febio
@@ -82,14 +82,14 @@ def _python() -> Iterator[Finding]:
 
 
 def _cores() -> Iterator[Finding]:
-    usable, there = usable_cores(), os.cpu_count() or 1
+    usable, there = count_usable_cores(), os.cpu_count() or 1
     set_here = [f"{name}={os.environ[name]}" for name in THREAD_VARIABLES if name in os.environ]
     yield Finding("cores", "ok", f"{usable} of {there} may be used: {usable} workers of one thread each")
     yield Finding("threads", "ok", ", ".join(set_here) or "not set here; workers get one each")
 
 
 def _memory() -> Iterator[Finding]:
-    free, workers = psutil.virtual_memory().available / 1e9, usable_cores()
+    free, workers = psutil.virtual_memory().available / 1e9, count_usable_cores()
     enough = free >= NEEDED_GB
     yield Finding(
         "memory",

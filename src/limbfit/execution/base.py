@@ -1,4 +1,4 @@
-"""What every executor does, what a job may cost, and the executor that needs no workers."""
+"""The interface of every executor, the limits of a job, and the executor that needs no workers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 
 @dataclass(frozen=True)
 class Limits:
-    """What one job may take: wall time in s and resident memory in GB (10^9 bytes); 0 means no limit."""
+    """The limits of one job: wall time in s and resident memory in GB (10^9 bytes); 0 means no limit."""
 
     time_s: float = 0.0
     memory_GB: float = 0.0
@@ -42,15 +42,15 @@ _listener: ContextVar[Callable[[Any], None] | None] = ContextVar("_listener", de
 
 
 def report_progress(message: Any) -> None:
-    """From within a job, to the ``told`` of whoever maps it: numbers and words, plain enough for JSON."""
+    """Report from within a job to the ``on_report`` of its caller: anything plain enough for JSON."""
     listener = _listener.get()
     if listener is not None:
         listener(message)
 
 
 @contextmanager
-def reporting_to(listener: Callable[[Any], None] | None) -> Iterator[None]:
-    """`report_progress` calls ``listener`` in this block."""
+def send_reports_to(listener: Callable[[Any], None] | None) -> Iterator[None]:
+    """Send what `report_progress` is given in this block to ``listener``."""
     token = _listener.set(listener)
     try:
         yield
@@ -65,11 +65,11 @@ class Executor(Protocol):
 
     @property
     def workers(self) -> int:
-        """How many jobs it does at a time."""
+        """The number of jobs that it does at a time."""
         ...
 
     def threads_for(self, jobs: int) -> int:
-        """How many threads each of so many jobs may have, so that no worker is idle beside them."""
+        """Return how many threads each of so many jobs may have, so that no worker is idle beside them."""
         ...
 
     def map(
@@ -77,25 +77,25 @@ class Executor(Protocol):
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
-        lost: Callable[[Job, str], Answer] | None = None,
-        told: Callable[[Job, Any], None] | None = None,
+        on_lost: Callable[[Job, str], Answer] | None = None,
+        on_report: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        """Answers in the order of ``jobs``, as they are asked for.
+        """Yield answers in the order of ``jobs``, as they are asked for.
 
-        Jobs of one key go to one worker, over all calls, so that what it keeps (meshes, states) serves again;
-        a new key goes to the first worker that is free. An exception of a job is raised where its answer
-        would come, and ends the call.
+        Jobs of one key go to one worker, over all calls, so that it can use again what it keeps (meshes,
+        states). A new key goes to the first worker that is free. An exception of a job is raised where its
+        answer would come, and ends the call.
 
         Parameters
         ----------
-        lost : makes the answer of a job that was lost twice, from it and the reason in words: its worker
-            died, or it went over the executor's limits. Without it nothing limits the jobs.
-        told : is given a job and what it says by `report_progress`, while answers are waited for.
+        on_lost : makes the answer of a job that was lost twice, from the job and the reason in words: its
+            worker died, or it exceeded the executor's limits. Without it nothing limits the jobs.
+        on_report : called with a job and what it reports by `report_progress`, while answers are waited for.
 
         Raises
         ------
         RunError
-            Where a worker died twice on the same job, and ``lost`` is not given.
+            If a worker died twice on the same job, and ``on_lost`` is not given.
         """
         ...
 
@@ -106,15 +106,15 @@ class Executor(Protocol):
     ) -> None: ...
 
 
-def usable_cores() -> int:
-    """Cores that this process may use, which a batch system can make fewer than the machine has."""
+def count_usable_cores() -> int:
+    """Return the number of cores that this process may use; a batch system can allow fewer than there are."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def paired(jobs: Iterable[Job], keys: Sequence[str] | None) -> tuple[list[Job], list[str | None]]:
-    """Jobs as a list, and the key of each; None where they have none."""
+def zip_jobs(jobs: Iterable[Job], keys: Sequence[str] | None) -> tuple[list[Job], list[str | None]]:
+    """Return the jobs as a list, and the key of each; None if they have none."""
     listed = list(jobs)
     if keys is None:
         return listed, [None] * len(listed)
@@ -124,7 +124,7 @@ def paired(jobs: Iterable[Job], keys: Sequence[str] | None) -> tuple[list[Job], 
 
 
 class SerialExecutor:
-    """Runs jobs one after the other in this process, which no limit can end."""
+    """Runs jobs one after the other in this process; no limit can end them."""
 
     workers = 1
     limits = NO_LIMITS
@@ -134,17 +134,17 @@ class SerialExecutor:
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
-        lost: Callable[[Job, str], Answer] | None = None,
-        told: Callable[[Job, Any], None] | None = None,
+        on_lost: Callable[[Job, str], Answer] | None = None,
+        on_report: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
         def done(job: Job) -> Answer:
-            with reporting_to(None if told is None else partial(told, job)):
+            with send_reports_to(None if on_report is None else partial(on_report, job)):
                 return function(job)
 
-        return map(done, paired(jobs, keys)[0])
+        return map(done, zip_jobs(jobs, keys)[0])
 
     def threads_for(self, jobs: int) -> int:
-        return usable_cores()
+        return count_usable_cores()
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""Which executor a run gets: what its study says, unless the caller says otherwise."""
+"""The choice of an executor: what the study says, unless the caller says otherwise."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from ..errors import InputError
+from .base import NO_LIMITS, Answer, Executor, Job, Limits, SerialExecutor, count_usable_cores
 from .cluster import DaskExecutor
-from .face import NO_LIMITS, Answer, Executor, Job, Limits, SerialExecutor, usable_cores
 from .processes import ProcessExecutor
 
 
 @dataclass(frozen=True)
 class Placement:
-    """What a caller wants instead of what studies say.
+    """Where a caller wants jobs to run instead of what studies say.
 
-    ``workers``: how many; ``scheduler``: address of a Dask scheduler; ``dask``: a batch system for workers.
+    ``workers`` is their number, ``scheduler`` the address of a Dask scheduler, ``dask`` a batch system for
+    workers.
     """
 
     workers: int | None = None
@@ -34,23 +35,23 @@ class Placement:
             )
 
 
-_wanted: ContextVar[Placement | None] = ContextVar("_wanted", default=None)
+_placement: ContextVar[Placement | None] = ContextVar("_wanted", default=None)
 _shared: ContextVar[Executor | None] = ContextVar("_shared", default=None)
 
 
 @contextmanager
-def placed(placement: Placement) -> Iterator[None]:
-    """Executors made in this block are where ``placement`` says."""
-    token = _wanted.set(placement)
+def place_jobs(placement: Placement) -> Iterator[None]:
+    """Make executors that are created in this block run where ``placement`` says."""
+    token = _placement.set(placement)
     try:
         yield
     finally:
-        _wanted.reset(token)
+        _placement.reset(token)
 
 
 @contextmanager
-def sharing(executor: Executor) -> Iterator[None]:
-    """`make_executor` gives ``executor`` in this block, and whoever asked for it leaves it running."""
+def share_executor(executor: Executor) -> Iterator[None]:
+    """Make `make_executor` return ``executor`` in this block; whoever asks for it leaves it running."""
     token = _shared.set(executor)
     try:
         yield
@@ -59,28 +60,28 @@ def sharing(executor: Executor) -> Iterator[None]:
 
 
 def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
-    """An executor with that many workers, one thread each; 0 means one worker per usable core.
+    """Make an executor with that many workers, one thread each; 0 means one worker per usable core.
 
-    One worker means this process itself. `placed` and `sharing` take precedence.
+    One worker means this process itself. `place_jobs` and `share_executor` take precedence.
 
     Raises
     ------
     InputError
         For a scheduler or a batch system that cannot be used.
     """
-    shared, wanted = _shared.get(), _wanted.get() or Placement()
+    shared, wanted = _shared.get(), _placement.get() or Placement()
     if shared is not None:
-        return _Lent(shared, limits)
+        return _SharedExecutor(shared, limits)
     if wanted.scheduler is not None:
-        return DaskExecutor.at(wanted.scheduler, limits)
-    count = (workers if wanted.workers is None else wanted.workers) or usable_cores()
+        return DaskExecutor.connect(wanted.scheduler, limits)
+    count = (workers if wanted.workers is None else wanted.workers) or count_usable_cores()
     if wanted.dask is not None:
-        return DaskExecutor.queued(wanted.dask, count, limits)
+        return DaskExecutor.from_queue(wanted.dask, count, limits)
     return ProcessExecutor(count, limits=limits) if count > 1 else SerialExecutor()
 
 
-class _Lent:
-    """Another's executor with limits of one's own: leaving it does not end it."""
+class _SharedExecutor:
+    """Another's executor with limits of one's own; leaving its context does not end it."""
 
     def __init__(self, executor: Executor, limits: Limits) -> None:
         self._executor, self.limits = executor, limits
@@ -95,10 +96,10 @@ class _Lent:
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
         keys: Sequence[str] | None = None,
-        lost: Callable[[Job, str], Answer] | None = None,
-        told: Callable[[Job, Any], None] | None = None,
+        on_lost: Callable[[Job, str], Answer] | None = None,
+        on_report: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
-        return self._executor.map(function, jobs, keys, lost, told)
+        return self._executor.map(function, jobs, keys, on_lost, on_report)
 
     def threads_for(self, jobs: int) -> int:
         return self._executor.threads_for(jobs)
