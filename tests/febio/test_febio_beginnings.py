@@ -28,16 +28,16 @@ from limbfit.fe import (
 from limbfit.febio import (
     FebSettings,
     RunVerdict,
-    check_fitted,
+    build_result,
+    check_optimisable,
     read_feb,
     read_log,
-    result_of_log,
     run_feb,
     to_problem,
     write_feb,
     write_inp,
 )
-from limbfit.febio.beginning import Beginning
+from limbfit.febio.preparation import Preparation
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
 TENSED = Contractile(Fibred(MUSCLE, 0.012, 2.5), 0.01)
@@ -114,7 +114,7 @@ def test_it_pushes_as_hard_when_read_back(tmp_path, case):
     problem = block(bodies=(ball(),), **CASES[case])
     found, model = back(problem, tmp_path)
     found = replace(found, indenter=ball().shape)
-    assert model.settled_s == pytest.approx(Beginning.of(problem).settling_s)
+    assert model.settling_time_s == pytest.approx(Preparation.from_problem(problem).settling_s)
     np.testing.assert_array_equal(found.contact_faces, problem.bodies[0].faces)
     mine, theirs = pushes(problem), pushes(found)
     np.testing.assert_allclose(theirs, mine, atol=1e-6 * np.abs(mine).max())
@@ -174,8 +174,8 @@ def test_an_indenter_touches_where_limbfit_has_found_it(tmp_path, case):
     problem = block(indenter=PUNCH, **{"history": COURSE, **LATER[case]})
     control = LATE if problem.touch_down_s else replace(LATE, times=tuple(t - 2.0 for t in LATE.times[4:]))
     found, model = back(problem, tmp_path, control)
-    own, rest = Beginning.of(problem), 0.0 if problem.touch_down_s else 1.0
-    assert own.seconds == pytest.approx(model.settled_s + rest)
+    own, rest = Preparation.from_problem(problem), 0.0 if problem.touch_down_s else 1.0
+    assert own.seconds == pytest.approx(model.settling_time_s + rest)
     if found.indenter is not None:
         found = replace(found, indenter=replace(PUNCH, centre=found.indenter.centre))
     else:
@@ -199,12 +199,12 @@ def test_tables_and_results_tell_the_time_of_each(tmp_path):
     """FEBio's time in its own tables, that of the problem in its result, whose way is from touch-down."""
     problem = block(indenter=PUNCH, history=COURSE, **LATER["taut and clamped"])
     back(problem, tmp_path, LATE)
-    begun = Beginning.of(problem).seconds
+    begun = Preparation.from_problem(problem).seconds
     run = run_feb(tmp_path / "model.feb", tmp_path / "out", times=LATE.times, penalty=20.0, penetration=1.0)
     assert run.result.completed, run.result.reason
     log = read_log(tmp_path / "out" / "forces.txt")
     np.testing.assert_allclose(log.times[-9:], begun + np.array(LATE.times), rtol=1e-8)
-    found = result_of_log(problem, log, RunVerdict("normal", "", log.times[-1], "4.11"))
+    found = build_result(problem, log, RunVerdict("normal", "", log.times[-1], "4.11"))
     np.testing.assert_allclose(found.times[-9:], LATE.times, rtol=1e-6)
     assert found.displacement[-1] == pytest.approx(1.0)
     assert not found.force[found.times < HELD_S].any()
@@ -212,9 +212,7 @@ def test_tables_and_results_tell_the_time_of_each(tmp_path):
     np.testing.assert_allclose(found.force[-9:], along[-9:], atol=1e-8)
     assert found.peak_force > 0.5
     early = replace(log, times=log.times[:1], values=log.values[:1])
-    assert result_of_log(problem, early, RunVerdict("partial", "stopped", 0.1, "4.11")).times.tolist() == [
-        0.0
-    ]
+    assert build_result(problem, early, RunVerdict("partial", "stopped", 0.1, "4.11")).times.tolist() == [0.0]
 
 
 def test_what_limbfit_writes_says_what_it_does(tmp_path):
@@ -304,14 +302,14 @@ def test_what_febio_cannot_express_is_refused(tmp_path):
     with pytest.raises(ProblemError, match="its volume, which FEBio's pressure does not see; give one"):
         write_feb(squeezed, tmp_path / "model.feb", FebSettings())
     dragged = Motion.of([0.0, 1.0, 3.0], x=[0.0, 0.0, 1.0], force={"z": [0.0, 0.8, 0.5]})
-    with pytest.raises(ProblemError, match=r"between x, y and z.*in_indenter_frame"):
+    with pytest.raises(ProblemError, match=r"between x, y and z.*turn_to_indenter_frame"):
         write_feb(
             block(bodies=(ball((0.2, 0.0, -1.0), motion=dragged),)), tmp_path / "model.feb", FebSettings()
         )
     late = replace(punched_block("tet4", 4), history=COURSE, touch_down_s=HELD_S)
     for held in (late, block(prestretch=TAUT), block(bodies=(ball(),))):
         with pytest.raises(ProblemError, match="cannot follow where a clamped, tensed or pre-strained limb"):
-            check_fitted(held)
-    check_fitted(block(indenter=PUNCH))
+            check_optimisable(held)
+    check_optimisable(block(indenter=PUNCH))
     with pytest.raises(ProblemError, match="pre-stretch move first is not written for Abaqus"):
         write_inp(late, tmp_path / "m.inp", "abaqus", FebSettings())

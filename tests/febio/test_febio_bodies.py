@@ -25,7 +25,15 @@ from limbfit.fe import (
     Support,
     solve,
 )
-from limbfit.febio import FebSettings, in_indenter_frame, read_feb, read_log, run_feb, to_problem, write_feb
+from limbfit.febio import (
+    FebSettings,
+    read_feb,
+    read_log,
+    run_feb,
+    to_problem,
+    turn_to_indenter_frame,
+    write_feb,
+)
 
 STEPS = StepControl(times=(0.5, 1.0, 1.5, 2.0), stress="linear", penalty=20.0, penetration=1.0)
 TIMES, END = [0.0, 1.0, 2.0], History(np.array([0.0, 2.0]), np.zeros(2))
@@ -173,10 +181,10 @@ def test_a_force_between_the_axes_beside_a_move_is_refused_and_can_be_turned(tmp
     history = History(np.array([0.0, 2.0]), force=np.array([0.0, 1.0]), across=across)
     faces = problem.contact_faces
     problem = replace(problem, indenter=oblique, history=history)
-    with pytest.raises(ProblemError, match=r"between x, y and z.*in_indenter_frame"):
+    with pytest.raises(ProblemError, match=r"between x, y and z.*turn_to_indenter_frame"):
         write_feb(problem, tmp_path / "model.feb", FebSettings())
     ball = RigidBody(replace(oblique, centre=(5.0, 4.0, 1.0)), faces, history.motion, name="b")
-    turned = in_indenter_frame(replace(problem, bodies=(ball,)))
+    turned = turn_to_indenter_frame(replace(problem, bodies=(ball,)))
     points = problem.mesh.points[:50]
     before = [body.shape.signed_distance(points) for body in (problem.rigid_bodies[0], ball)]
     after = [body.shape.signed_distance(turned.mesh.points[:50]) for body in turned.rigid_bodies]

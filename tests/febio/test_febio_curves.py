@@ -8,7 +8,7 @@ from febfiles import FEB, written
 
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter
-from limbfit.febio import read_feb, step_control, to_problem
+from limbfit.febio import build_step_control, read_feb, to_problem
 
 POINTS = "<pt>0,0</pt><pt>1,2</pt><pt>2,3</pt><pt>4,1</pt>"
 
@@ -75,7 +75,7 @@ def test_a_displacement_may_follow_any_curve(tmp_path):
     sphere = Indenter("sphere", 8.0)
     model = read_feb(written(tmp_path, smooth))
     problem = to_problem(model, sphere)
-    times = np.array(step_control(model, problem, penalty=1.0).times)
+    times = np.array(build_step_control(model, problem, penalty=1.0).times)
     w = times / 2.0
     np.testing.assert_allclose(problem.history.at(times), 3.0 * w**3 * (10 - 15 * w + 6 * w**2))
     math = expression(tmp_path, "1.5*t^2 - sin(pi*t)/2 + 0*exp(-t)")

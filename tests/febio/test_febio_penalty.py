@@ -13,19 +13,19 @@ from limbfit.bench.blocks import punched_block
 from limbfit.fe import State, Step, StepControl, System, solve
 from limbfit.fe.kernel.elements import face_quadrature
 from limbfit.febio import (
-    FaceWise,
+    FacePenalties,
     FebSettings,
-    axial_force,
-    differences,
-    mean_penalty,
+    build_step_control,
+    compute_axial_force,
+    compute_mean_penalty,
+    describe_differences,
     read_feb,
     read_log,
     run_feb,
-    step_control,
     to_problem,
     write_feb,
 )
-from limbfit.febio.penalty import CURRENT_AREA, automatic_penalties, explicit_penalty
+from limbfit.febio.penalty import CURRENT_AREA, compute_automatic_penalties, compute_explicit_penalty
 from limbfit.febio.reading.model import Contact
 
 EXPORTS = Path(__file__).parents[3] / "shared" / "reference" / "exports"
@@ -63,8 +63,8 @@ def test_the_automatic_penalty_depends_on_the_normal(element, axis):
     normal = np.asarray(axis) / np.linalg.norm(axis)
     skin = problem.materials["skin"]
     mu, kappa = skin.instantaneous_modulus, skin.table().kappa
-    found = automatic_penalties(problem, problem.contact_faces, dt)
-    straight = automatic_penalties(turned(element, (0, 0, 1)), problem.contact_faces, dt)
+    found = compute_automatic_penalties(problem, problem.contact_faces, dt)
+    straight = compute_automatic_penalties(turned(element, (0, 0, 1)), problem.contact_faces, dt)
     expected = modulus_as_febio(normal, mu, kappa) / modulus_as_febio((0, 0, 1), mu, kappa)
     np.testing.assert_allclose(found, expected * straight, rtol=1e-6)
     if element == "hex8":  # a square of 30 mm on a layer of 3 mm: A/V is one over the thickness
@@ -75,12 +75,12 @@ def test_the_mean_is_over_what_the_indenter_covers():
     """Faces beyond it, of other normals or sizes, say nothing of how far it sinks in."""
     problem = punched_block("hex8", 12)
     contact = Contact("sliding-elastic", ("", ""), 3.0, True, False, 0)
-    mean = mean_penalty(contact, problem, 0.1)
+    mean = compute_mean_penalty(contact, problem, 0.1)
     points = problem.mesh.points.copy()
     outside = np.abs(points[:, 0]) > 18.0
     points[outside, 2] += 0.4 * (np.abs(points[outside, 0]) - 18.0)  # a slope beside the punch
     bent = replace(problem, mesh=problem.mesh.with_points(points))
-    assert mean_penalty(contact, bent, 0.1) == pytest.approx(mean, rel=1e-9)
+    assert compute_mean_penalty(contact, bent, 0.1) == pytest.approx(mean, rel=1e-9)
 
 
 @pytest.mark.parametrize(("rule", "grown"), [("sliding-elastic", 1.21), ("sliding-facet-on-facet", 1.0)])
@@ -93,17 +93,17 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     contact = Contact(rule, ("", ""), 3.0, True, False, 0)
     system = System(problem)
     times = np.array([1.0, 2.0, 3.0])
-    weights = FaceWise(system, (contact,), times)
-    own = automatic_penalties(problem, problem.contact_faces, 1.0) * 3.0
+    weights = FacePenalties(system, (contact,), times)
+    own = compute_automatic_penalties(problem, problem.contact_faces, 1.0) * 3.0
     modulus = np.mean([m.instantaneous_modulus for m in problem.materials.values()])
     rest = face_quadrature(problem.formulation, points, problem.contact_faces, "gauss")[1]
-    uniform = mean_penalty(contact, problem, 1.0) * modulus
+    uniform = compute_mean_penalty(contact, problem, 1.0) * modulus
     np.testing.assert_allclose(uniform * system.surface.areas, own[:, None] * rest, rtol=1e-12)
     for t, stretch in ((1.0, 1.0), (2.0, np.sqrt(1.105))):  # 1.21 is as far from 1.105 as that from 1
         u = np.column_stack([(stretch - 1.0) * points[:, :2], np.zeros(len(points))])
         state, nothing = State(t, float(problem.history.at(t)), u, 1.0, None), np.zeros((1, 6))
         place = np.array([[0.0, 0.0, state.displacement, 0.0, 0.0, 0.0]])
-        weights.after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, nothing, place, None, state))
+        weights.update_after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, nothing, place, None, state))
     np.testing.assert_allclose(uniform * system.surface.areas, grown * own[:, None] * rest, rtol=1e-9)
 
 
@@ -116,11 +116,11 @@ def test_an_explicit_penalty_goes_out_and_comes_back(tmp_path):
     for tag in ("<auto_penalty>0<", "<max_ups>0<", "<max_refs>60<"):
         assert tag in text
     model = read_feb(tmp_path / "model.feb")
-    found = step_control(model, to_problem(model))
+    found = build_step_control(model, to_problem(model))
     assert found.penalty == pytest.approx(300.0)
     modulus = np.mean([m.instantaneous_modulus for m in problem.materials.values()])
-    assert explicit_penalty(problem, steps) == pytest.approx(300.0 * modulus / CURRENT_AREA)
-    assert explicit_penalty(problem, StepControl()) == pytest.approx(100.0 * modulus / CURRENT_AREA)
+    assert compute_explicit_penalty(problem, steps) == pytest.approx(300.0 * modulus / CURRENT_AREA)
+    assert compute_explicit_penalty(problem, StepControl()) == pytest.approx(100.0 * modulus / CURRENT_AREA)
     write_feb(problem, tmp_path / "model.feb", FebSettings(penalty=3.0))
     assert "<penalty>3.0</penalty>\n<auto_penalty>1<" in (tmp_path / "model.feb").read_text()
 
@@ -130,12 +130,12 @@ def test_what_differs_is_said_in_the_file(tmp_path):
     for settings, words in ((FebSettings(), "as stiff as limbfit's; FEBio's"), (FebSettings(3.0), "smaller")):
         write_feb(problem, tmp_path / "model.feb", settings)
         text = (tmp_path / "model.feb").read_text()
-        lines = differences(problem, settings)
+        lines = describe_differences(problem, settings)
         assert words in lines[0]
         assert all(f"<!-- {line} -->" in text for line in lines)
     assert not any("edge" in line for line in lines)
     sharp = replace(problem, indenter=replace(problem.indenter, edge_radius=0.0))
-    assert any("may stop before the end" in line for line in differences(sharp, FebSettings()))
+    assert any("may stop before the end" in line for line in describe_differences(sharp, FebSettings()))
 
 
 def test_a_written_model_is_as_stiff_as_its_own(tmp_path):
@@ -160,5 +160,5 @@ def test_exports_as_febio_ran_them(tmp_path, name):
     result = run_feb(file, tmp_path / "out").result
     assert result.completed
     log = read_log(EXPORTS / f"{name}-forces.txt")
-    febio = axial_force(result.problem, log)
+    febio = compute_axial_force(result.problem, log)
     assert np.abs(result.force_at(log.times) - febio).max() < 0.015 * febio.max()

@@ -20,8 +20,8 @@ import pytest
 from limbfit.bench.blocks import punched_block
 from limbfit.errors import InputError, ProblemError, RunError
 from limbfit.fe import History
-from limbfit.febio import RunVerdict, find_febio, judge, read_log, result_of_log, run_febio
-from limbfit.febio.verdict import ERROR, NORMAL
+from limbfit.febio import RunVerdict, build_result, find_febio, judge_run, read_log, run_febio
+from limbfit.febio.program import ERROR_TERMINATION, NORMAL_TERMINATION
 
 LOGS = Path(__file__).parents[3] / "shared" / "reference" / "febio-logs"
 END = 12.708333333333334
@@ -37,7 +37,11 @@ VERDICTS = {
     ),
     "killed": ("killed", "killed by signal 9, most often for lack of memory, at 4.13 s of 12.71 s"),
 }
-WELL = "  version 4.11.0\n------- converged at time : 1\n------- converged at time : 2\n " + NORMAL + "\n"
+WELL = (
+    "  version 4.11.0\n------- converged at time : 1\n------- converged at time : 2\n "
+    + NORMAL_TERMINATION
+    + "\n"
+)
 
 
 def words(name: str) -> str:
@@ -48,7 +52,7 @@ def words(name: str) -> str:
 @pytest.mark.parametrize("name", VERDICTS)
 def test_recorded_runs(name):
     kind, fragment = VERDICTS[name]
-    verdict = judge(words(name), int((LOGS / name / "exit-code.txt").read_text()), END)
+    verdict = judge_run(words(name), int((LOGS / name / "exit-code.txt").read_text()), END)
     assert verdict.kind == kind
     assert fragment in verdict.reason
     assert "\n" not in verdict.reason
@@ -58,7 +62,7 @@ def test_recorded_runs(name):
 
 @recorded
 def test_an_error_is_one_whatever_the_exit_code():
-    verdict = judge(words("stops-early"), 0, END)
+    verdict = judge_run(words("stops-early"), 0, END)
     assert verdict.kind == "error"
     assert "though it left with exit code 0" in verdict.reason
 
@@ -68,17 +72,17 @@ def test_an_error_is_one_whatever_the_exit_code():
     [
         (WELL, 0, "normal", ""),
         (WELL.replace("time : 2", "time : 1.5"), 0, "partial", "stopped early, at 1.5 s of 2 s"),
-        (WELL.replace(NORMAL, ""), 0, "crashed", "without a verdict"),
-        (WELL.replace(NORMAL, ERROR), 0, "error", "though it left with exit code 0"),
-        (WELL.replace(NORMAL, ""), -11, "killed", "signal 11"),
-        (WELL.replace(NORMAL, ""), 139, "killed", "signal 11"),
+        (WELL.replace(NORMAL_TERMINATION, ""), 0, "crashed", "without a verdict"),
+        (WELL.replace(NORMAL_TERMINATION, ERROR_TERMINATION), 0, "error", "though it left with exit code 0"),
+        (WELL.replace(NORMAL_TERMINATION, ""), -11, "killed", "signal 11"),
+        (WELL.replace(NORMAL_TERMINATION, ""), 139, "killed", "signal 11"),
         (WELL, 3, "crashed", "exit code 3"),
         ("", 0, "no output", "wrote nothing"),
         ("", 127, "crashed", "exit code 127"),
     ],
 )
 def test_other_ends(said, code, kind, fragment):
-    verdict = judge(said, code, 2.0)
+    verdict = judge_run(said, code, 2.0)
     assert verdict.kind == kind
     assert fragment in verdict.reason
 
@@ -87,13 +91,13 @@ def test_other_ends(said, code, kind, fragment):
 def test_six_digits_of_the_end_are_the_end(tmp_path, end):
     """FEBio prints the time with six digits: a run that reached its end says a little less, or more."""
     said = WELL.replace("time : 2", f"time : {end:.6g}")
-    assert judge(said, 0, end).kind == "normal"
-    assert judge(WELL.replace("time : 2", f"time : {0.9999 * end:.6g}"), 0, end).kind == "partial"
+    assert judge_run(said, 0, end).kind == "normal"
+    assert judge_run(WELL.replace("time : 2", f"time : {0.9999 * end:.6g}"), 0, end).kind == "partial"
     (tmp_path / "forces.txt").write_text(f"*Step  = 1\n*Time  = {end:.6g}\n*Data  = Fz\n3,-1.5\n")
     history = History(np.array([0.0, end / 2, end]), np.array([0.0, 6.1, 0.0]))
     problem = replace(punched_block("hex8", 2), history=history)
     log = read_log(tmp_path / "forces.txt")
-    assert result_of_log(problem, log, judge(said, 0, end)).completed
+    assert build_result(problem, log, judge_run(said, 0, end)).completed
 
 
 def program(folder: Path, body: str) -> Path:
@@ -122,7 +126,7 @@ def test_a_failed_run_is_a_result_with_its_reason(tmp_path, name):
     problem = punched_block("hex8", 2)
     history = History(np.array([0.0, END / 2, END]), np.array([0.0, 6.1, 0.0]))
     problem = replace(problem, history=history)
-    found = result_of_log(problem, run.log, run.verdict, run.seconds)
+    found = build_result(problem, run.log, run.verdict, run.seconds)
     assert not found.completed
     assert found.reason == run.verdict.reason
     assert found.statistics["linear_solver"].startswith("FEBio 4.11.0")
@@ -141,7 +145,7 @@ def test_a_good_run(tmp_path):
         tmp_path, 2.0, "forces.txt",
     )  # fmt: skip
     assert run.verdict == RunVerdict("normal", "", 2.0, "4.11.0")
-    found = result_of_log(punched_block("hex8", 2), run.log, run.verdict)
+    found = build_result(punched_block("hex8", 2), run.log, run.verdict)
     assert found.completed
     assert found.force.tolist() == [0.0, 1.5]  # along the axis, which is -z; rest is put before it
 
@@ -178,7 +182,7 @@ def test_the_time_limit_ends_it_and_its_children(tmp_path):
 
 
 def test_of_very_many_words_the_last_count(tmp_path):
-    body = f"sys.stdout.write('  version 4.11.0\\n' + 'x' * 7 * 10**7 + {NORMAL!r})"
+    body = f"sys.stdout.write('  version 4.11.0\\n' + 'x' * 7 * 10**7 + {NORMAL_TERMINATION!r})"
     run = run_febio(program(tmp_path, body), tmp_path, 0.0, "forces.txt")
     assert run.verdict.version == "4.11.0"
     assert run.verdict.kind == "no output"  # ended well, without a table
@@ -221,7 +225,7 @@ def test_a_table_of_something_else(tmp_path):
     good = RunVerdict("normal", "", 2.0, "")
     file.write_text("*Step  = 1\n*Time  = 2\n*Data  = Fx;Fy\n3,0,0\n")
     with pytest.raises(ProblemError, match="has no Fz"):
-        result_of_log(punched_block("hex8", 2), read_log(file), good)
+        build_result(punched_block("hex8", 2), read_log(file), good)
     file.write_text("*Step  = 1\n*Time  = 200\n*Data  = Fz\n3,0\n")
     with pytest.raises(ProblemError, match="goes on to 200 s"):
-        result_of_log(punched_block("hex8", 2), read_log(file), good)
+        build_result(punched_block("hex8", 2), read_log(file), good)

@@ -11,7 +11,7 @@ from febfiles import FEB, written
 from limbfit.bench.blocks import punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter, RigidSurface
-from limbfit.febio import FebSettings, read_feb, read_log, step_control, to_problem, write_feb
+from limbfit.febio import FebSettings, build_step_control, read_feb, read_log, to_problem, write_feb
 
 BOX = np.array([[x, y, z] for z in (-2.0, 0.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
 BOX_FACES = np.array(
@@ -176,7 +176,7 @@ def test_must_points_and_the_growing_step(tmp_path):
         "<time_steps>4</time_steps><step_size>0.5", "<time_steps>20</time_steps><step_size>0.1"
     )
     model = read_feb(written(tmp_path, text.replace("</LoadData>", curve)))
-    times = step_control(model, to_problem(model, Indenter("sphere", 8.0)), penalty=1.0).times
+    times = build_step_control(model, to_problem(model, Indenter("sphere", 8.0)), penalty=1.0).times
     # a fifth of the way from 0.1 to 0.3 s each time: 0.1, 0.14, 0.172, ..; 0.5 s is met
     np.testing.assert_allclose(times[:4], [0.1, 0.24, 0.412, 0.5])
     assert times[-1] == pytest.approx(2.0)

@@ -14,7 +14,7 @@ from febfiles import written
 from limbfit import simulate_feb
 from limbfit.errors import InputError
 from limbfit.fe import Indenter
-from limbfit.febio import FebSettings, axial_force, read_feb, read_log, run_feb, to_problem, write_feb
+from limbfit.febio import FebSettings, compute_axial_force, read_feb, read_log, run_feb, to_problem, write_feb
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 recorded = pytest.mark.skipif(
@@ -72,7 +72,7 @@ def test_written_anew(tmp_path):
     write_feb(problem, tmp_path / "anew.feb", FebSettings(penalty=3.0))
     result = run_feb(tmp_path / "anew.feb", tmp_path / "out").result
     log = read_log(f"{case}.txt")
-    force = axial_force(problem, log)
+    force = compute_axial_force(problem, log)
     assert result.completed
     assert np.abs(np.interp(log.times, result.times, result.force) - force).max() < 0.015 * force.max()
 

@@ -14,7 +14,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import History
 from limbfit.febio import FebSettings, read_feb, run_feb, write_feb
 from limbfit.febio.reading.geometry import Part
-from limbfit.febio.reading.rigid import centre_of_mass
+from limbfit.febio.reading.rigid import compute_centre_of_mass
 
 TABLES = """<Output><logfile>
 <node_data data="z;uz" file="nodes.txt" delim=","></node_data>
@@ -108,7 +108,7 @@ def part(kind, cells, thickness=0.0):
 )
 def test_the_mass_of_a_straight_cell_lies_in_its_middle(kind, cell):
     points = UNIT @ SKEWED
-    found = centre_of_mass(points, [part(kind, [cell], 0.5)])
+    found = compute_centre_of_mass(points, [part(kind, [cell], 0.5)])
     np.testing.assert_allclose(found, points[cell].mean(axis=0), atol=1e-12)
 
 
@@ -116,7 +116,7 @@ def test_masses_add_up():
     points = np.vstack([UNIT, [[3.0, 0, 0], [4.0, 0, 0], [3.0, 1, 0]]]).astype(float)
     both = [part("hex8", [[0, 1, 2, 3, 4, 5, 6, 7]]), part("tri3", [[8, 9, 10]], 2.0)]
     # one cubic millimetre around 0.5, another (0.5 mm^2 of 2 mm) around 10/3
-    np.testing.assert_allclose(centre_of_mass(points, both)[0], 0.5 * (0.5 + 10.0 / 3.0))
+    np.testing.assert_allclose(compute_centre_of_mass(points, both)[0], 0.5 * (0.5 + 10.0 / 3.0))
 
 
 def test_a_rigid_body_without_a_centre_reports_where_its_mass_is(tmp_path):

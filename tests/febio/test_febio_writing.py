@@ -15,17 +15,17 @@ from limbfit.fe import History, Indenter, Ogden, OgdenQLV, RigidSurface, StepCon
 from limbfit.fe.solution.control import schedule
 from limbfit.febio import (
     FebSettings,
-    Range,
+    ParameterRange,
     RunVerdict,
+    build_result,
+    build_step_control,
     find_febio,
-    in_indenter_frame,
     read_feb,
     read_log,
-    result_of_log,
     run_feb,
     run_febio,
-    step_control,
     to_problem,
+    turn_to_indenter_frame,
     write_feb,
     write_inp,
     write_optimisation,
@@ -91,7 +91,7 @@ def test_it_is_read_back_as_it_was(tmp_path, element):
         np.testing.assert_array_equal(back.terms, mine.terms)
         np.testing.assert_array_equal(back.prony, mine.prony)
         assert back.kappa == pytest.approx(mine.kappa, rel=1e-14)
-    times = step_control(model, found).times
+    times = build_step_control(model, found).times
     assert set(np.round(schedule(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
 
 
@@ -246,7 +246,7 @@ def test_it_pushes_as_hard(tmp_path, shape):
     limit = 0.01 * direct.peak_force
     np.testing.assert_allclose(run.result.force, direct.force, atol=limit)
     log = read_log(run.files[0])
-    found = result_of_log(problem, log, RunVerdict("normal", "", 3.0, ""))
+    found = build_result(problem, log, RunVerdict("normal", "", 3.0, ""))
     np.testing.assert_allclose(found.force, run.result.force, atol=1e-3 * limit)
 
 
@@ -266,7 +266,7 @@ def test_what_febio_has_not_is_refused(tmp_path):
 def test_in_the_frame_of_the_indenter(tmp_path):
     problem = block("tet4", "sharp", divisions=6)
     steps = StepControl(load_steps=3, unload_steps=2)
-    turned = in_indenter_frame(problem)
+    turned = turn_to_indenter_frame(problem)
     np.testing.assert_allclose(turned.indenter.frame, np.eye(3), atol=1e-14)
     forces = [solve(p, steps, store="none").force for p in (problem, turned)]
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-3, atol=1e-4)
@@ -278,7 +278,7 @@ def test_optimisation(tmp_path, relaxation):
     start = {"c": 0.004, "m": 6.0} | {name: 2.0 / i for i, name in enumerate(relaxation, 1)}
     each = 5 + len(relaxation)
     lower, upper = ({k: f * v for k, v in start.items()} for f in (0.1, 3.0))
-    tissues = {name: Range(start, lower, upper, 100.0) for name in ("skin", "fat", "muscle")}
+    tissues = {name: ParameterRange(start, lower, upper, 100.0) for name in ("skin", "fat", "muscle")}
     times, force = np.linspace(0.0, 10.0, 21), np.linspace(-0.01, 3.0, 21)
     write_optimisation(tmp_path / "o.feb", tissues, times, force)
     root = ET.parse(tmp_path / "o.feb").getroot()
@@ -340,6 +340,6 @@ def test_febio_itself_runs_it(tmp_path, shape):
     end = float(problem.history.times[-1])
     run = run_febio(find_febio(), tmp_path, end, "forces.txt", time_limit_s=600.0)
     assert run.verdict.completed, run.verdict.reason
-    found = result_of_log(problem, run.log, run.verdict)
+    found = build_result(problem, run.log, run.verdict)
     mine = run_feb(tmp_path / "model.feb", tmp_path / "out").result
     np.testing.assert_allclose(mine.force_at(found.times), found.force, atol=0.02 * found.peak_force)

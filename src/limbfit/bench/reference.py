@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..fe import Indenter, Problem, StepControl
-from ..febio import Log, read_feb, read_log, to_problem
+from ..febio import FebioLog, read_feb, read_log, to_problem
 
 Array = NDArray[np.float64]
 Tell = Callable[[int, int, str], None]  # done, of how many, what
@@ -92,7 +92,7 @@ def find_reference(start: Path) -> Path:
     )
 
 
-def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, Log]:
+def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, FebioLog]:
     """The problem on FEBio's mesh, FEBio's own time steps, and FEBio's results.
 
     Raises
@@ -106,7 +106,7 @@ def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, 
     return problem, StepControl(times=tuple(log.times[1:]), stress="linear", **case.control), log
 
 
-def pushing_force(problem: Problem, log: Log) -> Array:
+def pushing_force(problem: Problem, log: FebioLog) -> Array:
     """Force (n,) of the model on the tissue along the indenter's axis, N, from FEBio's reactions."""
     assert problem.indenter is not None
     axis = problem.indenter.frame[2]

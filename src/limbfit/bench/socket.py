@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..febio import Log, read_log, run_feb
+from ..febio import FebioLog, read_log, run_feb
 
 Array = NDArray[np.float64]
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
@@ -103,7 +103,7 @@ def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
             yield row | _compared(part, found, febio, "" if run.result.completed else run.result.reason)
 
 
-def _compared(part: CasePart, found: Log, febio: Log, reason: str) -> dict[str, Any]:
+def _compared(part: CasePart, found: FebioLog, febio: FebioLog, reason: str) -> dict[str, Any]:
     forces = part.columns[0] in FORCES
     columns, whole = (
         [febio.names.index(name) for name in names if name in febio.names]

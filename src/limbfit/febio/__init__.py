@@ -1,43 +1,52 @@
-"""FEBio beside limbfit: its inputs as problems, problems as its inputs, its runs and logs as results."""
+"""FEBio beside limbfit: its inputs read as problems, problems written as its inputs, its runs and logs."""
 
 from .abaqus import write_inp
-from .beginning import end_of_file
-from .logs import Log, read_log
-from .optimising import Range, check_fitted, in_indenter_frame, write_optimisation
-from .penalty import FaceWise, mean_penalty
-from .problem import step_control, to_problem
-from .program import FebioRun, axial_force, find_febio, result_of_log, run_febio
+from .optimisation import ParameterRange, check_optimisable, turn_to_indenter_frame, write_optimisation
+from .penalty import FacePenalties, compute_mean_penalty
+from .preparation import compute_end_time
+from .problem import build_step_control, to_problem
+from .program import (
+    TIME_TOLERANCE,
+    FebioLog,
+    FebioRun,
+    RunVerdict,
+    build_result,
+    compute_axial_force,
+    find_febio,
+    judge_run,
+    read_log,
+    run_febio,
+)
 from .reading.model import FebModel, read_feb
 from .running import FebRun, run_feb
-from .verdict import SLACK, RunVerdict, judge
-from .writing import FebSettings, contact_of, differences, write_feb
+from .writing import FebSettings, build_contact, describe_differences, write_feb
 
 __all__ = [
-    "SLACK",
-    "FaceWise",
+    "TIME_TOLERANCE",
+    "FacePenalties",
     "FebModel",
     "FebRun",
     "FebSettings",
+    "FebioLog",
     "FebioRun",
-    "Log",
-    "Range",
+    "ParameterRange",
     "RunVerdict",
-    "axial_force",
-    "check_fitted",
-    "contact_of",
-    "differences",
-    "end_of_file",
+    "build_contact",
+    "build_result",
+    "build_step_control",
+    "check_optimisable",
+    "compute_axial_force",
+    "compute_end_time",
+    "compute_mean_penalty",
+    "describe_differences",
     "find_febio",
-    "in_indenter_frame",
-    "judge",
-    "mean_penalty",
+    "judge_run",
     "read_feb",
     "read_log",
-    "result_of_log",
     "run_feb",
     "run_febio",
-    "step_control",
     "to_problem",
+    "turn_to_indenter_frame",
     "write_feb",
     "write_inp",
     "write_optimisation",

@@ -1,43 +1,159 @@
-"""Mesh, named sets and domains of a FEBio input."""
+"""The mesh of a FEBio input: tissue, rigid bodies, named sets and domains.
+
+An indenter becomes the rigid mesh that FEBio and Abaqus need: its front in quadrilaterals, extended
+backwards. The side walls are left out below the steepest part of the rounded edge: faces beside the skin keep
+FEBio's contact from converging, and the skin under a punch does not reach them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..fe import Problem
-from .faceting import Body, ToolMesh
-from .moving import HELD, row
+from ..arrays import Array, Indices
+from ..errors import ProblemError
+from ..fe import Indenter, Motion, OpenSurface, Problem, SmoothSurface, System
+from ..fe.contact.rigid import RigidShape
+from .conditions import FIXED_SET, find_rail, format_row, to_rail_motion, to_space
 
+INDENTER, PATCH, FRONT = "indenter", "contact_patch", "indenter_front"
+MIN_EDGE_ROUNDING = 0.05  # edge radius over the width that FEBio's contact goes round without retries
 # FEBio's names of limbfit's elements; hex8 with an uncoupled material is three-field by itself.
 QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10p0": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
 _FACE = {3: "tri3", 4: "quad4", 6: "tri6"}
 
 
-def mesh_lines(problem: Problem, bodies: list[Body], meshes: dict[str, ToolMesh]) -> Iterator[str]:
-    """The mesh of the tissue and those of rigid bodies by name, with all sets, surfaces and pairs."""
+@dataclass(frozen=True)
+class RigidMesh:
+    """A rigid mesh: ``points (n, 3)`` mm, ``cells`` of ``cell_type`` (hex8, or tri3 shells).
+
+    ``front`` holds the faces (f, 4 | 3) that touch, outward.
+    """
+
+    points: Array
+    cells: Indices
+    cell_type: str
+    front: Indices
+
+
+def has_round_edges(indenter: Indenter) -> bool:
+    """True if the rigid mesh is round enough for FEBio's contact; the edges of a surface are sharp."""
+    return indenter.body.facets().rounding >= MIN_EDGE_ROUNDING * indenter.width
+
+
+def build_indenter_mesh(indenter: Indenter) -> RigidMesh:
+    """Build the rigid mesh of an indenter where it stands.
+
+    Shapes have the rounding that limbfit itself computes with; a surface (``stl``) is written as it is, with
+    sharp edges.
+    """
+    facets = indenter.body.facets()
+    if facets.closed is not None:
+        return RigidMesh(_to_space(indenter, facets.points), facets.closed, "tri3", facets.front)
+    count, back = len(facets.points), facets.points - [0.0, 0.0, 0.5 * indenter.width]
+    cells = np.hstack([facets.front + count, facets.front])
+    return RigidMesh(_to_space(indenter, np.vstack([facets.points, back])), cells, "hex8", facets.front)
+
+
+def _to_space(indenter: Indenter, local: Array) -> Array:
+    return np.asarray(np.asarray(indenter.centre) + local @ indenter.frame)
+
+
+@dataclass(frozen=True)
+class FebBody:
+    """A rigid body as it is written.
+
+    It has a mesh, the place (3,) of its centre of mass, its motion along and about the axes of space, the
+    faces (f, k) of tissue that it may touch, and the names of all that. ``rail (3,)`` is the direction along
+    which it is guided if forces in space alone would not keep it on its line.
+    """
+
+    name: str
+    patch: str
+    front: str
+    pair: str
+    tool: RigidMesh
+    centre: Array
+    motion: Motion
+    faces: Indices
+    friction: str | float
+    width: float
+    rail: Array | None
+
+
+def build_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[FebBody]:
+    """Build the rigid bodies of a problem where they start, with other ``motions`` than its own if given.
+
+    Raises
+    ------
+    ProblemError
+        For a motion that FEBio cannot be given, and for two bodies of one name.
+    """
+    system = System(problem)
+    bodies: list[FebBody] = []
+    for i, body in enumerate([] if system.bodies is None else system.bodies.all):
+        body_in_problem, first = body.stated, i == 0 and problem.indenter is not None
+        driven = motions[i] if motions else body_in_problem.motion
+        name = INDENTER if first else re.sub(r"[^\w-]+", "_", body_in_problem.name) or f"body_{i + 1}"
+        if name in {other.name for other in bodies}:
+            raise ProblemError(f"two rigid bodies have the name {name!r}", remedy="give each its own")
+        patch, front, pair = (PATCH, FRONT, "indentation") if first else (
+            f"{name}_patch", f"{name}_front", f"{name}_contact"
+        )  # fmt: skip
+        rail = find_rail(driven, body.start.frame)
+        motion = to_space(name, driven, body.start.frame) if rail is None else to_rail_motion(driven, rail)
+        faces = np.asarray(body_in_problem.faces, dtype=np.int64)
+        tool = _mesh_shape(body.start)
+        names = name, patch, front, pair
+        width = body.start.width
+        bodies.append(FebBody(*names, tool, body.pivot, motion, faces, body_in_problem.friction, width, rail))
+    return bodies
+
+
+def build_frame_mesh(bodies: Sequence[FebBody]) -> RigidMesh:
+    """Build a cube of 1 mm beside the bodies, which stands for what their rails are fixed to."""
+    corner = np.vstack([body.tool.points for body in bodies]).min(axis=0) - 10.0
+    cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    points = corner + cube
+    return RigidMesh(points, np.arange(8)[None], "hex8", np.zeros((0, 4), np.int64))
+
+
+def _mesh_shape(shape: RigidShape) -> RigidMesh:
+    if isinstance(shape, Indenter):
+        return build_indenter_mesh(shape)
+    if not isinstance(shape, OpenSurface | SmoothSurface):
+        raise ProblemError(f"a rigid body that is a {type(shape).__name__} is not written for FEBio")
+    used, faces = np.unique(shape.faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    points = shape.points[used] @ shape.frame + np.asarray(shape.centre, dtype=float)
+    return RigidMesh(points, faces, "tri3", faces)
+
+
+def format_mesh(problem: Problem, bodies: list[FebBody], meshes: dict[str, RigidMesh]) -> Iterator[str]:
+    """Write the mesh of the tissue and those of rigid bodies by name, with all sets, surfaces and pairs."""
     mesh = problem.mesh
     firsts = np.cumsum([len(mesh.points), *(len(rigid.points) for rigid in meshes.values())])
     yield '<Mesh><Nodes name="all">'
     for i, point in enumerate(np.vstack([mesh.points, *(rigid.points for rigid in meshes.values())]), 1):
-        yield f'<node id="{i}">{row(point)}</node>'
+        yield f'<node id="{i}">{format_row(point)}</node>'
     yield "</Nodes>"
     number = 1
     for r, name in enumerate(mesh.region_names):
         cells = mesh.cells[mesh.regions == r]
-        yield from _elements(name, mesh.cell_type, cells, number)
+        yield from _format_elements(name, mesh.cell_type, cells, number)
         number += len(cells)
     for (name, rigid), first in zip(meshes.items(), firsts):
-        yield from _elements(name, rigid.cell_type, rigid.cells + first, number)
+        yield from _format_elements(name, rigid.cell_type, rigid.cells + first, number)
         number += len(rigid.cells)
-    sets = {HELD: problem.fixed, **mesh.node_sets}
+    sets = {FIXED_SET: problem.fixed, **mesh.node_sets}
     sets |= {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
     for name, nodes in sets.items():
         if len(nodes):
-            yield f"<NodeSet name={quoteattr(name)}>{_ids(nodes)}</NodeSet>"
+            yield f"<NodeSet name={quoteattr(name)}>{_format_ids(nodes)}</NodeSet>"
     named = {  # FEBio makes an element set of every part
         f"{name}_surface" if name in mesh.region_names else name: faces
         for name, faces in mesh.face_sets.items()
@@ -46,30 +162,30 @@ def mesh_lines(problem: Problem, bodies: list[Body], meshes: dict[str, ToolMesh]
     surfaces |= {body.front: body.tool.front + first for body, first in zip(bodies, firsts)}
     surfaces |= {f"pressed_{i}": np.asarray(one.faces) for i, one in enumerate(problem.pressures, 1)}
     for name, faces in {**surfaces, **named}.items():
-        yield from _surface(name, faces)
+        yield from _format_surface(name, faces)
     for body in bodies:
         yield f"<SurfacePair name={quoteattr(body.pair)}><primary>{body.patch}</primary>"
         yield f"<secondary>{body.front}</secondary></SurfacePair>"
     yield "</Mesh>"
 
 
-def _elements(name: str, cell_type: str, cells: NDArray[np.int64], first: int) -> Iterator[str]:
+def _format_elements(name: str, cell_type: str, cells: Indices, first: int) -> Iterator[str]:
     yield f"<Elements type={quoteattr(cell_type)} name={quoteattr(name)}>"
     for i, cell in enumerate(cells, first):
-        yield f'<elem id="{i}">{_ids(cell)}</elem>'
+        yield f'<elem id="{i}">{_format_ids(cell)}</elem>'
     yield "</Elements>"
 
 
-def _surface(name: str, faces: NDArray[np.int64]) -> Iterator[str]:
+def _format_surface(name: str, faces: Indices) -> Iterator[str]:
     kind = _FACE[faces.shape[1]]
     yield f"<Surface name={quoteattr(name)}>"
     for i, face in enumerate(faces, 1):
-        yield f'<{kind} id="{i}">{_ids(face)}</{kind}>'
+        yield f'<{kind} id="{i}">{_format_ids(face)}</{kind}>'
     yield "</Surface>"
 
 
-def domain_lines(problem: Problem, meshes: dict[str, ToolMesh]) -> Iterator[str]:
-    """How the parts are discretised."""
+def format_domains(problem: Problem, meshes: dict[str, RigidMesh]) -> Iterator[str]:
+    """Write how the parts are discretised."""
     rule = QUADRATURE[problem.formulation.name]
     given = f' elem_type="{rule}"' if rule else ""
     if problem.formulation.name == "tet10p0":  # one volume ratio and pressure per element
@@ -86,5 +202,5 @@ def domain_lines(problem: Problem, meshes: dict[str, ToolMesh]) -> Iterator[str]
     yield "</MeshDomains>"
 
 
-def _ids(nodes: Iterable[int]) -> str:
+def _format_ids(nodes: Iterable[int]) -> str:
     return ",".join(str(int(node) + 1) for node in nodes)

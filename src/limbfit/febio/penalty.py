@@ -1,8 +1,8 @@
-"""Contact stiffness in FEBio's terms and in limbfit's, each as the other.
+"""The contact stiffness of FEBio and of limbfit, each converted to the other.
 
 limbfit's is one number, 1/mm, times the mean instantaneous shear modulus, over the skin at rest
-(`StepControl.penalty`).  FEBio's is a pressure over a gap, MPa/mm: one number (``auto_penalty`` 0), or one
-of each face (``auto_penalty`` 1).
+(`StepControl.penalty`). FEBio's is a pressure over a gap, MPa/mm: one number (``auto_penalty`` 0), or one for
+each face (``auto_penalty`` 1).
 
 Source: FEBio, ``FEContactInterface::AutoPenalty``.
 """
@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import ELEMENTS, Material, Problem, Step, StepControl, System
 from ..fe.contact.contact import ContactSurface, touching_offset
@@ -24,49 +24,46 @@ from ..fe.materials import prony_factors
 from ..mesh import Mesh
 from .reading.model import Contact
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
 # FEBio's penalty acts over the current area of the skin, limbfit's over that at rest: what touches a punch
 # has stretched by that much at the peak of the four reference cases with contact (docs/contact.md).
 CURRENT_AREA = 1.21
 
 
-def explicit_penalty(problem: Problem, steps: StepControl) -> float:
-    """The explicit penalty of ``sliding-elastic`` that is as stiff as limbfit's contact, MPa/mm."""
+def compute_explicit_penalty(problem: Problem, steps: StepControl) -> float:
+    """Return the explicit penalty of ``sliding-elastic`` that is as stiff as limbfit's contact, MPa/mm."""
     width = 1.0 if problem.indenter is None else problem.indenter.width
-    own = 2000.0 / width if steps.penalty is None else steps.penalty
-    return own * _mean_modulus(problem) / CURRENT_AREA
+    penalty = 2000.0 / width if steps.penalty is None else steps.penalty
+    return penalty * _compute_mean_modulus(problem) / CURRENT_AREA
 
 
-def mean_penalty(contact: Contact, problem: Problem, dt: float) -> float:
-    """FEBio's penalty of ``contact`` as `StepControl.penalty`, 1/mm (see `mean_stiffness`).
+def compute_mean_penalty(contact: Contact, problem: Problem, dt: float) -> float:
+    """Return FEBio's penalty of ``contact`` as `StepControl.penalty`, 1/mm (see `compute_mean_stiffness`).
 
     ``sliding-elastic`` acts over the current area, ``sliding-facet-on-facet`` over that at rest.
     """
     area = CURRENT_AREA if contact.rule == "sliding-elastic" else 1.0
-    return area * mean_stiffness(contact, problem, dt) / _mean_modulus(problem)
+    return area * compute_mean_stiffness(contact, problem, dt) / _compute_mean_modulus(problem)
 
 
-def mean_stiffness(contact: Contact, problem: Problem, dt: float) -> float:
-    """FEBio's penalty of ``contact``, MPa/mm.
+def compute_mean_stiffness(contact: Contact, problem: Problem, dt: float) -> float:
+    """Return FEBio's penalty of ``contact``, MPa/mm.
 
     An automatic one is the mean over the faces that the indenter would pass through at its deepest, after a
     first step of ``dt`` s.
     """
     if not contact.automatic:
         return contact.penalty
-    faces = _covered(problem)
-    area = _areas(problem, faces).sum(axis=1)
-    return contact.penalty * float(np.average(automatic_penalties(problem, faces, dt), weights=area))
+    faces = _find_covered_faces(problem)
+    area = _compute_areas(problem, faces).sum(axis=1)
+    return contact.penalty * float(np.average(compute_automatic_penalties(problem, faces, dt), weights=area))
 
 
-class FaceWise:
-    """FEBio's contact on a limbfit system: the penalty of every face, over the area that it has by now.
+class FacePenalties:
+    """FEBio's contact on a limbfit system: the penalty of every face, over its current area.
 
-    A system weighs its contact points by their area at rest.  Here they are weighed so that the uniform
-    penalty of `mean_penalty` acts as FEBio's does; `after` foresees the area of the next step from those of
-    the last two.  The contact area of the result then means nothing.
+    A system weighs its contact points by their area at rest. Here they are weighed so that the uniform
+    penalty of `compute_mean_penalty` acts as FEBio's does; `update_after` extrapolates the area of the next
+    step from those of the last two. The contact area of the result then has no meaning.
 
     Parameters
     ----------
@@ -78,26 +75,28 @@ class FaceWise:
         assert system.bodies is not None
         self.system, self.times = system, np.asarray(times)
         first = float(self.times[0])
-        mean = mean_stiffness(contacts[0], system.problem, first)
+        mean = compute_mean_stiffness(contacts[0], system.problem, first)
         if contacts[0].rule == "sliding-elastic":
             mean *= CURRENT_AREA
         self.faces = [
-            _Faces(body, contact, system.problem, first, mean)
+            _BodyFaces(body, contact, system.problem, first, mean)
             for body, contact in zip(system.bodies.all, contacts, strict=True)
         ]
 
-    def after(self, step: Step) -> None:
+    def update_after(self, step: Step) -> None:
         """Weigh the contact points for the step that follows an accepted one."""
         later = self.times[self.times > step.time * (1.0 + 1e-9)]
         ahead = float(later[0]) if len(later) else step.time
         for faces, coordinates in zip(self.faces, step.coordinates):
-            faces.after(step, coordinates, ahead)
+            faces.update_after(step, coordinates, ahead)
 
 
-class _Faces:
+class _BodyFaces:
     """The faces that one body touches."""
 
-    def __init__(self, body: Any, contact: Contact, problem: Problem, first: float, mean: float) -> None:
+    def __init__(
+        self, body: Any, contact: Contact, problem: Problem, first_step_s: float, mean_stiffness: float
+    ) -> None:
         self.body, self.problem, self.all = body, problem, np.asarray(body.stated.faces)
         # On quadratic faces the mean stretch comes nearer to FEBio's forces (0.4 to 0.7 % on exported sites)
         # than the area itself (0.7 to 2 %), on linear ones the area does; why is not known.
@@ -105,17 +104,19 @@ class _Faces:
         self.current = elastic and self.all.shape[1] != 6
         stiffness = np.full(len(self.all), contact.penalty)
         if contact.automatic:
-            stiffness *= automatic_penalties(problem, self.all, first)
-        self.share = stiffness[:, None] / mean * (1.0 if self.current or not elastic else CURRENT_AREA)
-        self.areas = self._areas_at(problem.mesh.points)
+            stiffness *= compute_automatic_penalties(problem, self.all, first_step_s)
+        self.share = (
+            stiffness[:, None] / mean_stiffness * (1.0 if self.current or not elastic else CURRENT_AREA)
+        )
+        self.areas = self._compute_areas_at(problem.mesh.points)
         self.coordinates = body.stated.motion.at(0.0)[0]
         self._weigh(self.areas)
 
-    def after(self, step: Step, coordinates: Array, ahead: float) -> None:
-        """Foresee the areas at the time ``ahead``, s, from where the body is and what moves it."""
+    def update_after(self, step: Step, coordinates: Array, ahead: float) -> None:
+        """Extrapolate the areas to the time ``ahead``, s, from where the body is and what moves it."""
         if not self.current:
             return
-        areas = self._areas_at(self.problem.mesh.points + step.state.u)
+        areas = self._compute_areas_at(self.problem.mesh.points + step.state.u)
         there, forced, _ = self.body.stated.motion.at(ahead)
         gone, way = coordinates - self.coordinates, np.where(forced, 0.0, there - coordinates)
         moved = float(gone[:3] @ gone[:3])
@@ -123,7 +124,7 @@ class _Faces:
         self._weigh(np.maximum(areas + ratio * (areas - self.areas), 0.5 * areas))
         self.areas, self.coordinates = areas, coordinates
 
-    def _areas_at(self, points: Array) -> Array:
+    def _compute_areas_at(self, points: Array) -> Array:
         problem = self.problem
         return face_quadrature(problem.formulation, points, self.all, problem.contact_rule)[1]
 
@@ -131,53 +132,54 @@ class _Faces:
         self.body.surface = replace(self.body.surface, areas=self.share * areas)
 
 
-def automatic_penalties(problem: Problem, faces: Indices, dt: float) -> Array:
-    """FEBio's automatic penalty (f,) of faces (f, k), MPa/mm: ``E A / V`` of the face and the element behind.
+def compute_automatic_penalties(problem: Problem, faces: Indices, dt: float) -> Array:
+    """Return FEBio's automatic penalty (f,) of faces (f, k), MPa/mm: ``E A / V`` of face and element behind
+    it.
 
     FEBio takes the modulus across the face from the inverse of the tangent as a 6 x 6 matrix, whose shear
-    terms are four times those of the tensor: for the unit normal n ``1/E = 1/E_0 + 3 G / mu`` with
-    ``G = n1^2 n2^2 + n2^2 n3^2 + n3^2 n1^2`` and Young's modulus ``E_0 = 9 k mu / (3 k + mu)``.  It is
-    softest where the normal lies between the axes.  The moduli are those of a step of ``dt`` s.
+    terms are four times those of the tensor: for the unit normal n ``1/E = 1/E_0 + 3 G / mu`` with ``G = n1^2
+    n2^2 + n2^2 n3^2 + n3^2 n1^2`` and Young's modulus ``E_0 = 9 k mu / (3 k + mu)``. It is softest where the
+    normal lies between the axes. The moduli are those of a step of ``dt`` s.
     """
     mesh = problem.mesh
-    behind = _cells_behind(mesh, faces)
-    moduli = np.array([_moduli(problem.materials[name], dt) for name in mesh.region_names])
+    behind = _find_cells_behind(mesh, faces)
+    moduli = np.array([_compute_moduli(problem.materials[name], dt) for name in mesh.region_names])
     mu, kappa = moduli[mesh.regions[behind]].T
-    squared = _normals(mesh.points, faces) ** 2
+    squared = _compute_normals(mesh.points, faces) ** 2
     between = 0.5 * (1.0 - (squared**2).sum(axis=1))  # n1^2 n2^2 + .., as the squares add up to one
     compliance = (3.0 * kappa + mu) / (9.0 * kappa * mu) + 3.0 * between / mu
     _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
-    return np.asarray(_areas(problem, faces).sum(axis=1) / weights.sum(axis=1) / compliance)
+    return np.asarray(_compute_areas(problem, faces).sum(axis=1) / weights.sum(axis=1) / compliance)
 
 
-def thinnest(mesh: Mesh, faces: Indices) -> float:
-    """The least depth of the elements behind contact faces: volume over area of the face, mm."""
-    cells = _cells_behind(mesh, faces)
+def find_smallest_depth(mesh: Mesh, faces: Indices) -> float:
+    """Return the smallest depth of the elements behind contact faces: volume over area of the face, mm."""
+    cells = _find_cells_behind(mesh, faces)
     element = ELEMENTS[mesh.cell_type]
     _, areas = face_quadrature(element, mesh.points, faces, "gauss")
     _, volumes = reference_gradients(element, mesh.points, mesh.cells[cells])
     return float((volumes.sum(axis=1) / areas.sum(axis=1)).min())
 
 
-def _mean_modulus(problem: Problem) -> float:
-    """Mean of the tissues' instantaneous shear moduli, MPa."""
+def _compute_mean_modulus(problem: Problem) -> float:
+    """Return the mean of the tissues' instantaneous shear moduli, MPa."""
     names = problem.mesh.region_names
     return float(np.mean([problem.materials[name].instantaneous_modulus for name in names]))
 
 
-def _areas(problem: Problem, faces: Indices) -> Array:
+def _compute_areas(problem: Problem, faces: Indices) -> Array:
     return face_quadrature(problem.formulation, problem.mesh.points, faces, problem.contact_rule)[1]
 
 
-def _normals(points: Array, faces: Indices) -> Array:
-    """Unit normals (f, 3) of faces with three corners, or across the diagonals of four."""
+def _compute_normals(points: Array, faces: Indices) -> Array:
+    """Return unit normals (f, 3) of faces with three corners, or across the diagonals of four."""
     (a, b), (c, d) = ((0, 2), (1, 3)) if faces.shape[1] == 4 else ((0, 1), (0, 2))
     across = np.cross(points[faces[:, b]] - points[faces[:, a]], points[faces[:, d]] - points[faces[:, c]])
     return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
 
 
-def _covered(problem: Problem) -> Indices:
-    """The contact faces that the indenter would pass through at its deepest; all, where there are none."""
+def _find_covered_faces(problem: Problem) -> Indices:
+    """Return the contact faces that the indenter would pass through at its deepest; all if there are none."""
     faces, indenter = np.asarray(problem.contact_faces), problem.indenter
     if indenter is None:
         return faces
@@ -190,8 +192,8 @@ def _covered(problem: Problem) -> Indices:
     return faces[inside] if inside.any() else faces
 
 
-def _cells_behind(mesh: Mesh, faces: Indices) -> Indices:
-    """The cell (f,) that each face belongs to."""
+def _find_cells_behind(mesh: Mesh, faces: Indices) -> Indices:
+    """Return the cell (f,) that each face belongs to."""
     corners = faces[:, : mesh.kind.face_corners]
     touched = np.flatnonzero(np.isin(mesh.cells, corners).sum(axis=1) >= corners.shape[1])
     owner = {int(cell): set(mesh.cells[cell].tolist()) for cell in touched}
@@ -208,8 +210,8 @@ def _cells_behind(mesh: Mesh, faces: Indices) -> Indices:
     return np.array(found)
 
 
-def _moduli(material: Material, dt: float) -> tuple[float, float]:
-    """Shear and bulk modulus at rest over a step of ``dt`` s, MPa."""
+def _compute_moduli(material: Material, dt: float) -> tuple[float, float]:
+    """Return shear and bulk modulus at rest over a step of ``dt`` s, MPa."""
     table = material.table()
     mu = float(table.terms[:, 0].sum()) / 2.0
     if len(table.prony):

@@ -6,31 +6,32 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import Activation, Indenter, Pressure, Problem, StepControl, Support
-from .bodies import indenter_of, rigid_body, rigid_corners, touched_faces
-from .driving import Drive, contacts_of_bodies, drive
-from .penalty import mean_penalty, thinnest
-from .reading.controls import step_times
+from .drive import Drive, find_drive, group_contacts
+from .parts import (
+    TissueMesh,
+    build_indenter,
+    build_rigid_body,
+    build_tissue,
+    find_rigid_corners,
+    find_touched_faces,
+)
+from .penalty import compute_mean_penalty, find_smallest_depth
 from .reading.model import FebModel
-from .reading.motions import knots
-from .tissue import Tissue, tissue_of
+from .reading.rigid import merge_knots
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-
-MOST_PER_STEP = 20  # Newton iterations, in the mean over FEBio's many steps
+MAX_ITERATIONS_PER_STEP = 20  # Newton iterations, in the mean over FEBio's many steps
 
 
 def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: Any) -> Problem:
-    """The problem of a FEBio input.
+    """Convert a FEBio input to a problem.
 
-    FEBio's rigid body is faces, which become an indenter of shape ``stl``; where ``indenter`` is given, they
-    stand for its shape, which is put where the body's foremost point is.  Regions carry the names of the
-    parts.
+    FEBio's rigid body consists of faces, which become an indenter of shape ``stl``. If ``indenter`` is given,
+    the faces stand for its shape, which is put where the body's foremost point is. Regions have the names of
+    the parts.
 
     Parameters
     ----------
@@ -39,23 +40,23 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     Raises
     ------
     ProblemError
-        Where the input has no deformable part, several element types, or motions that are not one history.
+        If the input has no deformable part, several element types, or motions that are not one history.
     """
-    tissue, driven = tissue_of(model), drive(model, shaped=indenter is not None)
-    touching, name = contacts_of_bodies(model), driven.indenter
+    tissue, driven = build_tissue(model), find_drive(model, shaped=indenter is not None)
+    touching, name = group_contacts(model), driven.indenter
     faces, placed = np.zeros((0, 3), np.int64), None
     if touching:
-        faces = touched_faces(model, next(iter(touching.values())), tissue)
+        faces = find_touched_faces(model, next(iter(touching.values())), tissue)
     if driven.axis is not None:
         placed = (
-            indenter_of(model, driven.axis, name, thinnest(tissue.mesh, faces))
+            build_indenter(model, driven.axis, name, find_smallest_depth(tissue.mesh, faces))
             if indenter is None
-            else _placed(model, driven.axis, name, indenter)
+            else _place_indenter(model, driven.axis, name, indenter)
         )
     elif indenter is not None and touching:
         raise ProblemError("no single rigid body goes straight into the tissue, to stand for an indenter")
-    fixed, supports = _supports(model, tissue.number, driven)
-    element = next(iter(model.parts_of(model.materials).values())).element
+    fixed, supports = _build_supports(model, tissue.node_index, driven)
+    element = next(iter(model.select_parts(model.materials).values())).element
     friction = 0.0 if placed is None else touching[name][0].friction
     return Problem(
         mesh=tissue.mesh,
@@ -71,18 +72,19 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
         friction=friction or "frictionless",
         sticking="anchored" if placed is None else touching[name][0].sticking,
         bodies=tuple(
-            rigid_body(model, name, touching[name], motion, tissue) for name, motion in driven.motions.items()
+            build_rigid_body(model, name, touching[name], motion, tissue)
+            for name, motion in driven.motions.items()
         ),
-        pressures=_pressures(model, tissue),
-        fibres=_fibres(model, tissue),
-        activation=_activation(model),
-        prestretch=_prestretch(model, tissue),
-        **{"element": element, "contact_rule": _contact_rule(model, tissue), **settings},
+        pressures=_build_pressures(model, tissue),
+        fibres=_build_fibres(model, tissue),
+        activation=_build_activation(model),
+        prestretch=_build_prestretch(model, tissue),
+        **{"element": element, "contact_rule": _choose_contact_rule(model, tissue), **settings},
     )
 
 
-def _fibres(model: FebModel, tissue: Tissue) -> Array | None:
-    """The direction of the fibres in every cell; any where there are none."""
+def _build_fibres(model: FebModel, tissue: TissueMesh) -> Array | None:
+    """Return the direction of the fibres in every cell, which is arbitrary where there are none."""
     if not model.fibres:
         return None
     found = np.tile([1.0, 0.0, 0.0], (len(tissue.mesh.cells), 1))
@@ -92,8 +94,8 @@ def _fibres(model: FebModel, tissue: Tissue) -> Array | None:
     return found
 
 
-def _prestretch(model: FebModel, tissue: Tissue) -> Array | None:
-    """The pre-strain of every cell, fully grown; the identity where there is none."""
+def _build_prestretch(model: FebModel, tissue: TissueMesh) -> Array | None:
+    """Return the pre-strain of every cell, fully grown; the identity where there is none."""
     if not model.prestrains:
         return None
     found = np.tile(np.eye(3), (len(tissue.mesh.cells), 1, 1))
@@ -105,13 +107,13 @@ def _prestretch(model: FebModel, tissue: Tissue) -> Array | None:
     return found
 
 
-def _activation(model: FebModel) -> Activation | None:
-    """The one course of all contractions."""
+def _build_activation(model: FebModel) -> Activation | None:
+    """Return the one course of all contractions."""
     if not model.contractions:
         return None
-    end, every = sum(phase.seconds for phase in model.phases), step_times(model.phases, model.curves)
+    end, every = model.end_s, model.step_times
     curves = [model.curves[one.curve] for one in model.contractions if one.curve]
-    times = knots(curves, every, 0.0, end)
+    times = merge_knots(curves, every, 0.0, end)
     courses = [
         model.curves[one.curve].at(times) if one.curve else np.ones(len(times)) for one in model.contractions
     ]
@@ -123,8 +125,8 @@ def _activation(model: FebModel) -> Activation | None:
     return Activation(times, courses[0])
 
 
-def _contact_rule(model: FebModel, tissue: Tissue) -> str:
-    """Where FEBio's contact acts."""
+def _choose_contact_rule(model: FebModel, tissue: TissueMesh) -> str:
+    """Choose where FEBio's contact acts."""
     nodal = {contact.rule == "sliding-node-on-facet" for contact in model.contacts}
     if len(nodal) == 2:
         place = f"line {model.contacts[1].line}, <contact>"
@@ -134,28 +136,28 @@ def _contact_rule(model: FebModel, tissue: Tissue) -> str:
     return "gauss7" if tissue.mesh.cell_type == "tet10" else "gauss"  # FEBio's quadrature
 
 
-def _placed(model: FebModel, axis: Array, name: str, indenter: Indenter) -> Indenter:
+def _place_indenter(model: FebModel, axis: Array, name: str, indenter: Indenter) -> Indenter:
     centre = model.rigid[name].centre
-    foremost = float(((rigid_corners(model, name) - centre) @ axis).max())
+    foremost = float(((find_rigid_corners(model, name) - centre) @ axis).max())
     return replace(indenter, centre=centre + foremost * axis, axis=axis)
 
 
-def _pressures(model: FebModel, tissue: Tissue) -> tuple[Pressure, ...]:
-    """The pressures on tissue, over the whole time."""
-    found, end = [], sum(phase.seconds for phase in model.phases)
+def _build_pressures(model: FebModel, tissue: TissueMesh) -> tuple[Pressure, ...]:
+    """Return the pressures on tissue, over the whole time."""
+    found = []
     for load in model.pressures:
-        faces = tissue.number[model.geometry.surfaces[load.surface]]
+        faces = tissue.node_index[model.geometry.surfaces[load.surface]]
         if (faces < 0).any():
             what = f"the surface {load.surface!r} of a pressure does not lie on tissue"
             raise ProblemError(what, place=f"line {load.line}")
         curve = model.curves[load.curve]
-        times = knots([curve], step_times(model.phases, model.curves), 0.0, end)
+        times = merge_knots([curve], model.step_times, 0.0, model.end_s)
         found.append(Pressure(faces, times, load.factor * curve.at(times)))
     return tuple(found)
 
 
-def _supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices, tuple[Support, ...]]:
-    """Nodes held in all directions, and single components held or moved; rigid bodies carry theirs."""
+def _build_supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices, tuple[Support, ...]]:
+    """Return nodes held in all directions, and single components held or moved; rigid bodies carry theirs."""
     held: dict[str, set[int]] = {}
     for m in model.motions:
         if (number[m.nodes] < 0).any():
@@ -169,7 +171,7 @@ def _supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices,
         for m, factor in zip(model.motions, driven.factors)
         if m.target not in clamped
     ]
-    for name, carried in model.carried.items():
+    for name, carried in model.carried_nodes.items():
         way = driven.travel[name]
         _check_agreement(model, driven, name)
         if way.any():
@@ -182,42 +184,43 @@ def _supports(model: FebModel, number: Indices, driven: Drive) -> tuple[Indices,
 def _check_agreement(model: FebModel, driven: Drive, name: str) -> None:
     """Refuse conditions on nodes that a rigid body carries elsewhere."""
     for m, factor in zip(model.motions, driven.factors):
-        both = np.isin(m.nodes, model.carried[name])
+        both = np.isin(m.nodes, model.carried_nodes[name])
         if both.any() and not np.isclose(factor, driven.travel[name][m.component]):
             node = model.geometry.node_ids[m.nodes[both][0]]
             what = f"node {node} of {m.target!r} moves with the rigid body {name!r}, which goes elsewhere"
             raise ProblemError(what, place=f"line {m.line}")
 
 
-def step_control(model: FebModel, problem: Problem, **settings: Any) -> StepControl:
-    """FEBio's steps in time, its course of the stress in them, a tolerance no looser than its own and, where
-    it penalises contact, its penalty.
+def build_step_control(model: FebModel, problem: Problem, **settings: Any) -> StepControl:
+    """Build the step control that follows FEBio.
 
-    Augmented and nodal contact are limbfit's own, which keeps the penetration below 1 % of the depth.
+    It has FEBio's steps in time, its course of the stress in them, a tolerance no looser than its own and,
+    where FEBio penalises contact, its penalty. Augmented and nodal contact are limbfit's own, which keeps the
+    penetration below 1 % of the depth.
     """
-    times = step_times(model.phases, model.curves)
+    times = model.step_times
     finest = min(phase.tolerance for phase in model.phases)
     chosen: dict[str, Any] = {
         "times": tuple(times),
         "stress": "linear",
         "tolerance": min(StepControl.tolerance, max(0.1 * finest, 1e-11)),
-        "most_iterations": max(StepControl.most_iterations, MOST_PER_STEP * len(times)),
+        "most_iterations": max(StepControl.most_iterations, MAX_ITERATIONS_PER_STEP * len(times)),
     }
-    if penalised(model):
-        penalty = mean_penalty(model.contacts[0], problem, float(times[0]))
+    if has_penalty(model):
+        penalty = compute_mean_penalty(model.contacts[0], problem, float(times[0]))
         chosen |= {"penalty": penalty, "penetration": 1.0, "hold_penalty": problem.indenter is None}
     return StepControl(**{**chosen, **settings})
 
 
-def penalised(model: FebModel) -> bool:
-    """Whether contact has FEBio's penalty.
+def has_penalty(model: FebModel) -> bool:
+    """True if contact has FEBio's penalty.
 
     Raises
     ------
     ProblemError
-        Where some has, and some has limbfit's own.
+        If some contacts have it, and some have limbfit's own.
     """
-    found = {contact.penalised for contact in model.contacts}
+    found = {contact.has_penalty for contact in model.contacts}
     if len(found) == 2:
         place = f"line {model.contacts[1].line}, <contact>"
         what = "contacts with a penalty beside augmented or nodal ones are not supported"

@@ -1,8 +1,9 @@
-"""FEBio as a program: where it is, one run in a folder of its own, and what came of it."""
+"""FEBio as a program: where it is, one run in a folder of its own, its verdict and its log tables."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,51 +13,61 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Problem, Result
-from .beginning import Beginning
-from .logs import Log, read_log
-from .verdict import SLACK, RunVerdict, judge
+from .preparation import Preparation
 
-Array = NDArray[np.float64]
-VARIABLE = "FEBIO_CMD"
-NAMES = ("febio4", "febio")
+PROGRAM_VARIABLE = "FEBIO_CMD"
+PROGRAM_NAMES = ("febio4", "febio")
 INPUT, OUTPUT, LOG = "model.feb", "stdout.txt", "model.log"
-_MOST_MESSAGES = 32 * 2**20  # of FEBio's first and last words, bytes
-GET_IT = f"install FEBio 4 (https://febio.org/downloads); put febio4 on the path or set {VARIABLE} to it"
+_MAX_MESSAGE_BYTES = 32 * 2**20  # of FEBio's first and last words, bytes
+INSTALL_REMEDY = (
+    f"install FEBio 4 (https://febio.org/downloads); put febio4 on the path or set {PROGRAM_VARIABLE} to it"
+)
+NORMAL_TERMINATION, ERROR_TERMINATION = (
+    "N O R M A L   T E R M I N A T I O N",
+    "E R R O R   T E R M I N A T I O N",
+)
+_VERSION = re.compile(r"^\s*version\s+(\d+(?:\.\w+)+)", re.MULTILINE)
+_CONVERGED = re.compile(r"------- converged at time : ([-+.\deE]+)")
+_FAILED = re.compile(r"------- failed to converge at time : ([-+.\deE]+)")
+_BOX = re.compile(r"^ \*+\n \*\s+(?:FATAL )?ERROR\s+\*\n((?: \*.*\n?)+)", re.MULTILINE)
+TIME_TOLERANCE = 1e-5  # of the end time: FEBio prints six digits, 10.0223 for 10.022314
 
 
 @dataclass(frozen=True)
 class FebioRun:
-    """One run: FEBio's own words as a verdict, its table of the indenter, if there is any, and its time."""
+    """One run: the verdict by FEBio's own messages, its table of the indenter, if any, and its time."""
 
     verdict: RunVerdict
-    log: Log | None
+    log: FebioLog | None
     seconds: float
     folder: Path
 
 
 def find_febio(program: str | Path | None = None) -> Path:
-    """The FEBio program: the one given, that of ``FEBIO_CMD``, or febio4 or febio on the path.
+    """Find the FEBio program: the one given, that of ``FEBIO_CMD``, or febio4 or febio on the path.
 
     Raises
     ------
     InputError
-        Where there is none, with how to get it.
+        If there is none, with how to get it.
     """
-    for name, given in (("febio.program", program), (VARIABLE, os.environ.get(VARIABLE))):
+    for name, given in (("febio.program", program), (PROGRAM_VARIABLE, os.environ.get(PROGRAM_VARIABLE))):
         if given:
             found = shutil.which(str(given))
             if found is None:
-                raise InputError("is not a program that can be run", file=given, place=name, remedy=GET_IT)
+                raise InputError(
+                    "is not a program that can be run", file=given, place=name, remedy=INSTALL_REMEDY
+                )
             return Path(found)
-    for candidate in NAMES:
+    for candidate in PROGRAM_NAMES:
         found = shutil.which(candidate)
         if found is not None:
             return Path(found)
-    raise InputError("FEBio is not installed here", remedy=GET_IT)
+    raise InputError("FEBio is not installed here", remedy=INSTALL_REMEDY)
 
 
 def run_febio(
@@ -72,7 +83,7 @@ def run_febio(
     Raises
     ------
     RunError
-        Where the program cannot be started, or the folder cannot be written.
+        If the program cannot be started, or the folder cannot be written.
     """
     words = folder / OUTPUT
     try:
@@ -80,12 +91,12 @@ def run_febio(
             (folder / left).unlink(missing_ok=True)
         started = time.perf_counter()
         with words.open("wb") as stream:
-            code, timed_out = _call(program, folder, stream, threads, time_limit_s)
+            code, timed_out = _run_process(program, folder, stream, threads, time_limit_s)
     except OSError as error:
         raise RunError(f"{program}: {error.strerror or error}") from error
     seconds = time.perf_counter() - started
-    messages = _messages(words)
-    verdict = judge(messages, code, end_s, timed_out=timed_out, limit_s=time_limit_s)
+    messages = _read_messages(words)
+    verdict = judge_run(messages, code, end_s, timed_out=timed_out, limit_s=time_limit_s)
     try:
         log = read_log(folder / table)
     except ProblemError as error:
@@ -95,19 +106,19 @@ def run_febio(
     return FebioRun(verdict, log, seconds, folder)
 
 
-def _messages(file: Path) -> str:
-    """FEBio's words; of very many the first (its version) and the last (its end)."""
+def _read_messages(file: Path) -> str:
+    """Read FEBio's messages; of very long ones the first part (its version) and the last (its end)."""
     with file.open("rb") as said:
-        found = said.read(_MOST_MESSAGES)
+        found = said.read(_MAX_MESSAGE_BYTES)
         left = file.stat().st_size - len(found)
         if left > 0:
-            said.seek(-min(left, _MOST_MESSAGES), os.SEEK_END)
+            said.seek(-min(left, _MAX_MESSAGE_BYTES), os.SEEK_END)
             found += b"\n" + said.read()
     return found.decode("utf-8", "replace")
 
 
-def _call(program: Path, folder: Path, stream: Any, threads: int, limit_s: float) -> tuple[int, bool]:
-    """Exit code, and whether the time limit ended it; its children end with it."""
+def _run_process(program: Path, folder: Path, stream: Any, threads: int, limit_s: float) -> tuple[int, bool]:
+    """Run the program; return its exit code, and True if the time limit ended it and its children."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
     process = subprocess.Popen(
         [str(program), "-i", INPUT, "-o", LOG],
@@ -124,10 +135,10 @@ def _call(program: Path, folder: Path, stream: Any, threads: int, limit_s: float
         return -signal.SIGKILL, True
     finally:
         if process.poll() is None:
-            _end(process)
+            _kill_process(process)
 
 
-def _end(process: subprocess.Popen) -> None:
+def _kill_process(process: subprocess.Popen) -> None:
     if hasattr(os, "killpg"):
         os.killpg(process.pid, signal.SIGKILL)
     else:  # Windows has no process groups of this kind
@@ -135,28 +146,27 @@ def _end(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def result_of_log(problem: Problem, log: Log | None, verdict: RunVerdict, seconds: float = 0.0) -> Result:
-    """FEBio's force over time as a `Result`, complete or not.
+def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, seconds: float = 0.0) -> Result:
+    """Build a `Result` of FEBio's force over time, complete or not.
 
-    FEBio's table says nothing of penetration and area; forces across the axis, moments and coordinates are
-    not read: all are NaN;
-    there are no states.
+    FEBio's table does not contain penetration and area. Forces across the axis, moments and coordinates are
+    not read. All of these are NaN, and there are no states.
 
     Raises
     ------
     ProblemError
-        Where the table holds no force along the indenter's axis, or goes beyond the history.
+        If the table holds no force along the indenter's axis, or goes beyond the history.
     """
     times, force = np.zeros(1), np.zeros(1)
     if log is not None:
-        begun = Beginning.of(problem).seconds
-        own = log.times >= begun * (1.0 - SLACK)
-        times, force = np.maximum(log.times[own] - begun, 0.0), axial_force(problem, log)[own]
+        begun = Preparation.from_problem(problem).seconds
+        own = log.times >= begun * (1.0 - TIME_TOLERANCE)
+        times, force = np.maximum(log.times[own] - begun, 0.0), compute_axial_force(problem, log)[own]
     if not len(times):  # FEBio did not come so far
         times, force = np.zeros(1), np.zeros(1)
     if times[0] > 0.0:
         times, force = np.concatenate([[0.0], times]), np.concatenate([[0.0], force])
-    if times[-1] > problem.history.times[-1] * (1.0 + SLACK):
+    if times[-1] > problem.history.times[-1] * (1.0 + TIME_TOLERANCE):
         raise ProblemError(
             f"the table goes on to {times[-1]:.4g} s, the indentation to {problem.history.times[-1]:.4g} s",
             remedy="give the table of the same indentation",
@@ -188,13 +198,13 @@ def result_of_log(problem: Problem, log: Log | None, verdict: RunVerdict, second
     )
 
 
-def axial_force(problem: Problem, log: Log) -> Array:
-    """Force (n,) of the indenter on the tissue along its axis, N.
+def compute_axial_force(problem: Problem, log: FebioLog) -> Array:
+    """Return the force (n,) of the indenter on the tissue along its axis, N.
 
     Raises
     ------
     ProblemError
-        Where the table lacks a component of it.
+        If the table lacks a component of it.
     """
     assert problem.indenter is not None
     force = np.zeros(len(log.times))
@@ -204,3 +214,133 @@ def axial_force(problem: Problem, log: Log) -> Array:
         elif abs(share) > 1e-3:
             raise ProblemError(f"the table has no {name}, along which the indenter moves")
     return force
+
+
+@dataclass(frozen=True)
+class RunVerdict:
+    """The verdict over one run: its ``kind``, and the ``reason`` in one line, which is empty if all is well.
+
+    ``kind`` is normal, partial, error, input, killed, time limit, no output or crashed. ``reached_s`` is the
+    last time that converged; ``version`` is that of FEBio, empty if it did not say.
+    """
+
+    kind: str
+    reason: str
+    reached_s: float
+    version: str
+
+    @property
+    def completed(self) -> bool:
+        return self.kind == "normal"
+
+
+def judge_run(
+    messages: str, exit_code: int, end_s: float, *, timed_out: bool = False, limit_s: float = 0.0
+) -> RunVerdict:
+    """Judge a run by its exit, its messages and its log.
+
+    Parameters
+    ----------
+    messages : what FEBio wrote on standard output (its log file says the same).
+    exit_code : of the process; negative or above 128 for a signal.
+    end_s : time that the input asks for.
+    timed_out, limit_s : whether it was stopped by the time limit, and after how many seconds.
+    """
+    found = _VERSION.search(messages)
+    version = found.group(1) if found else ""
+    times = [float(t) for t in _CONVERGED.findall(messages)]
+    reached = times[-1] if times else 0.0
+    kind, what = _classify_run(messages, exit_code, reached, end_s, timed_out, limit_s)
+    if kind == "normal":
+        return RunVerdict(kind, "", reached, version)
+    where = "" if kind in ("input", "no output") else f" at {reached:.4g} s of {end_s:.4g} s"
+    return RunVerdict(kind, f"FEBio {what}{where}{_find_cause(messages, kind)}", reached, version)
+
+
+def _classify_run(
+    messages: str, exit_code: int, reached: float, end_s: float, timed_out: bool, limit_s: float
+) -> tuple[str, str]:
+    signal = -exit_code if exit_code < 0 else exit_code - 128
+    if timed_out:
+        return "time limit", f"was stopped by the time limit of {limit_s:g} s"
+    if re.search(r"^Reading file .*FAILED!", messages, re.MULTILINE):
+        return "input", "could not read its input"
+    if ERROR_TERMINATION in messages:
+        return "error", "stopped with an error" + ("" if exit_code else ", though it left with exit code 0")
+    if 0 < signal < 65:
+        memory = ", most often for lack of memory" if signal == 9 else ""
+        return "killed", f"was killed by signal {signal}{memory},"
+    if exit_code != 0:
+        return "crashed", f"left with exit code {exit_code} without a message,"
+    if not messages.strip():
+        return "no output", "wrote nothing"
+    if NORMAL_TERMINATION not in messages:
+        return "crashed", "ended without a verdict,"
+    if reached < end_s * (1.0 - TIME_TOLERANCE):
+        return "partial", "ended, but stopped early,"
+    return "normal", ""
+
+
+def _find_cause(messages: str, kind: str) -> str:
+    """Return the last error that FEBio framed, and where it did not converge."""
+    if kind not in ("error", "input", "crashed"):
+        return ""
+    boxes = _BOX.findall(messages)
+    lines = [line.strip(" *") for line in boxes[-1].split("\n")] if boxes else []
+    words = " ".join(" ".join(lines).split()).rstrip(".")
+    failed = _FAILED.findall(messages)
+    parts = [words] if words else []
+    if kind != "input" and failed:
+        parts.append(f"no convergence at {float(failed[-1]):.4g} s")
+    return ": " + "; ".join(parts) if parts else ""
+
+
+@dataclass(frozen=True)
+class FebioLog:
+    """Values (n, i, k) of ``i`` items at ``n`` times (n,) s, in FEBio's units; ``names`` of the k columns."""
+
+    times: Array
+    names: tuple[str, ...]
+    values: Array
+
+    def column(self, name: str) -> Array:
+        """Return the values (n,) of the first item."""
+        return self.values[:, 0, self.names.index(name)]
+
+
+def read_log(path: str | Path) -> FebioLog:
+    """Read a log file of FEBio: ``*Step``, ``*Time``, ``*Data`` and one line per item, per step.
+
+    A last step that was not written to its end is left out.
+
+    Raises
+    ------
+    ProblemError
+        If the file is missing, holds no complete step, or a line that is no number.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ProblemError(error.strerror or "cannot be read", file=path) from error
+    times: list[float] = []
+    steps: list[list[list[float]]] = []
+    names: tuple[str, ...] = ()
+    for number, line in enumerate(text.split("\n")[:-1], 1):  # a line without end was cut short
+        try:
+            if line.startswith("*Time"):
+                times.append(float(line.partition("=")[2]))
+                steps.append([])
+            elif line.startswith("*Data"):
+                names = tuple(name.strip() for name in line.partition("=")[2].split(";"))
+            elif line.strip() and not line.startswith("*"):
+                steps[-1].append([float(value) for value in line.split(",")[1:]])
+        except (ValueError, IndexError) as error:
+            raise ProblemError(
+                f"{line!r} is not a line of a FEBio log", file=path, place=str(number)
+            ) from error
+    items = len(steps[0]) if steps else 0
+    whole = [[len(row) for row in step] == [len(names)] * items for step in steps]
+    count = whole.index(False) if False in whole else len(whole)
+    if not count or not items:
+        raise ProblemError("holds no complete step of FEBio", file=path)
+    return FebioLog(np.array(times[:count]), names, np.array(steps[:count]))

@@ -1,26 +1,34 @@
-"""A FEBio input solved by limbfit, with the tables that its own output section asks for."""
+"""A FEBio input solved by limbfit, with the log-file tables that its own output section asks for."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import TextIOBase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from ..arrays import Array, Indices
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Result, Step, System, solve
-from .driving import contacts_of_bodies
-from .penalty import FaceWise
-from .problem import penalised, step_control, to_problem
-from .reading.model import read_feb
-from .tables import Tables
+from ..fe.kernel.laws import Laws
+from ..fe.observables import ElementFields, element_fields, nodal_forces
+from .drive import find_drive, group_contacts
+from .parts import build_tissue
+from .penalty import FacePenalties
+from .problem import build_step_control, has_penalty, to_problem
+from .reading.model import FebModel, read_feb
+from .reading.requests import Request
+
+_CAUCHY = ("sx", "sy", "sz", "sxy", "syz", "sxz")
 
 
 @dataclass(frozen=True)
 class FebRun:
-    """What came of a FEBio input: the simulation, the files written, and what was left out."""
+    """The result of a FEBio input: the simulation, the files written, and notes on what was left out."""
 
     result: Result
     files: tuple[Path, ...]
@@ -39,26 +47,26 @@ def run_feb(
     Parameters
     ----------
     on_step : called with every accepted step and the time of the last one, s.
-    keep : refuse to write over files that are there.
+    keep : refuse to write over existing files.
     settings : fields of `StepControl` that replace what the input says (``times``, ``threads``, ..).
 
     Raises
     ------
     ProblemError
-        Where the input cannot be read or holds what limbfit does not know; with its line.
+        If the input cannot be read or holds what limbfit does not support; with its line.
     RunError
-        Where the tables cannot be written.
+        If the tables cannot be written.
     """
     folder, model = Path(output), read_feb(path)
     try:
         problem = to_problem(model)
-        control = step_control(model, problem, **settings)
+        control = build_step_control(model, problem, **settings)
         system = System(problem, control.threads)
-        tables = Tables(model, system, folder, Path(path).stem)
+        tables = LogTables(model, system, folder, Path(path).stem)
         weights = None
-        if penalised(model) and "penalty" not in settings:
-            laws = [contacts[0] for contacts in contacts_of_bodies(model).values()]
-            weights = FaceWise(system, laws, np.asarray(control.times))
+        if has_penalty(model) and "penalty" not in settings:
+            laws = [contacts[0] for contacts in group_contacts(model).values()]
+            weights = FacePenalties(system, laws, np.asarray(control.times))
     except ProblemError as error:
         raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None
     assert control.times is not None
@@ -71,7 +79,7 @@ def run_feb(
     def accepted(step: Step) -> None:
         tables.add(step)
         if weights is not None:
-            weights.after(step)
+            weights.update_after(step)
         if on_step is not None:
             on_step(step, last)
 
@@ -82,3 +90,159 @@ def run_feb(
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror or error}") from error
     return FebRun(result, tables.files, model.notes)
+
+
+class LogTables:
+    """The tables of a model, written step by step, so that they hold what was reached when it stops.
+
+    Nodes and elements stand in the order of the file, those of rigid bodies among them: they move with their
+    body, and are free of stress.
+    """
+
+    def __init__(self, model: FebModel, system: System, folder: Path, stem: str) -> None:
+        problem = system.problem
+        self.model, self.problem, self.system = model, problem, system
+        self.tissue = build_tissue(model)
+        self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+        self.travel = find_drive(model).travel
+        # The bodies of the problem by FEBio's name, in the problem's order.
+        self.bodies = dict(zip(group_contacts(model), problem.rigid_bodies))
+        self.count = 0
+        names = [request.file or f"{stem}.log" for request in model.requests]
+        self.paths = [folder / name for name in names]
+        self.streams: dict[Path, TextIOBase] = {}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file once."""
+        return tuple(dict.fromkeys(self.paths))
+
+    def __enter__(self) -> LogTables:
+        for path in self.files:
+            self.streams[path] = path.open("w", encoding="utf-8")
+        self._write(0.0, None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for stream in self.streams.values():
+            stream.close()
+
+    def add(self, step: Step) -> None:
+        """Write one accepted step."""
+        self._write(self.model.settling_time_s + step.time, step)
+
+    def _write(self, time: float, step: Step | None) -> None:
+        needed = any(request.kind == "element_data" for request in self.model.requests)
+        fields = element_fields(self.system, self.laws, step.state) if step is not None and needed else None
+        u = self._compute_displacement(step)
+        for request, path in zip(self.model.requests, self.paths):
+            stream = self.streams[path]
+            head = f"*Step  = {self.count}\n*Time  = {time:.9g}\n*Data  = {';'.join(request.names)}\n"
+            stream.write(head)
+            numbers, columns = self._compute_columns(request, step, u, fields)
+            for i in np.flatnonzero([request.includes(int(number)) for number in numbers]):
+                values = (f"{column[i]:.12g}" for column in columns)
+                stream.write(request.delimiter.join([str(numbers[i]), *values]) + "\n")
+            stream.flush()
+        self.count += 1
+
+    def _compute_pose(self, name: str, step: Step | None) -> tuple[Array, Array]:
+        """Return move (3,), mm, and rotation vector (3,), rad, of a rigid body's centre of mass in space."""
+        if name in self.bodies and self.problem.indenter is None:
+            i, body = list(self.bodies).index(name), self.bodies[name]
+            coordinates = body.motion.at(0.0)[0] if step is None else step.coordinates[i]
+            return coordinates[:3] @ body.shape.frame, coordinates[3:] @ body.shape.frame
+        gone = float(self.problem.history.at(0.0)) if step is None else step.displacement
+        return gone * self.travel[name], np.zeros(3)
+
+    def _compute_displacement(self, step: Step | None) -> Array:
+        """Return the displacement (n, 3) of all nodes of the file, mm; nodes of no element stay."""
+        u = np.zeros_like(self.model.geometry.points)
+        for part in self.model.select_parts(self.model.rigid).values():
+            move, turn = self._compute_pose(part.material, step)
+            nodes, centre = np.unique(part.cells), self.model.rigid[part.material].centre
+            arms = self.model.geometry.points[nodes] - centre
+            u[nodes] = move + Rotation.from_rotvec(turn).apply(arms) - arms
+        if step is not None:
+            u[self.tissue.nodes] = step.state.u
+        return u
+
+    def _compute_columns(
+        self, request: Request, step: Step | None, u: Array, fields: ElementFields | None
+    ) -> tuple[Indices, list[Array]]:
+        """Return FEBio's numbers of the items, and a column per name."""
+        geometry = self.model.geometry
+        if request.kind == "node_data":
+            found = dict(zip(("x", "y", "z", "ux", "uy", "uz"), np.hstack([geometry.points + u, u]).T))
+            numbers = geometry.node_ids
+        elif request.kind == "element_data":
+            found = self._compute_element_columns(geometry.points + u, fields)
+            numbers = np.concatenate([part.ids for part in geometry.parts.values()])
+        else:
+            found = self._compute_rigid_columns(step)
+            numbers = np.array([body.number for body in self.model.rigid.values()])
+        return numbers, [found[name] for name in request.names]
+
+    def _compute_element_columns(self, points: Array, fields: ElementFields | None) -> dict[str, Array]:
+        parts = self.model.geometry.parts.values()
+        stress, J = (np.zeros((sum(len(part.ids) for part in parts), 6)), [])
+        middle, at, tissue = [], 0, 0
+        for part in parts:
+            count = len(part.ids)
+            middle.append(points[part.cells].mean(axis=1))
+            J.append(np.ones(count))
+            if part.material in self.model.materials:
+                if fields is not None:
+                    stress[at : at + count] = fields.cauchy[tissue : tissue + count]
+                    J[-1] = fields.J[tissue : tissue + count]
+                tissue += count
+            at += count
+        found = dict(zip(_CAUCHY, stress.T))
+        xx, yy, zz, xy, yz, zx = stress.T
+        tensor = np.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz], axis=1).reshape(-1, 3, 3)
+        found |= dict(zip(("s3", "s2", "s1"), np.linalg.eigvalsh(tensor).T))
+        found |= dict(zip(("x", "y", "z"), np.vstack(middle).T))
+        found["J"] = np.concatenate(J)
+        return found
+
+    def _compute_rigid_columns(self, step: Step | None) -> dict[str, Array]:
+        """Return columns of every rigid body.
+
+        They are the place of its centre of mass, mm, its rotation vector, rad, the force, N, and the moment
+        about that place, N mm.
+        """
+        names = ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
+        rows = np.zeros((len(self.model.rigid), len(names)))
+        for i, (name, body) in enumerate(self.model.rigid.items()):
+            move, turn = self._compute_pose(name, step)
+            rows[i, :3], rows[i, 3:6] = body.centre + move, turn
+            if step is not None:
+                rows[i, 6:] = self._compute_force(name, body.centre + move, turn, step)
+        return dict(zip(names, rows.T))
+
+    def _compute_force(self, name: str, pivot_point: Array, turn: Array, step: Step) -> Array:
+        """Return force and moment (6,) about a point of a rigid body on tissue that it touches or carries."""
+        total = np.zeros(6)
+        if name in self.bodies:
+            assert self.system.bodies is not None
+            i = list(self.bodies).index(name)
+            body = self.system.bodies.all[i]
+            force, conjugate = step.reactions[i].reshape(2, 3) @ body.frame
+            pivot = body.pivot + step.coordinates[i, :3] @ body.frame
+            moment = np.linalg.solve(_compute_spin(turn).T, conjugate)
+            total += [*force, *(moment + np.cross(pivot - pivot_point, force))]
+        if name in self.model.carried_nodes:
+            nodes = self.tissue.node_index[self.model.carried_nodes[name]]
+            forces = nodal_forces(self.system, self.laws, step.state)[nodes]
+            arms = self.tissue.mesh.points[nodes] + step.state.u[nodes] - pivot_point
+            total += [*forces.sum(axis=0), *np.cross(arms, forces).sum(axis=0)]
+        return total
+
+
+def _compute_spin(w: Array) -> Array:
+    """Return the spin (3, 3) in space per unit of the rotation vector ``w``: Rodrigues' left Jacobian."""
+    angle, skew = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * skew)
+    a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + a * skew + b * skew @ skew)

@@ -1,6 +1,6 @@
-"""A problem as an input of FEBio 4.0 (``.feb``) that runs unedited and opens in FEBio Studio.
+"""A problem written as an input of FEBio 4.0 (``.feb``) that runs unedited and opens in FEBio Studio.
 
-Numbers are written so that they are read back as they are.  Units: mm, N, s, MPa.
+Numbers are written so that they are read back exactly. Units: mm, N, s, MPa.
 """
 
 from __future__ import annotations
@@ -12,33 +12,49 @@ from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError, RunError
 from ..fe import Indenter, Motion, Problem, StepControl
 from ..fe.solution.control import schedule
-from .beginning import STRAINED_S, Beginning, as_written
-from .faceting import FRONT, INDENTER, PATCH, Body, ToolMesh, blunt, frame_mesh, written_bodies
-from .fibres import axes_of_cells, axis_of, directions
-from .materials import material_lines, prestrain_of, prestrains, prestrains_of_cells
-from .meshes import QUADRATURE, domain_lines, mesh_lines
-from .moving import (
-    FRAME,
-    HELD,
-    Curves,
-    boundary_lines,
-    conditions,
-    pressure_lines,
-    rail_lines,
-    row,
-    step_ends,
+from .conditions import (
+    FIXED_SET,
+    FRAME_BODY,
+    CurveList,
+    find_step_ends,
+    format_boundary,
+    format_conditions,
+    format_pressures,
+    format_rail,
+    format_row,
 )
-from .penalty import explicit_penalty, mean_stiffness
+from .materials import (
+    find_fibre_directions,
+    find_prestrains,
+    format_axis,
+    format_cell_axes,
+    format_cell_prestrains,
+    format_material,
+    format_prestrain,
+)
+from .meshes import (
+    FRONT,
+    INDENTER,
+    PATCH,
+    QUADRATURE,
+    FebBody,
+    RigidMesh,
+    build_bodies,
+    build_frame_mesh,
+    format_domains,
+    format_mesh,
+    has_round_edges,
+)
+from .penalty import compute_explicit_penalty, compute_mean_stiffness
+from .preparation import PRESTRAIN_S, Preparation, prepare_problem
 from .reading.model import Contact
 
-Array = NDArray[np.float64]
-
-HELD_STILL = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
+REST = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
 
 
 @dataclass(frozen=True)
@@ -47,9 +63,9 @@ class FebSettings:
 
     Parameters
     ----------
-    penalty : times FEBio's automatic one (above 3, tet10 retry or stall); None: an explicit one as stiff as
-        limbfit's contact.
-    steps : limbfit's step control: its times FEBio must meet, its penalty is the explicit one.
+    penalty : multiple of FEBio's automatic penalty (above 3, tet10 retry or stall); None: an explicit one as
+        stiff as limbfit's contact.
+    steps : limbfit's step control, whose times FEBio must meet and whose penalty is the explicit one.
     force_file : name of the table of the indenter's force and position.
     title : one line in the head of the file.
     """
@@ -60,41 +76,41 @@ class FebSettings:
     title: str = ""
 
 
-def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> ToolMesh | None:
-    """Write a problem as FEBio input; returns the rigid mesh of its indenter, or of its first body, if any.
+def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> RigidMesh | None:
+    """Write a problem as FEBio input; return the rigid mesh of its indenter, or of its first body, if any.
 
     Raises
     ------
     ProblemError
         For a problem that FEBio cannot be given as it is: sticky contact, limbfit's own elements, a force
-        along an axis askew that is not all that drives a body; and as `as_written`.
+        along an axis between those of space that is not all that drives a body; and as `prepare_problem`.
     RunError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     settings = settings or FebSettings()
-    bodies, there = _checked_bodies(problem), problem
+    bodies, prepared = _check_bodies(problem), problem
     forced = any(np.asarray(body.motion.forced)[0].any() for body in problem.rigid_bodies)
-    if forced or Beginning.of(problem).seconds or problem.touch_down_s:
-        there, motions = as_written(problem, settings.steps)
-        bodies = written_bodies(there, motions)
+    if forced or Preparation.from_problem(problem).seconds or problem.touch_down_s:
+        prepared, motions = prepare_problem(problem, settings.steps)
+        bodies = build_bodies(prepared, motions)
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _lines(problem, there, bodies, settings))
+            stream.writelines(f"{line}\n" for line in _format_file(problem, prepared, bodies, settings))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
     return bodies[0].tool if bodies else None
 
 
-def _checked_bodies(problem: Problem) -> list[Body]:
-    """The rigid bodies of a problem that FEBio can be given.
+def _check_bodies(problem: Problem) -> list[FebBody]:
+    """Return the rigid bodies of a problem that FEBio can be given.
 
     Raises
     ------
     ProblemError
-        Where it cannot.
+        If FEBio cannot be given the problem.
     """
     check_element(problem, "FEBio")
-    prestrains(problem)
+    find_prestrains(problem)
     if problem.touch_down_s and any(support.factor for support in problem.supports):
         raise ProblemError("nodes that move with an indenter which touches later are not written for FEBio")
     tenses = problem.activation is not None and any(m.table().active for m in problem.materials.values())
@@ -102,28 +118,28 @@ def _checked_bodies(problem: Problem) -> list[Body]:
         raise ProblemError("nothing drives the problem: there is nothing to write for FEBio")
     if any(body.friction == "sticky" for body in problem.rigid_bodies):
         raise ProblemError("FEBio has no sticky contact", remedy='export with friction = "frictionless"')
-    bodies = written_bodies(problem)
+    bodies = build_bodies(problem)
     mesh = problem.mesh
-    own = {name for body in bodies for name in (body.name, body.patch, body.front)} | {HELD, FRAME}
+    own = {name for body in bodies for name in (body.name, body.patch, body.front)} | {FIXED_SET, FRAME_BODY}
     taken = own & {*mesh.node_sets, *mesh.face_sets, *mesh.region_names}
     if taken:
         raise ProblemError(f"a set or tissue has the name {min(taken)!r}, which is a rigid body's")
     return bodies
 
 
-def contact_of(problem: Problem, settings: FebSettings) -> Contact:
-    """The contact that is written: FEBio's automatic penalty, or an explicit one as stiff as limbfit's."""
+def build_contact(problem: Problem, settings: FebSettings) -> Contact:
+    """Build the contact to write: FEBio's automatic penalty, or an explicit one as stiff as limbfit's."""
     penalty, automatic = settings.penalty, settings.penalty is not None
     if penalty is None:
-        penalty = explicit_penalty(problem, settings.steps)
+        penalty = compute_explicit_penalty(problem, settings.steps)
     return Contact("sliding-elastic", (PATCH, FRONT), penalty, automatic, False, 0)
 
 
-def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
-    """What FEBio still does otherwise with the input than limbfit does, a line each."""
-    own, automatic = explicit_penalty(problem, settings.steps), settings.penalty is not None
+def describe_differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
+    """Describe, a line each, what FEBio still does differently with the input."""
+    own, automatic = compute_explicit_penalty(problem, settings.steps), settings.penalty is not None
     if automatic:
-        mean = mean_stiffness(contact_of(problem, settings), problem, first_step(problem))
+        mean = compute_mean_stiffness(build_contact(problem, settings), problem, compute_first_step(problem))
         contact = (
             f"contact: {settings.penalty:g} times FEBio's automatic penalty, {mean:.3g} MPa/mm in the mean, "
             f"where {own:.3g} were as stiff as limbfit's: the indenter sinks in further and the force is "
@@ -137,13 +153,13 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
     lines = [contact, "indenter: facets, without the side walls", "time: FEBio's own steps"]
     if not automatic:
         lines.append("force: within 2 % of the peak of limbfit's, as far as these go")
-    beginning = Beginning.of(problem)
-    if beginning.settling_s:
+    preparation = Preparation.from_problem(problem)
+    if preparation.settling_s:
         lines.append(
-            f"pre-strain: grows in {STRAINED_S:g} s and relaxes until {beginning.settling_s:g} s; the "
-            f"history begins at {beginning.seconds:g} s"
+            f"pre-strain: grows in {PRESTRAIN_S:g} s and relaxes until {preparation.settling_s:g} s; the "
+            f"history begins at {preparation.seconds:g} s"
         )
-    if beginning.approach_s or problem.touch_down_s:
+    if preparation.approach_s or problem.touch_down_s:
         lines.append(
             "touch-down: where limbfit has found it, which holds for these parameters alone; FEBio brings "
             "the indenter there"
@@ -153,15 +169,15 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
             "forces: begin after limbfit's first step, in which FEBio moves the body to where limbfit has "
             "found it then"
         )
-    if any(body.rail is not None for body in written_bodies(problem)):
+    if any(body.rail is not None for body in build_bodies(problem)):
         lines.append("guides: bodies under a force go along a prismatic joint, held by a penalty")
-    if any(_slides(body.friction) and body.sticking == "anchored" for body in problem.rigid_bodies):
+    if any(_has_friction(body.friction) and body.sticking == "anchored" for body in problem.rigid_bodies):
         lines.append(
             "sticking: FEBio anchors what sticks anew in every step, so that it slips on in time; "
             'limbfit does so with sticking = "stepwise"'
         )
     shapes = [body.shape for body in problem.rigid_bodies]
-    if not all(blunt(shape) for shape in shapes if isinstance(shape, Indenter)):
+    if not all(has_round_edges(shape) for shape in shapes if isinstance(shape, Indenter)):
         lines.append(
             "edge: FEBio's contact gets through with edges rounded by 2 mm, or a twentieth of the width; "
             "under one as sharp as this it may stop before the end"
@@ -170,15 +186,15 @@ def differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
 
 
 def check_element(problem: Problem, program: str) -> None:
-    """Raise `ProblemError` where another program has no such element."""
+    """Raise `ProblemError` if another program has no such element."""
     name = problem.formulation.name
     if name not in QUADRATURE:
         known = ", ".join(QUADRATURE)
         raise ProblemError(f"{program} has no element {name!r}", remedy=f"export with one of {known}")
 
 
-def check_plain(problem: Problem, program: str) -> None:
-    """Raise `ProblemError` where a problem is more than a frictionless indentation along the axis."""
+def check_simple_indentation(problem: Problem, program: str) -> None:
+    """Raise `ProblemError` if a problem is more than a frictionless indentation along the axis."""
     check_element(problem, program)
     if problem.prestretch is not None or problem.touch_down_s or problem.activation is not None:
         what = f"a limb that clamps, contraction or pre-stretch move first is not written for {program}"
@@ -195,28 +211,34 @@ def check_plain(problem: Problem, program: str) -> None:
         raise ProblemError(
             f"friction is not written for {program}", remedy='export with friction = "frictionless"'
         )
-    taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, HELD}
+    taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, FIXED_SET}
     if taken or INDENTER in problem.mesh.region_names:
         raise ProblemError(f"a set or tissue has the name {(*taken, INDENTER)[0]!r}, which is the indenter's")
 
 
-def _lines(problem: Problem, there: Problem, bodies: list[Body], settings: FebSettings) -> Iterator[str]:
-    """The file of a problem, which is ``there`` in the file's own time."""
+def _format_file(
+    problem: Problem, prepared: Problem, bodies: list[FebBody], settings: FebSettings
+) -> Iterator[str]:
+    """Write the file of a problem, which is ``there`` in the file's own time."""
     yield '<?xml version="1.0" encoding="UTF-8"?>'
-    for words in (f"limbfit: {settings.title}; mm, N, s, MPa", *differences(problem, settings)):
-        yield f"<!-- {escape(' '.join(words.replace('--', '-').split()))} -->"
-    curves, regions, settled = Curves(), problem.mesh.region_names, Beginning.of(problem).settling_s
-    ends = step_ends([body.motion for body in bodies], float(there.history.times[-1]), settled)
-    rigid = [conditions(body.name, body.motion, ends, curves) for body in bodies]
+    for remark in (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings)):
+        yield f"<!-- {escape(' '.join(remark.replace('--', '-').split()))} -->"
+    curves, regions, settled = (
+        CurveList(),
+        problem.mesh.region_names,
+        Preparation.from_problem(problem).settling_s,
+    )
+    ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
+    rigid = [format_conditions(body.name, body.motion, ends, curves) for body in bodies]
     by_step = [[line for body in rigid for line in body[k]] for k in range(len(ends))]
-    must = curves.add("must_points", _must_points(problem, settings), "STEP")
-    boundary = list(boundary_lines(there, curves))
-    loads = list(pressure_lines(there, curves))
-    controls = [list(_control(problem, settings, must, *span)) for span in pairwise([0.0, *ends])]
-    tissues = list(_materials(there, curves, settled))
+    must = curves.add("must_points", _find_must_points(problem, settings), "STEP")
+    boundary = list(format_boundary(prepared, curves))
+    loads = list(format_pressures(prepared, curves))
+    controls = [list(_format_control(problem, settings, must, *span)) for span in pairwise([0.0, *ends])]
+    tissues = list(_format_materials(prepared, curves, settled))
     rails = [line for body in bodies if body.rail is not None
-             for line in rail_lines(body.name, body.motion, body.rail, body.centre, body.width)]  # fmt: skip
-    frame = frame_mesh(bodies) if rails else None
+             for line in format_rail(body.name, body.motion, body.rail, body.centre, body.width)]  # fmt: skip
+    frame = build_frame_mesh(bodies) if rails else None
     yield '<febio_spec version="4.0">'
     yield '<Module type="solid"/>'
     if len(ends) == 1:
@@ -224,73 +246,81 @@ def _lines(problem: Problem, there: Problem, bodies: list[Body], settings: FebSe
     yield "<Globals><Constants><T>0</T><R>0</R><Fc>0</Fc></Constants></Globals>"
     yield from ("<Material>", *tissues)
     rigids = [(body.name, body.centre) for body in bodies]
-    rigids += [] if frame is None else [(FRAME, frame.points[0])]
+    rigids += [] if frame is None else [(FRAME_BODY, frame.points[0])]
     for i, (name, centre) in enumerate(rigids, len(regions) + 1):
         yield (
             f'<material id="{i}" name={quoteattr(name)} type="rigid body"><density>1</density>'
-            f"<center_of_mass>{row(centre)}</center_of_mass></material>"
+            f"<center_of_mass>{format_row(centre)}</center_of_mass></material>"
         )
     yield "</Material>"
-    meshes = {body.name: body.tool for body in bodies} | ({} if frame is None else {FRAME: frame})
-    yield from mesh_lines(problem, bodies, meshes)
-    yield from domain_lines(problem, meshes)
-    data = [*axes_of_cells(problem), *prestrains_of_cells(prestrains(problem))]
+    meshes = {body.name: body.tool for body in bodies} | ({} if frame is None else {FRAME_BODY: frame})
+    yield from format_mesh(problem, bodies, meshes)
+    yield from format_domains(problem, meshes)
+    data = [*format_cell_axes(problem), *format_cell_prestrains(find_prestrains(problem))]
     if data:
         yield from ("<MeshData>", *data, "</MeshData>")
     yield from ("<Boundary>", *boundary, "</Boundary>")
     everywhere = rails + (by_step[0] if len(ends) == 1 else [])
     if frame is not None:
-        everywhere += conditions(FRAME, HELD_STILL, ends[-1:], curves)[0]
+        everywhere += format_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]
     if everywhere:
         yield from ("<Rigid>", *everywhere, "</Rigid>")
     if bodies:
-        contacts = (line for body in bodies for line in _contact(problem, body, settings))
+        contacts = (line for body in bodies for line in _format_contact(problem, body, settings))
         yield from ("<Contact>", *contacts, "</Contact>")
     if loads:
         yield from ("<Loads>", *loads, "</Loads>")
-    yield from curves.lines()
+    yield from curves.format_lines()
     if len(ends) > 1:
         yield "<Step>"
         for k, (control, lines) in enumerate(zip(controls, by_step), 1):
             yield from (f'<step id="{k}">', *control, "<Rigid>", *lines, "</Rigid>", "</step>")
         yield "</Step>"
-    yield from _output(range(len(regions) + 1, len(regions) + len(bodies) + 1), settings)
+    yield from _format_output(range(len(regions) + 1, len(regions) + len(bodies) + 1), settings)
     yield "</febio_spec>"
 
 
-def _must_points(problem: Problem, settings: FebSettings) -> Array:
-    """Times (k,) that FEBio must meet and the largest step up to each, s."""
-    beginning = Beginning.of(problem)
-    own = beginning.seconds + schedule(problem.history, settings.steps, problem.turns)
-    times, largest = np.append(0.0, own), np.full(len(own) + 1, largest_step(problem))
-    if beginning.settling_s:
-        rest = beginning.settling_s - STRAINED_S
-        settling = [STRAINED_S, beginning.settling_s] if rest else [STRAINED_S]
+def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
+    """Return the times (k,) that FEBio must meet and the largest step up to each, s."""
+    preparation = Preparation.from_problem(problem)
+    own = preparation.seconds + schedule(problem.history, settings.steps, problem.turns)
+    times, largest = np.append(0.0, own), np.full(len(own) + 1, compute_largest_step(problem))
+    if preparation.settling_s:
+        rest = preparation.settling_s - PRESTRAIN_S
+        settling = [PRESTRAIN_S, preparation.settling_s] if rest else [PRESTRAIN_S]
         times = np.concatenate([[0.0], settling, own])
-        largest = np.concatenate([[STRAINED_S / 10.0], [STRAINED_S / 10.0, rest / 10.0][: len(settling)],
+        largest = np.concatenate([[PRESTRAIN_S / 10.0], [PRESTRAIN_S / 10.0, rest / 10.0][: len(settling)],
                                   largest[1:]])  # fmt: skip
     return np.column_stack([times, largest])
 
 
-def _materials(there: Problem, curves: Curves, settled: float) -> Iterator[str]:
-    """The tissues, with the curves of their contraction and of their pre-strain."""
-    axes, strained, course = directions(there), prestrains(there), 0
-    if there.activation is not None:
-        points = np.column_stack([np.asarray(there.activation.times), np.asarray(there.activation.shares)])
+def _format_materials(problem: Problem, curves: CurveList, settled: float) -> Iterator[str]:
+    """Write the tissues, with the curves of their contraction and of their pre-strain."""
+    axes, strained, course = find_fibre_directions(problem), find_prestrains(problem), 0
+    if problem.activation is not None:
+        points = np.column_stack(
+            [np.asarray(problem.activation.times), np.asarray(problem.activation.shares)]
+        )
         course = curves.add("activation", points)
-    ramp = curves.add("prestrain", np.array([[0.0, 0.0], [STRAINED_S, 1.0]])) if settled else 0
-    for i, name in enumerate(there.mesh.region_names, 1):
-        prestrain = prestrain_of(name, strained.get(name), ramp)
-        yield from material_lines(i, name, there.materials[name], axis_of(axes.get(name)), course, prestrain)
+    ramp = curves.add("prestrain", np.array([[0.0, 0.0], [PRESTRAIN_S, 1.0]])) if settled else 0
+    for i, name in enumerate(problem.mesh.region_names, 1):
+        prestrain = format_prestrain(name, strained.get(name), ramp)
+        yield from format_material(
+            i, name, problem.materials[name], format_axis(axes.get(name)), course, prestrain
+        )
 
 
-def _control(problem: Problem, settings: FebSettings, must: int, begin: float, end: float) -> Iterator[str]:
-    """Steps that FEBio grows and halves; stiff contact needs a tangent in every iteration.
+def _format_control(
+    problem: Problem, settings: FebSettings, must: int, begin: float, end: float
+) -> Iterator[str]:
+    """Write the steps that FEBio enlarges and halves; stiff contact needs a tangent in every iteration.
 
     With an explicit penalty quasi-Newton updates stall.
     """
-    settles = end <= Beginning.of(problem).settling_s
-    size = _dividing(end - begin, 0.25 * (STRAINED_S / 10.0 if settles else largest_step(problem)))
+    settles = end <= Preparation.from_problem(problem).settling_s
+    size = _divide_evenly(
+        end - begin, 0.25 * (PRESTRAIN_S / 10.0 if settles else compute_largest_step(problem))
+    )
     updates, reformations = (0, 60) if settings.penalty is None else (10, 25)
     yield f"<Control><analysis>STATIC</analysis><time_steps>{round((end - begin) / size)}</time_steps>"
     yield f"<step_size>{size!r}</step_size>"
@@ -298,7 +328,7 @@ def _control(problem: Problem, settings: FebSettings, must: int, begin: float, e
     yield '<time_stepper type="default"><max_retries>8</max_retries><opt_iter>15</opt_iter>'
     yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="{must}">1</dtmax><aggressiveness>1</aggressiveness>'
     yield "</time_stepper>"
-    smooth = not problem.pressures and not any(_slides(body.friction) for body in problem.rigid_bodies)
+    smooth = not problem.pressures and not any(_has_friction(body.friction) for body in problem.rigid_bodies)
     matrix = "symmetric" if smooth else "non-symmetric"
     yield f'<solver type="solid"><symmetric_stiffness>{matrix}</symmetric_stiffness>'
     yield f"<max_refs>{reformations}</max_refs>"
@@ -306,42 +336,42 @@ def _control(problem: Problem, settings: FebSettings, must: int, begin: float, e
     yield f'<qn_method type="BFGS"><max_ups>{updates}</max_ups></qn_method></solver></Control>'
 
 
-def _slides(friction: str | float) -> bool:
-    """Whether a body slides with friction."""
+def _has_friction(friction: str | float) -> bool:
+    """True if a body slides with friction."""
     return friction not in ("frictionless", 0.0)
 
 
-def largest_step(problem: Problem) -> float:
-    """The largest step, s: a sixteenth of the first way in, half of that under sharp edges."""
+def compute_largest_step(problem: Problem) -> float:
+    """Return the largest step, s: a sixteenth of the first way in, half of that under sharp edges."""
     ways = [] if problem.indenter is None else [problem.history.loading_s - problem.touch_down_s]
     for body in problem.bodies:
         ends = [*body.motion.turns, body.motion.times[-1]]
         ways += [float(ends[0])] if body.motion.values.any() else []
     shapes = [body.shape for body in problem.rigid_bodies]
-    round_enough = all(blunt(shape) for shape in shapes if isinstance(shape, Indenter))
+    round_enough = all(has_round_edges(shape) for shape in shapes if isinstance(shape, Indenter))
     return min(ways, default=float(problem.history.times[-1])) / (16.0 if round_enough else 32.0)
 
 
-def first_step(problem: Problem) -> float:
-    """The first step, s: a quarter of the largest at most, and a whole part of the time."""
-    return _dividing(float(problem.history.times[-1]), 0.25 * largest_step(problem))
+def compute_first_step(problem: Problem) -> float:
+    """Return the first step, s: at most a quarter of the largest, and a whole fraction of the time."""
+    return _divide_evenly(float(problem.history.times[-1]), 0.25 * compute_largest_step(problem))
 
 
-def _dividing(span: float, size: float) -> float:
-    """A whole part of a span of time, not above ``size``, s."""
+def _divide_evenly(span: float, size: float) -> float:
+    """Return a whole fraction of a span of time, not above ``size``, s."""
     return span / float(np.ceil(span / size))
 
 
-def _contact(problem: Problem, body: Body, settings: FebSettings) -> Iterator[str]:
-    """The way of the reference cases; the search reaches as far as a body goes in, and half again."""
+def _format_contact(problem: Problem, body: FebBody, settings: FebSettings) -> Iterator[str]:
+    """Write the contact as in the reference cases; the search reaches half again as far as a body goes in."""
     ways = np.where(body.motion.free, 0.0, np.abs(body.motion.values))[:, :3]
     reach = max(1.5 * float(ways.max()), 10.0 if body.motion.free.any() else 2.0)
     pair = quoteattr(body.pair)
     yield f'<contact name={pair} type="sliding-elastic" surface_pair={pair}>'
-    contact = contact_of(problem, settings)
+    contact = build_contact(problem, settings)
     yield f"<laugon>PENALTY</laugon><penalty>{contact.penalty!r}</penalty>"
     yield f"<auto_penalty>{contact.automatic:d}</auto_penalty>"
-    smooth = not _slides(body.friction)
+    smooth = not _has_friction(body.friction)
     yield f"<two_pass>0</two_pass><symmetric_stiffness>{smooth:d}</symmetric_stiffness>"
     yield "<search_tol>0.01</search_tol>"
     if not smooth:
@@ -349,7 +379,7 @@ def _contact(problem: Problem, body: Body, settings: FebSettings) -> Iterator[st
     yield f"<search_radius>{reach!r}</search_radius></contact>"
 
 
-def _output(numbers: Iterable[int], settings: FebSettings) -> Iterator[str]:
+def _format_output(numbers: Iterable[int], settings: FebSettings) -> Iterator[str]:
     variables = ("displacement", "stress", "relative volume", "contact pressure", "contact gap")
     yield '<Output><plotfile type="febio">' + "".join(f'<var type="{name}"/>' for name in variables)
     items = ",".join(str(number) for number in numbers)

@@ -1,1 +1,1 @@
-"""Inputs of FEBio as arrays, laws and conditions; nothing is solved here."""
+"""Inputs of FEBio read as arrays, laws and conditions; nothing is solved here."""

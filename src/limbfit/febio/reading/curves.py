@@ -11,21 +11,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .tree import Node
+from ...arrays import Array, Indices
+from .tree import XmlNode
 
-Array = NDArray[np.float64]
 INTERPOLATIONS = ("LINEAR", "STEP", "SMOOTH", "SMOOTH STEP")
 EXTENSIONS = ("CONSTANT", "EXTRAPOLATE", "REPEAT", "REPEAT OFFSET")
-LONGEST = 400  # characters of an expression
+MAX_EXPRESSION_LENGTH = 400  # characters of an expression
 
 
 @dataclass(frozen=True)
-class Curve:
+class LoadCurve:
     """A value over time: ``points (n, 2)``, time (s) and value, with what lies between and beyond them.
 
-    ``formula`` takes their place where it is given: the value at times (k,).
+    ``formula`` takes their place if it is given: it returns the value at times (k,).
     """
 
     points: Array
@@ -35,7 +34,7 @@ class Curve:
     formula: Callable[[Array], Array] | None = field(default=None, compare=False)
 
     def at(self, times: float | Array) -> Array:
-        """Values at times (s), of their shape."""
+        """Return values at times (s), of their shape."""
         t = np.asarray(times, dtype=float)
         if self.formula is not None:
             return np.broadcast_to(self.formula(t), t.shape)
@@ -55,8 +54,8 @@ class Curve:
             inside = inside + self._beyond(t)
         return np.asarray(inside + offset)
 
-    def after(self, seconds: float) -> Curve:
-        """The same where time begins at what were so many seconds."""
+    def shift(self, seconds: float) -> LoadCurve:
+        """Return the curve with its time beginning so many seconds later."""
         given = self.formula
         if given is not None:
             return replace(self, formula=lambda t: given(t + seconds))
@@ -64,7 +63,7 @@ class Curve:
 
     @property
     def corners(self) -> Array | None:
-        """Times (n,) between which the value is linear; None where there are none such."""
+        """Times (n,) between which the value is linear; None if there are none such."""
         if self.formula is None and self.interpolate == "LINEAR" and not self.extend.startswith("REPEAT"):
             return np.asarray(self.points[:, 0])
         return None
@@ -83,11 +82,11 @@ class Curve:
         after = self._parabola(t, np.minimum(n - 1, len(x) - 3))
         return np.asarray(before + (after - before) * w)
 
-    def _parabola(self, t: Array, first: NDArray[np.int64]) -> Array:
-        """The parabola through three points from ``first`` on, at ``t``."""
+    def _parabola(self, t: Array, start: Indices) -> Array:
+        """Return the parabola through three points from ``start`` on, at ``t``."""
         (a, b, c), (f, g, h) = (
-            (self.points[first + i, 0] for i in range(3)),
-            (self.points[first + i, 1] for i in range(3)),
+            (self.points[start + i, 0] for i in range(3)),
+            (self.points[start + i, 1] for i in range(3)),
         )
         return np.asarray(
             f * (c - t) * (b - t) / ((c - a) * (b - a))
@@ -96,7 +95,7 @@ class Curve:
         )
 
     def _beyond(self, t: Array) -> Array:
-        """What the last slope adds before the first and after the last point."""
+        """Return what the last slope adds before the first and after the last point."""
         x = self.points[:, 0]
         if self.interpolate in ("STEP", "SMOOTH STEP"):
             return np.zeros(t.shape)
@@ -107,39 +106,41 @@ class Curve:
         return np.asarray(low * np.minimum(t - x[0], 0.0) + high * np.maximum(t - x[-1], 0.0))
 
 
-def read_curves(section: Node | None) -> dict[int, Curve]:
-    """Load curves by number.
+def read_curves(section: XmlNode | None) -> dict[int, LoadCurve]:
+    """Read the load curves by number.
 
     Raises
     ------
     ProblemError
         For controllers, interpolations and extensions that limbfit does not have.
     """
-    curves: dict[int, Curve] = {}
+    curves: dict[int, LoadCurve] = {}
     for node in section or ():
         number = node.identity()
         if number in curves:
-            raise node.refuse(f"load controller {number} is there twice")
+            raise node.error(f"load controller {number} is there twice")
         kind = node.attribute("type")
         if kind == "math":
-            curves[number] = Curve(np.zeros((0, 2)), "MATH", node.line, formula=_formula(node.child("math")))
+            curves[number] = LoadCurve(
+                np.zeros((0, 2)), "MATH", node.line, formula=_read_formula(node.child("math"))
+            )
         elif kind == "loadcurve":
-            curves[number] = _curve(node)
+            curves[number] = _read_curve(node)
         else:
-            raise node.refuse(f"load controllers of type {kind!r} are not supported, only loadcurve and math")
+            raise node.error(f"load controllers of type {kind!r} are not supported, only loadcurve and math")
     return curves
 
 
-def _curve(node: Node) -> Curve:
+def _read_curve(node: XmlNode) -> LoadCurve:
     points = np.array([point.numbers(2) for point in node.child("points")]).reshape(-1, 2)
     if not len(points) or (np.diff(points[:, 0]) <= 0).any():
-        raise node.refuse("a load curve needs points that go forward in time")
+        raise node.error("a load curve needs points that go forward in time")
     chosen = {}
     for tag, known in (("interpolate", INTERPOLATIONS), ("extend", EXTENSIONS)):
         chosen[tag] = node.string(tag, known[0]).upper()
         if chosen[tag] not in known:
-            raise node.child(tag).refuse(f"{chosen[tag]!r} is not supported", "use " + ", ".join(known))
-    return Curve(points, chosen["interpolate"], node.line, chosen["extend"])
+            raise node.child(tag).error(f"{chosen[tag]!r} is not supported", "use " + ", ".join(known))
+    return LoadCurve(points, chosen["interpolate"], node.line, chosen["extend"])
 
 
 _OPERATORS: dict[type, Callable[[Array, Array], Array]] = {
@@ -156,24 +157,24 @@ _FUNCTIONS: dict[str, Callable[[Array], Array]] = {
 }  # fmt: skip
 
 
-def _formula(node: Node) -> Callable[[Array], Array]:
-    """The expression of the time ``t`` that an element holds; only arithmetic is read, nothing is run."""
+def _read_formula(node: XmlNode) -> Callable[[Array], Array]:
+    """Read an element's expression of the time ``t``; only arithmetic is read, nothing is run."""
     text = node.text.strip()
     wrong = f"{text[:40]!r} is no expression of t that limbfit reads"
     remedy = "use numbers, t, pi, + - * / ^ and " + ", ".join(_FUNCTIONS)
-    if len(text) > LONGEST or "**" in text:
-        raise node.refuse(wrong, remedy)
+    if len(text) > MAX_EXPRESSION_LENGTH or "**" in text:
+        raise node.error(wrong, remedy)
     try:
         tree = ast.parse(text.replace("^", "**"), mode="eval").body
         _evaluate(tree, np.zeros(1))
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
-        raise node.refuse(wrong, remedy) from None
+        raise node.error(wrong, remedy) from None
 
     def value(t: Array) -> Array:
         with np.errstate(all="ignore"):
             found = np.asarray(_evaluate(tree, t), dtype=float)
         if not np.isfinite(found).all():
-            raise node.refuse(f"{text[:40]!r} is not finite at a time of the analysis")
+            raise node.error(f"{text[:40]!r} is not finite at a time of the analysis")
         return found
 
     return value

@@ -7,13 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, Indices
 from ...errors import ProblemError
-from .tree import Node
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from .tree import XmlNode
 
 CELL_NODES = {"tet4": 4, "tet10": 10, "hex8": 8, "penta6": 6, "tri3": 3, "tri6": 6, "quad4": 4}
 FACE_NODES = {"tri3": 3, "tri6": 6, "quad4": 4}
@@ -33,9 +30,9 @@ FORMULATIONS = {
 class Part:
     """Cells (m, k) of one type in FEBio's (and VTK's) node order.
 
-    ``material`` by name, ``ids (m,)`` FEBio's numbers, ``element`` the row of limbfit's element table
-    (empty for a type that limbfit cannot deform), ``line`` where it stands in the file, ``thickness`` that
-    of shells, mm.
+    ``material`` is given by name, ``ids (m,)`` are FEBio's numbers, ``element`` is the row of limbfit's
+    element table (empty for a type that limbfit cannot deform), ``line`` the place in the file, ``thickness``
+    that of shells, mm.
     """
 
     cell_type: str
@@ -49,7 +46,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Geometry:
-    """What stands in ``<Mesh>`` and ``<MeshDomains>``; nodes are numbered from 0 in the order of the file.
+    """The content of ``<Mesh>`` and ``<MeshDomains>``; nodes are numbered from 0 in the order of the file.
 
     ``element_sets`` hold FEBio's numbers; every part is one, too. ``blocks`` are ``<Nodes>`` with a name,
     which FEBio takes as node sets; ``part_lists`` name parts.
@@ -66,7 +63,7 @@ class Geometry:
     part_lists: Mapping[str, tuple[str, ...]]
 
 
-def read_geometry(root: Node, materials: Iterable[str]) -> Geometry:
+def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
     """Read ``<Mesh>`` and ``<MeshDomains>``.
 
     Raises
@@ -77,87 +74,89 @@ def read_geometry(root: Node, materials: Iterable[str]) -> Geometry:
     mesh = root.child("Mesh")
     nodes = [node for group in mesh.all("Nodes") for node in group]
     if not nodes:
-        raise mesh.refuse("has no nodes")
-    numbers = _Numbers(nodes)
-    owners = _owners(root.child("MeshDomains"), materials)
+        raise mesh.error("has no nodes")
+    numbers = _NodeNumbers(nodes)
+    owners = _read_domains(root.child("MeshDomains"), materials)
     parts, seen = {}, set[int]()
-    for name, group in _named(mesh, "Elements"):
+    for name, group in _find_named(mesh, "Elements"):
         if name not in owners:
-            raise group.refuse(f"part {name!r} has no domain, hence no material")
-        parts[name] = _part(group, owners[name], numbers, seen)
+            raise group.error(f"part {name!r} has no domain, hence no material")
+        parts[name] = _read_part(group, owners[name], numbers, seen)
     for name, domain in owners.items():
         if name not in parts:
-            raise domain.refuse(f"there is no part {name!r}")
-    surfaces = {name: _faces(group, numbers) for name, group in _named(mesh, "Surface")}
+            raise domain.error(f"there is no part {name!r}")
+    surfaces = {name: _read_faces(group, numbers) for name, group in _find_named(mesh, "Surface")}
     pairs = {}
-    for name, pair in _named(mesh, "SurfacePair"):
+    for name, pair in _find_named(mesh, "SurfacePair"):
         both = pair.string("primary"), pair.string("secondary")
         for surface in both:
             if surface not in surfaces:
-                raise pair.refuse(f"there is no surface {surface!r}")
+                raise pair.error(f"there is no surface {surface!r}")
         pairs[name] = both
-    sets = {name: _node_set(group, numbers) for name, group in _named(mesh, "NodeSet")}
+    sets = {name: _read_node_set(group, numbers) for name, group in _find_named(mesh, "NodeSet")}
     named = [group for group in mesh.all("Nodes") if group.attributes.get("name")]
-    blocks = {group.attributes["name"]: np.array(numbers.of(group, _identities(group))) for group in named}
+    blocks = {
+        group.attributes["name"]: np.array(numbers.of(group, _read_identities(group))) for group in named
+    }
     elements = {name: part.ids for name, part in parts.items()}
-    elements |= {name: np.array(_listed(group)) for name, group in _named(mesh, "ElementSet")}
+    elements |= {name: np.array(_read_ids(group)) for name, group in _find_named(mesh, "ElementSet")}
     points = np.array([node.numbers(3) for node in nodes])
-    lists = _part_lists(mesh, parts)
+    lists = _read_part_lists(mesh, parts)
     return Geometry(points, numbers.ids, parts, sets, elements, surfaces, pairs, blocks, lists)
 
 
-class _Numbers:
+class _NodeNumbers:
     """FEBio's node numbers and the places of the nodes."""
 
-    def __init__(self, nodes: list[Node]) -> None:
+    def __init__(self, nodes: list[XmlNode]) -> None:
         self.place: dict[int, int] = {}
         for i, node in enumerate(nodes):
             if self.place.setdefault(node.identity(), i) != i:
-                raise node.refuse(f"node {node.identity()} is there twice")
+                raise node.error(f"node {node.identity()} is there twice")
         self.ids = np.array(list(self.place), dtype=np.int64)
 
-    def of(self, node: Node, ids: list[int]) -> list[int]:
+    def of(self, node: XmlNode, ids: list[int]) -> list[int]:
         try:
             return [self.place[i] for i in ids]
         except KeyError as error:
-            raise node.refuse(f"there is no node {error.args[0]}") from None
+            raise node.error(f"there is no node {error.args[0]}") from None
 
 
-def _named(mesh: Node, tag: str) -> list[tuple[str, Node]]:
-    found: dict[str, Node] = {}
+def _find_named(mesh: XmlNode, tag: str) -> list[tuple[str, XmlNode]]:
+    found: dict[str, XmlNode] = {}
     for group in mesh.all(tag):
         name = group.attribute("name")
         if name in found:
-            raise group.refuse(f"{name!r} is there twice")
+            raise group.error(f"{name!r} is there twice")
         found[name] = group
     return list(found.items())
 
 
-def _part_lists(mesh: Node, parts: Mapping[str, Part]) -> dict[str, tuple[str, ...]]:
+def _read_part_lists(mesh: XmlNode, parts: Mapping[str, Part]) -> dict[str, tuple[str, ...]]:
     lists = {}
-    for name, group in _named(mesh, "PartList"):
+    for name, group in _find_named(mesh, "PartList"):
         lists[name] = tuple(part.strip() for part in group.text.split(","))
         for part in lists[name]:
             if part not in parts:
-                raise group.refuse(f"there is no part {part!r}")
+                raise group.error(f"there is no part {part!r}")
     return lists
 
 
-def _owners(section: Node, materials: Iterable[str]) -> dict[str, Node]:
-    known, owners = set(materials), dict[str, Node]()
+def _read_domains(section: XmlNode, materials: Iterable[str]) -> dict[str, XmlNode]:
+    known, owners = set(materials), dict[str, XmlNode]()
     for domain in section:
         name = domain.attribute("name")
         if domain.tag not in ("SolidDomain", "ShellDomain"):
-            raise domain.refuse("this kind of domain is not supported")
+            raise domain.error("this kind of domain is not supported")
         if domain.attribute("mat") not in known:
-            raise domain.refuse(f"there is no material {domain.attribute('mat')!r}")
+            raise domain.error(f"there is no material {domain.attribute('mat')!r}")
         if name in owners:
-            raise domain.refuse(f"part {name!r} has two domains")
+            raise domain.error(f"part {name!r} has two domains")
         owners[name] = domain
     return owners
 
 
-def _part(group: Node, domain: Node, numbers: _Numbers, seen: set[int]) -> Part:
+def _read_part(group: XmlNode, domain: XmlNode, numbers: _NodeNumbers, used_ids: set[int]) -> Part:
     # FEBio also takes the quadrature in the place of the type: TET10G4, HEX8G8, ..
     given = group.attribute("type")
     cell_type, rule = given.lower(), domain.attributes.get("elem_type", "")
@@ -165,28 +164,28 @@ def _part(group: Node, domain: Node, numbers: _Numbers, seen: set[int]) -> Part:
         if given == name:
             cell_type, rule = kind, rule or name
     if cell_type not in CELL_NODES:
-        raise group.refuse(f"elements of type {given!r} are not supported")
+        raise group.error(f"elements of type {given!r} are not supported")
     count = CELL_NODES[cell_type]
     ids, cells = [], []
     for element in group:
         number, corners = element.identity(), element.integers()
-        if number in seen:
-            raise element.refuse(f"element {number} is there twice")
+        if number in used_ids:
+            raise element.error(f"element {number} is there twice")
         if len(corners) != count:
-            raise element.refuse(f"element {number} has {len(corners)} nodes; {cell_type} has {count}")
-        seen.add(number)
+            raise element.error(f"element {number} has {len(corners)} nodes; {cell_type} has {count}")
+        used_ids.add(number)
         ids.append(number)
         cells.append(numbers.of(element, corners))
     if not ids:
-        raise group.refuse("has no elements")
-    formulation = _formulation(domain, cell_type, rule)
+        raise group.error("has no elements")
+    formulation = _choose_formulation(domain, cell_type, rule)
     material = domain.attribute("mat")
     thickness = domain.number("shell_thickness", 0.0)
     return Part(cell_type, np.array(cells), material, np.array(ids), formulation, group.line, thickness)
 
 
-def _formulation(domain: Node, cell_type: str, rule: str) -> str:
-    """Limbfit's element, or nothing where the cell type is one for rigid bodies only."""
+def _choose_formulation(domain: XmlNode, cell_type: str, rule: str) -> str:
+    """Return limbfit's element, or an empty text if the cell type is one for rigid bodies only."""
     kind = domain.attributes.get("type", "")
     if kind in ("", "rigid-solid", "rigid-shell") or cell_type not in ("tet4", "tet10", "hex8"):
         known = True
@@ -196,51 +195,51 @@ def _formulation(domain: Node, cell_type: str, rule: str) -> str:
         if (cell_type, rule, kind) == ("tet10", "TET10G4", "three-field-solid"):
             return "tet10p0"
     if not known or (cell_type in ("tet4", "tet10", "hex8") and (cell_type, rule) not in FORMULATIONS):
-        raise domain.refuse(f"{cell_type} as {kind or rule!r} is not supported")
+        raise domain.error(f"{cell_type} as {kind or rule!r} is not supported")
     return FORMULATIONS.get((cell_type, rule), "")
 
 
-def _faces(group: Node, numbers: _Numbers) -> Indices:
+def _read_faces(group: XmlNode, numbers: _NodeNumbers) -> Indices:
     kinds = {face.tag for face in group}
     if len(kinds) != 1 or not kinds <= set(FACE_NODES):
-        raise group.refuse(f"a surface needs faces of one type of {', '.join(FACE_NODES)}")
+        raise group.error(f"a surface needs faces of one type of {', '.join(FACE_NODES)}")
     count = FACE_NODES[kinds.pop()]
     faces = []
     for face in group:
         corners = face.integers()
         if len(corners) != count:
-            raise face.refuse(f"has {len(corners)} nodes, not {count}")
+            raise face.error(f"has {len(corners)} nodes, not {count}")
         faces.append(numbers.of(face, corners))
     return np.array(faces)
 
 
-def _node_set(group: Node, numbers: _Numbers) -> Indices:
-    return np.array(numbers.of(group, _listed(group, len(numbers.ids))), dtype=np.int64)
+def _read_node_set(group: XmlNode, numbers: _NodeNumbers) -> Indices:
+    return np.array(numbers.of(group, _read_ids(group, len(numbers.ids))), dtype=np.int64)
 
 
-def _listed(group: Node, most: int = 10**7) -> list[int]:
-    """The numbers of a set; ``most`` are in a range."""
+def _read_ids(group: XmlNode, most: int = 10**7) -> list[int]:
+    """Read the numbers of a set; a range holds at most ``most``."""
     if group.children:  # FEBio 3: <n id="1"/>
-        return _identities(group)
+        return _read_identities(group)
     ids: list[int] = []
     for text in group.text.replace(",", " ").split():
         first, _, last = text.partition(":")
         try:
             low, high = int(first), int(last or first)
         except ValueError:
-            raise group.refuse(f"{text[:40]!r} is no number") from None
+            raise group.error(f"{text[:40]!r} is no number") from None
         if not 0 <= high - low < most:
-            raise group.refuse(f"there are no items {low} to {high}")
+            raise group.error(f"there are no items {low} to {high}")
         ids += range(low, high + 1)
     return ids
 
 
-def _identities(group: Node) -> list[int]:
+def _read_identities(group: XmlNode) -> list[int]:
     return [node.identity() for node in group]
 
 
-def node_set(geometry: Geometry, name: str, node: Node) -> Indices:
-    """Nodes of a set, or, as ``@surface:name``, of a surface; ``node`` is what asks for it.
+def find_node_set(geometry: Geometry, name: str, node: XmlNode) -> Indices:
+    """Return the nodes of a set or, as ``@surface:name``, of a surface; ``node`` is what asks for it.
 
     ``@elem_set:`` and ``@part_list:`` stand for the nodes of elements (FEBio User Manual 4.0, section 3.6).
     """
@@ -251,20 +250,20 @@ def node_set(geometry: Geometry, name: str, node: Node) -> Indices:
     if kind == "@surface" and of in geometry.surfaces:
         return np.unique(geometry.surfaces[of])
     if kind == "@elem_set" and of in geometry.element_sets:
-        return nodes_of(geometry.parts.values(), geometry.element_sets[of])
+        return collect_nodes(geometry.parts.values(), geometry.element_sets[of])
     if kind == "@part_list" and of in geometry.part_lists:
-        return nodes_of([geometry.parts[part] for part in geometry.part_lists[of]])
-    raise node.refuse(f"there is no node set {name!r}")
+        return collect_nodes([geometry.parts[part] for part in geometry.part_lists[of]])
+    raise node.error(f"there is no node set {name!r}")
 
 
-def nodes_of(parts: Iterable[Part], elements: Indices | None = None) -> Indices:
-    """Nodes of the cells of parts, or of those among them that have these of FEBio's numbers."""
+def collect_nodes(parts: Iterable[Part], elements: Indices | None = None) -> Indices:
+    """Return the nodes of the cells of parts, or of those cells that have these of FEBio's numbers."""
     cells = [part.cells if elements is None else part.cells[np.isin(part.ids, elements)] for part in parts]
     return np.unique(np.concatenate([np.zeros(0, np.int64), *(cell.ravel() for cell in cells)]))
 
 
-def boundary(parts: Iterable[Part]) -> list[Indices]:
-    """Faces (3 or 4 corners each, as in the parts) that belong to one cell only; shells are faces."""
+def find_boundary_faces(parts: Iterable[Part]) -> list[Indices]:
+    """Return the faces (3 or 4 corners, as in the parts) that belong to one cell only; shells are faces."""
     single: dict[tuple[int, ...], Indices] = {}
     for part in parts:
         for local in _FACES[part.cell_type]:
@@ -275,8 +274,8 @@ def boundary(parts: Iterable[Part]) -> list[Indices]:
     return list(single.values())
 
 
-def closed(faces: Iterable[Indices]) -> bool:
-    """Whether every edge of the faces belongs to two of them."""
+def is_closed(faces: Iterable[Indices]) -> bool:
+    """True if every edge of the faces belongs to two of them."""
     edges = Counter(
         frozenset(pair) for face in faces for pair in zip(face.tolist(), np.roll(face, -1).tolist())
     )
@@ -295,32 +294,33 @@ _FACES: dict[str, tuple[list[int], ...]] = {
 }
 
 
-def triangles(faces: Iterable[Indices]) -> Indices:
-    """Faces of three or four corners as triangles (m, 3)."""
+def split_into_triangles(faces: Iterable[Indices]) -> Indices:
+    """Split faces of three or four corners into triangles (m, 3)."""
     out = []
     for face in faces:
         out += [face[:3]] if len(face) == 3 else [face[[0, 1, 2]], face[[0, 2, 3]]]
     return np.array(out, dtype=np.int64).reshape(-1, 3)
 
 
-def bulging(points: Array, faces: Iterable[Indices]) -> Indices:
-    """Faces around a body as triangles (m, 3), those of four corners parted where they bulge.
+def split_convexly(points: Array, faces: Iterable[Indices]) -> Indices:
+    """Split faces around a body into triangles (m, 3), those of four corners where they bulge.
 
-    A warped face parted along its other diagonal has a valley: there the way out of the body jumps from one
-    side to the other, and contact has no smooth energy.  The faces run all one way round, seen from outside.
+    A warped face split along its other diagonal has a valley: there the way out of the body jumps from one
+    side to the other, and contact has no smooth energy. The faces all run in the same sense, seen from
+    outside.
     """
     faces = list(faces)
-    corners = points[triangles(faces)]
+    corners = points[split_into_triangles(faces)]
     outward = np.sign(np.linalg.det(corners - corners.mean(axis=(0, 1))).sum())
     parted = []
     for face in faces:
         a, b, c, d = points[face[[0, 1, 2, -1]]]
         valley = outward * float(np.cross(b - a, c - a) @ (d - a)) > 0.0
         parted.append(np.roll(face, -1) if valley else face)
-    return triangles(parted)
+    return split_into_triangles(parted)
 
 
-def refuse_part(part: Part, name: str, what: str) -> ProblemError:
-    """The error that names a part and its line."""
+def part_error(part: Part, name: str, what: str) -> ProblemError:
+    """Return the error that names a part and its line."""
     ids = f"elements {part.ids.min()} to {part.ids.max()}"
     return ProblemError(f"part {name!r} ({part.cell_type}, {ids}): {what}", place=f"line {part.line}")

@@ -1,6 +1,6 @@
 """Materials of FEBio as limbfit's: uncoupled hyperelastic laws, fibres beside and Prony terms around them.
 
-A contraction may stand beside, a pre-strain around all of it (`straining`).
+A contraction may stand beside, and a pre-strain around all of it (`tissue_state`).
 
 Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
 """
@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
 from ...fe import Contractile, Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from ...fe.materials import Uncoupled
-from .tree import Node
-
-Array = NDArray[np.float64]
+from .tree import XmlNode
 
 ELASTIC = {
     "Ogden": {f"{letter}{i}" for letter in "cm" for i in range(1, 7)},
@@ -42,8 +40,7 @@ _VOLUMETRIC = {
 
 @dataclass(frozen=True)
 class RigidMaterial:
-    """A rigid material: its number in the file, its centre of mass (3,), mm (NaN: to be found), and its
-    line."""
+    """A rigid material: its number in the file, centre of mass (3,), mm (NaN: to be found), and line."""
 
     number: int
     centre: Array
@@ -51,11 +48,11 @@ class RigidMaterial:
 
 
 def read_materials(
-    section: Node, used: Container[str]
+    section: XmlNode, used: Container[str]
 ) -> tuple[dict[str, Material], dict[str, RigidMaterial], tuple[str, ...]]:
-    """Deformable and rigid materials by name, and a note for those that limbfit does not have.
+    """Read deformable and rigid materials by name, with notes on those that limbfit does not have.
 
-    Those are an error where a part is made of one (``used``: their names).
+    Those are an error if a part is made of one (``used``: their names).
 
     Raises
     ------
@@ -68,7 +65,7 @@ def read_materials(
     for node in section:
         name, number = node.attribute("name"), node.identity()
         if name in soft or name in rigid or number in numbers:
-            raise node.refuse(f"material {name!r} or its id is there twice")
+            raise node.error(f"material {name!r} or its id is there twice")
         numbers.add(number)
         if node.attribute("type") == "rigid body":
             centre = node.find("center_of_mass")
@@ -76,7 +73,7 @@ def read_materials(
             rigid[name] = RigidMaterial(number, at, node.line)
             continue
         try:
-            soft[name] = _law(node)
+            soft[name] = _read_law(node)
         except ProblemError as error:
             if name not in used:
                 notes.append(f"{node.place}: material {name!r} not read: no part is made of it")
@@ -86,145 +83,152 @@ def read_materials(
     return soft, rigid, tuple(notes)
 
 
-def _law(node: Node) -> Material:
-    k, law = node.number("k", 0.0), _volumetric(node)
+def _read_law(node: XmlNode) -> Material:
+    k, law = node.number("k", 0.0), _read_volumetric(node)
     if node.attribute("type") != PRESTRAINED:
-        return _uncoupled(node, k, law)
-    _only(node, {"elastic", "prestrain"} | _SHARED)
+        return _read_uncoupled(node, k, law)
+    _check_parameters(node, {"elastic", "prestrain"} | _SHARED)
     inner = node.child("elastic")
     if inner.number("k", 0.0) != 0.0:
-        raise inner.refuse("has a bulk modulus of its own in a pre-strain", "give that of the outer material")
-    return _uncoupled(inner, k, _agreeing(inner, law))
+        raise inner.error("has a bulk modulus of its own in a pre-strain", "give that of the outer material")
+    return _read_uncoupled(inner, k, _check_volumetric(inner, law))
 
 
-def _uncoupled(node: Node, k: float, law: str) -> Material:
-    """The law of a material with bulk modulus ``k`` (MPa)."""
+def _read_uncoupled(node: XmlNode, k: float, law: str) -> Material:
+    """Read the law of a material with bulk modulus ``k`` (MPa)."""
     kind = node.attribute("type")
     if kind == _RELAXED:
-        return _relaxing(node, k, law)
+        return _read_relaxing(node, k, law)
     if kind not in (*ELASTIC, _MIXTURE):
-        raise _unknown(node, kind)
+        raise _kind_error(node, kind)
     if kind == _MIXTURE:
         active = [one for one in node.all("solid") if one.attribute("type") == ACTIVE]
         if active:
-            return _contractile(node, active, k, law)
-    return _hyperelastic(node, 1.0, (), k, law)
+            return _read_contractile(node, active, k, law)
+    return _read_hyperelastic(node, 1.0, (), k, law)
 
 
-def _relaxing(node: Node, k: float, law: str) -> Material:
+def _read_relaxing(node: XmlNode, k: float, law: str) -> Material:
     elastic = node.child("elastic")
     if elastic.attribute("type") not in (*ELASTIC, _MIXTURE):
-        raise _unknown(elastic, elastic.attribute("type"))
-    _only(node, _RELAXING | _SHARED)
+        raise _kind_error(elastic, elastic.attribute("type"))
+    _check_parameters(node, _RELAXING | _SHARED)
     g0 = node.number("g0", 1.0)
     if not g0 > 0.0:
-        raise node.refuse("g0 is not positive: nothing would hold the tissue in the long term")
+        raise node.error("g0 is not positive: nothing would hold the tissue in the long term")
     prony = [(node.number(f"g{i}", 0.0), i) for i in range(1, 7)]
     terms = tuple((g / g0, node.number(f"t{i}", 1.0)) for g, i in prony if g != 0.0)
     # The wrapper adds its own k to the elastic material's; g0 scales the deviatoric part only.
-    return _hyperelastic(elastic, g0, terms, k + elastic.number("k", 0.0), _agreeing(elastic, law))
+    return _read_hyperelastic(
+        elastic, g0, terms, k + elastic.number("k", 0.0), _check_volumetric(elastic, law)
+    )
 
 
-def _agreeing(inner: Node, law: str) -> str:
-    if inner.find("pressure_model") is not None and _volumetric(inner) != law:
-        raise inner.refuse("its pressure_model differs from that of the material around it")
+def _check_volumetric(inner: XmlNode, law: str) -> str:
+    if inner.find("pressure_model") is not None and _read_volumetric(inner) != law:
+        raise inner.error("its pressure_model differs from that of the material around it")
     return law
 
 
-def _contractile(node: Node, active: list[Node], k: float, law: str) -> Contractile:
-    """What a mixture bears passively, and the stress of its fibres at full activation beside it."""
+def _read_contractile(node: XmlNode, active: list[XmlNode], k: float, law: str) -> Contractile:
+    """Read what a mixture bears passively, and the stress of its fibres at full activation."""
     if len(active) > 1:
-        raise active[1].refuse("a mixture is read with one contraction")
-    _only(node, {"solid"} | _SHARED)
+        raise active[1].error("a mixture is read with one contraction")
+    _check_parameters(node, {"solid"} | _SHARED)
     (pull,) = active
-    _only(pull, {"smax", "activation", "k", "density"})
+    _check_parameters(pull, {"smax", "activation", "k", "density"})
     rest = [one for one in node.all("solid") if one is not pull]
     if [one.attribute("type") for one in rest] == [_RELAXED]:
-        passive = _relaxing(rest[0], k, _agreeing(rest[0], law))
+        passive = _read_relaxing(rest[0], k, _check_volumetric(rest[0], law))
     elif len(rest) == 1 and rest[0].attribute("type") in ELASTIC:
-        passive = _hyperelastic(rest[0], 1.0, (), k, law)
+        passive = _read_hyperelastic(rest[0], 1.0, (), k, law)
     else:
-        passive = _mixed(node, rest, 1.0, (), k, law)
+        passive = _read_mixture(node, rest, 1.0, (), k, law)
     if not isinstance(passive, Fibred):
         assert isinstance(passive, Uncoupled)
         passive = Fibred(passive, 0.0, 1.0)
     return Contractile(passive, pull.number("smax") * pull.number("activation"))
 
 
-def _hyperelastic(
-    node: Node, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
+def _read_hyperelastic(
+    node: XmlNode, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
 ) -> Material:
-    """`_elastic`, and fibres beside it in a mixture."""
+    """Read an elastic law, and the fibres beside it if it is a mixture."""
     if node.attribute("type") != _MIXTURE:
-        return _elastic(node, scale, prony, k, law)
-    _only(node, {"solid"} | _SHARED)
-    return _mixed(node, node.all("solid"), scale, prony, k, law)
+        return _read_elastic(node, scale, prony, k, law)
+    _check_parameters(node, {"solid"} | _SHARED)
+    return _read_mixture(node, node.all("solid"), scale, prony, k, law)
 
 
-def _mixed(
-    node: Node, solids: list[Node], scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
+def _read_mixture(
+    node: XmlNode,
+    solids: list[XmlNode],
+    scale: float,
+    prony: tuple[tuple[float, float], ...],
+    k: float,
+    law: str,
 ) -> Fibred:
-    """The ground and the fibres among the ``solids`` of a mixture."""
+    """Read the ground and the fibres among the ``solids`` of a mixture."""
     fibres = [one for one in solids if one.attribute("type") == _FIBRE]
     grounds = [one for one in solids if one.attribute("type") in ELASTIC]
     if not len(fibres) == len(grounds) == 1 or len(solids) != 2:
         if any(one.attribute("type") == ACTIVE for one in solids):
-            raise node.refuse("an active stress that relaxes is not read", f"put {ACTIVE} beside {_RELAXED}")
-        raise node.refuse(f"a mixture is read of one {_FIBRE} and one of {', '.join(ELASTIC)}")
+            raise node.error("an active stress that relaxes is not read", f"put {ACTIVE} beside {_RELAXED}")
+        raise node.error(f"a mixture is read of one {_FIBRE} and one of {', '.join(ELASTIC)}")
     (fibre,), (ground,) = fibres, grounds
     for one in solids:
         if one.number("k", 0.0) != 0.0:
-            raise one.refuse("has a bulk modulus of its own in a mixture", "give that of the mixture alone")
-    _only(fibre, {"ksi", "alpha", "beta", "k", "density"})
+            raise one.error("has a bulk modulus of its own in a mixture", "give that of the mixture alone")
+    _check_parameters(fibre, {"ksi", "alpha", "beta", "k", "density"})
     if fibre.number("beta") != 2.0:
-        raise fibre.child("beta").refuse("limbfit's fibres have beta = 2")
-    made = _elastic(ground, scale, prony, k, law)
+        raise fibre.child("beta").error("limbfit's fibres have beta = 2")
+    made = _read_elastic(ground, scale, prony, k, law)
     return Fibred(made, scale * fibre.number("ksi"), fibre.number("alpha"))
 
 
-def _unknown(node: Node, kind: str) -> ProblemError:
+def _kind_error(node: XmlNode, kind: str) -> ProblemError:
     remedy = "limbfit has uncoupled materials: " + ", ".join(ELASTIC) + ", uncoupled viscoelastic"
     if kind in ("neo-Hookean", "isotropic elastic"):
         remedy = "use 'incomp neo-Hookean' with G = E / (2 (1 + v)) and k = E / (3 (1 - 2 v))"
-    return node.refuse(f"material type {kind!r} is not known", remedy)
+    return node.error(f"material type {kind!r} is not known", remedy)
 
 
-def _volumetric(node: Node) -> str:
+def _read_volumetric(node: XmlNode) -> str:
     name = node.string("pressure_model", "")
     if name not in _VOLUMETRIC:
-        raise node.child("pressure_model").refuse(f"volumetric law {name!r} is not known")
+        raise node.child("pressure_model").error(f"volumetric law {name!r} is not known")
     return _VOLUMETRIC[name]
 
 
-def _only(node: Node, known: set[str]) -> None:
+def _check_parameters(node: XmlNode, allowed: set[str]) -> None:
     for child in node:
-        if child.tag not in known:
-            raise child.refuse("this parameter of the material is not known")
+        if child.tag not in allowed:
+            raise child.error("this parameter of the material is not known")
         varies = child.attributes.get("lc") or child.attributes.get("type") not in (None, "const")
         if varies and child.tag not in ("elastic", "solid", "mat_axis", "prestrain", "activation"):
-            raise child.refuse("a parameter that changes in time or space is not supported")
+            raise child.error("a parameter that changes in time or space is not supported")
     if node.flag("laugon"):
-        raise node.child("laugon").refuse("augmented incompressibility is not supported")
+        raise node.child("laugon").error("augmented incompressibility is not supported")
 
 
-def _elastic(
-    node: Node, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
+def _read_elastic(
+    node: XmlNode, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
 ) -> Uncoupled:
-    """The law of ``node``, its moduli times ``scale``, with bulk modulus ``k`` (MPa)."""
+    """Read the law of ``node``, its moduli times ``scale``, with bulk modulus ``k`` (MPa)."""
     kind = node.attribute("type")
-    _only(node, ELASTIC[kind] | _SHARED)
+    _check_parameters(node, ELASTIC[kind] | _SHARED)
     if not k > 0.0:
-        raise node.refuse("has no positive bulk modulus k")
+        raise node.error("has no positive bulk modulus k")
     shared: dict[str, Any] = {"prony": prony, "volumetric": law}
     if kind == "incomp neo-Hookean":
         mu = scale * node.number("G")
-        return NeoHookean(mu, kappa_ratio=k / _modulus(node, mu), **shared)
+        return NeoHookean(mu, kappa_ratio=k / _check_modulus(node, mu), **shared)
     if kind == "Mooney-Rivlin":
         c1, c2 = scale * node.number("c1"), scale * node.number("c2", 0.0)
-        return MooneyRivlin(c1, c2, kappa_ratio=k / _modulus(node, 2.0 * (c1 + c2)), **shared)
+        return MooneyRivlin(c1, c2, kappa_ratio=k / _check_modulus(node, 2.0 * (c1 + c2)), **shared)
     terms = [(scale * node.number(f"c{i}", 0.0), node.number(f"m{i}", 1.0)) for i in range(1, 7)]
     terms = [term for term in terms if term[0] != 0.0]
-    ratio = k / _modulus(node, sum(c for c, _ in terms) / 2.0)
+    ratio = k / _check_modulus(node, sum(c for c, _ in terms) / 2.0)
     if len(terms) == 2 and law == "log":
         (c, m), (other, minus) = terms
         if (c, m) == (other, -minus) and m > 0.0:
@@ -233,7 +237,7 @@ def _elastic(
     return Ogden(tuple(terms), kappa_ratio=ratio, **shared)
 
 
-def _modulus(node: Node, mu: float) -> float:
+def _check_modulus(node: XmlNode, mu: float) -> float:
     if not mu > 0.0:
-        raise node.refuse(f"the shear modulus of small strains is {mu:.4g} MPa, not positive")
+        raise node.error(f"the shear modulus of small strains is {mu:.4g} MPa, not positive")
     return mu

@@ -1,38 +1,53 @@
-"""Rigid bodies of a FEBio input: where their mass lies, which tissue they carry."""
+"""Rigid bodies of a FEBio input: their centre of mass, the tissue that they carry, and their motions.
+
+In every step a body is held, displaced, turned, or under a force.
+
+Source: FEBio User Manual 4.0, sections 3.10 (rigid conditions and loads) and 3.13 (steps).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array, Indices
 from ...errors import ProblemError
-from ...fe import ELEMENTS
+from ...fe import ELEMENTS, Motion
 from ...fe.kernel.elements import reference_gradients
-from .geometry import Geometry, Indices, Part, node_set, nodes_of, triangles
-from .tree import Node
+from .controls import ControlPhase, compute_step_times
+from .curves import LoadCurve
+from .geometry import Geometry, Part, collect_nodes, find_node_set, split_into_triangles
+from .materials import RigidMaterial
+from .tree import XmlNode
 
-Array = NDArray[np.float64]
 _PRISM = ([0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3])  # three tetrahedra of a penta6
+FREEDOMS = "xyzuvw"  # of a rigid body: along the axes, about them
+_FIXED, _MOVED = ("rigid_fixed", "fix"), ("rigid_displacement", "rigid_rotation", "prescribe")
+_FORCED = ("rigid_force", "rigid_moment", "force")
+_RAIL = "rigid prismatic joint"
 
 
-def centre_of_mass(points: Array, parts: Iterable[Part]) -> Array:
-    """Centre of mass (3,) of parts of one density, mm: solids by volume, shells by area times thickness.
+def compute_centre_of_mass(points: Array, parts: Iterable[Part]) -> Array:
+    """Return the centre of mass (3,) of parts of one density, mm.
 
-    That of a body without volume is the origin, as in FEBio.
+    Solids count by volume, shells by area times thickness. The centre of a body without volume is the origin,
+    as in FEBio.
     """
     total, moment = 0.0, np.zeros(3)
     for part in parts:
-        mass, at = _lumps(points, part)
+        mass, at = _lump_mass(points, part)
         total += float(mass.sum())
         moment += mass @ at
     return moment / total if total > 0.0 else moment
 
 
-def _lumps(points: Array, part: Part) -> tuple[Array, Array]:
-    """A part as masses (k,) at places (k, 3)."""
+def _lump_mass(points: Array, part: Part) -> tuple[Array, Array]:
+    """Return a part as masses (k,) at places (k, 3)."""
     if part.cell_type in ELEMENTS:
         element = ELEMENTS[part.cell_type]
         _, volumes = reference_gradients(element, points, part.cells)
@@ -42,15 +57,18 @@ def _lumps(points: Array, part: Part) -> tuple[Array, Array]:
         tets = points[np.concatenate([part.cells[:, corners] for corners in _PRISM])]
         return np.abs(np.linalg.det(tets[:, 1:] - tets[:, :1])) / 6.0, tets.mean(axis=1)
     corners = part.cells[:, : 4 if part.cell_type == "quad4" else 3]
-    flat = points[triangles(corners)]
+    flat = points[split_into_triangles(corners)]
     area = 0.5 * np.linalg.norm(np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]), axis=1)
     return part.thickness * area, flat.mean(axis=1)
 
 
-def carried_nodes(
-    geometry: Geometry, soft: Collection[str], bodies: Collection[str], conditions: Sequence[tuple[str, Node]]
+def find_carried_nodes(
+    geometry: Geometry,
+    soft: Collection[str],
+    bodies: Collection[str],
+    conditions: Sequence[tuple[str, XmlNode]],
 ) -> dict[str, Indices]:
-    """Nodes of tissue that move with a rigid body, by its name: those of its own parts, and sets tied to it.
+    """Find the nodes of tissue that move with each rigid body: those of its own parts, and sets tied to it.
 
     Parameters
     ----------
@@ -63,14 +81,265 @@ def carried_nodes(
         For a node that two bodies would carry.
     """
     parts = geometry.parts.values()
-    owned = {name: nodes_of(part for part in parts if part.material == name) for name in (*soft, *bodies)}
+    owned = {
+        name: collect_nodes(part for part in parts if part.material == name) for name in (*soft, *bodies)
+    }
     tissue = np.unique(np.concatenate([np.zeros(0, np.int64), *(owned[name] for name in soft)]))
     found = {name: np.intersect1d(owned[name], tissue) for name in bodies}
     for name, condition in conditions:
-        nodes = node_set(geometry, condition.attribute("node_set"), condition)
+        nodes = find_node_set(geometry, condition.attribute("node_set"), condition)
         found[name] = np.union1d(found[name], np.intersect1d(nodes, tissue))
     for (one, nodes), (other, others) in combinations(found.items(), 2):
         if len(twice := np.intersect1d(nodes, others)):
             number = geometry.node_ids[twice[0]]
             raise ProblemError(f"node {number} is of two rigid bodies, {one!r} and {other!r}")
     return {name: nodes for name, nodes in found.items() if len(nodes)}
+
+
+@dataclass(frozen=True)
+class RigidCondition:
+    """One freedom of a rigid body, held, moved by ``factor`` times a load curve, or under such a force.
+
+    ``step`` is the step of the analysis that it belongs to; None: all.
+    """
+
+    body: str
+    freedom: int
+    kind: Literal["fixed", "moved", "forced"]
+    factor: float
+    curve: int
+    step: int | None
+    line: int
+
+
+@dataclass(frozen=True)
+class RigidRail:
+    """A joint that lets a rigid body go ``along (3,)`` a line only, beside a fixed body (``base``)."""
+
+    body: str
+    base: str
+    along: Array
+    line: int
+
+
+def read_rails(root: XmlNode, rigid: Mapping[str, RigidMaterial]) -> tuple[RigidRail, ...]:
+    """Read the prismatic joints of rigid bodies.
+
+    Raises
+    ------
+    ProblemError
+        For those that move a body themselves, or are there in some steps only.
+    """
+    found: list[RigidRail] = []
+    for node in root.find("Rigid") or ():
+        if node.tag != "rigid_connector" or node.attribute("type") != _RAIL:
+            continue
+        if node.flag("prescribed_translation") or node.number("force", 0.0) != 0.0:
+            raise node.error("a joint that moves its body is not supported", "give the body a rigid_force")
+        base, body = (find_body(node, rigid, tag) for tag in ("body_a", "body_b"))
+        axis = node.find("translation_axis")
+        along = np.array([1.0, 0.0, 0.0] if axis is None else axis.numbers(3))
+        if not along.any() or base == body or body in {rail.body for rail in found}:
+            raise node.error("needs an axis and two bodies of which it alone guides the second")
+        found.append(RigidRail(body, base, along / np.linalg.norm(along), node.line))
+    return tuple(found)
+
+
+def read_conditions(
+    root: XmlNode, rigid: Mapping[str, RigidMaterial], curves: Mapping[int, LoadCurve]
+) -> tuple[RigidCondition, ...]:
+    """Read the conditions and loads of rigid bodies, those of single steps among them.
+
+    Raises
+    ------
+    ProblemError
+        For connectors, loads that follow, and whatever else limbfit does not support.
+    """
+    sections: list[tuple[XmlNode | None, int | None]] = [(root.find("Rigid"), None)]
+    sections += [(step.find("Rigid"), number) for number, step in enumerate(root.find("Step") or ())]
+    found: list[RigidCondition] = []
+    for section, step in sections:
+        for node in section or ():
+            if not (step is None and node.tag == "rigid_connector" and node.attribute("type") == _RAIL):
+                found += _read_condition(node, rigid, curves, step)
+    return tuple(found)
+
+
+def _read_condition(
+    node: XmlNode, rigid: Mapping[str, RigidMaterial], curves: Mapping[int, LoadCurve], step: int | None
+) -> Iterator[RigidCondition]:
+    kind = node.attribute("type")
+    if node.tag not in ("rigid_bc", "rigid_constraint", "rigid_load"):
+        raise node.error(f"{kind!r} is not supported", f"limbfit knows no joint but the {_RAIL}")
+    if kind not in (*_FIXED, *_MOVED, *_FORCED):
+        raise node.error(f"rigid condition {kind!r} is not supported")
+    name = find_body(node, rigid)
+    if kind in _FIXED:
+        for letter in sorted(_read_fixed(node)):
+            yield RigidCondition(name, FREEDOMS.index(letter), "fixed", 0.0, 0, step, node.line)
+        return
+    dof = node.string("dof").lower().removeprefix("r")  # Rx, ..; FEBio 3 has a number for a load's
+    if dof not in tuple(FREEDOMS):
+        raise node.error(f"degree of freedom {node.string('dof')!r} is not supported")
+    if node.flag("relative"):
+        raise node.child("relative").error("relative displacements and forces are not supported")
+    if kind in _FORCED and node.string("load_type", "LOAD").upper() not in ("LOAD", "0"):
+        raise node.child("load_type").error("a force that follows the body, or ramps up, is not supported")
+    factor, curve = read_factor(find_value(node), curves)
+    yield RigidCondition(
+        name, FREEDOMS.index(dof), "forced" if kind in _FORCED else "moved", factor, curve, step, node.line
+    )
+
+
+def find_body(condition: XmlNode, rigid: Mapping[str, RigidMaterial], tag: str = "rb") -> str:
+    """Return the name of the rigid body that a condition is about; it gives its name or its number."""
+    names = {str(body.number): name for name, body in rigid.items()}
+    name = names.get(condition.string(tag), condition.string(tag))
+    if name not in rigid:
+        raise condition.error(f"there is no rigid body {name!r}")
+    return name
+
+
+def _read_fixed(condition: XmlNode) -> set[str]:
+    """Read what a ``rigid_fixed`` (FEBio 3: ``fix``) holds, of `FREEDOMS`."""
+    listed = [dof.strip().lower().removeprefix("r") for dof in condition.string("dofs", "").split(",")]
+    return {letter for letter in FREEDOMS if letter in listed or condition.flag(f"R{letter}_dof")}
+
+
+def find_value(condition: XmlNode) -> XmlNode:
+    """Return the element with the value of a prescribed motion; FEBio 3 calls it a scale."""
+    value = condition.find("value")
+    return condition.child("scale") if value is None else value
+
+
+def read_factor(value: XmlNode, curves: Mapping[int, LoadCurve]) -> tuple[float, int]:
+    """Read factor and load curve of a value; 0 and no curve if it is zero."""
+    factor, number = value.scalar(), value.attributes.get("lc", "")
+    if factor == 0.0:
+        return 0.0, 0
+    if not (number.isdecimal() and int(number) in curves):
+        raise value.error(f"there is no load curve {number!r}" if number else "needs a load curve")
+    return factor, int(number)
+
+
+def merge_knots(curves: Sequence[LoadCurve], every: Array, start: float, end: float) -> Array:
+    """Return times (n,) from ``start`` to ``end`` between which the curves are linear.
+
+    FEBio knows a curve at the ends of its steps only (``every (k,)``): these are the knots of a curve that is
+    not linear.
+    """
+    corners = [curve.corners for curve in curves]
+    inner = np.unique(np.concatenate([np.zeros(0), *(every if c is None else c for c in corners)]))
+    tiny = 1e-9 * end
+    return np.concatenate([[start], inner[(inner > start + tiny) & (inner < end - tiny)], [end]])
+
+
+def build_motion(
+    name: str,
+    conditions: Sequence[RigidCondition],
+    curves: Mapping[int, LoadCurve],
+    phases: Sequence[ControlPhase],
+) -> Motion:
+    """Build the motion of the rigid body ``name``: along and about the axes of space, mm, rad, N and N mm.
+
+    What is neither held nor moved in a step is free: a force drives it, of 0 if none is given.
+
+    Raises
+    ------
+    ProblemError
+        If a step holds what was free before it, or if it would turn about several axes.
+    """
+    own = [condition for condition in conditions if condition.body == name]
+    every, end = compute_step_times(tuple(phases), curves), 0.0
+    times, values, forced = np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6), dtype=bool)
+    for number, phase in enumerate(phases):
+        begin, end = end, end + phase.seconds
+        active = [c for c in own if c.step in (None, number)]
+        at = merge_knots([curves[c.curve] for c in active if c.curve], every, begin, end)
+        value, under = np.zeros((len(at), 6)), np.ones(6, dtype=bool)
+        for freedom in range(6):
+            here = [c for c in active if c.freedom == freedom]
+            moved, held = [c for c in here if c.kind == "moved"], [c for c in here if c.kind == "fixed"]
+            under[freedom] = not (moved or held)
+            for c in here if under[freedom] else moved:
+                if c.curve:
+                    value[:, freedom] += c.factor * curves[c.curve].at(at)
+            if held and not moved and len(times):
+                if forced[-1, freedom]:
+                    what = f"the rigid body {name!r} is held in R{FREEDOMS[freedom]} after it was free"
+                    raise ProblemError(what, place=f"line {held[0].line}", remedy="give it a displacement")
+                value[:, freedom] = values[-1, freedom]
+        later = len(times) > 0
+        goes_on = later and np.array_equal(under, forced[-1]) and np.array_equal(value[0], values[-1])
+        first = int(goes_on)
+        between = len(at) - 1 + int(later and not goes_on)  # an interval of no time parts two drives
+        times, values = np.concatenate([times, at[first:]]), np.concatenate([values, value[first:]])
+        forced = np.concatenate([forced, np.broadcast_to(under, (between, 6))])
+    if not has_same_rotation(values, forced):
+        lines = [c.line for c in own if c.freedom > 2 and c.kind != "fixed"]
+        raise ProblemError(
+            f"the rigid body {name!r} turns about more than one axis",
+            place=f"line {lines[0]}" if lines else "<Rigid>",
+            remedy="hold two of Ru, Rv, Rw, or leave all three free",
+        )
+    return Motion(times, values, forced)
+
+
+def restrict_to_rail(motion: Motion, rail: RigidRail) -> Motion:
+    """Return the motion of a body that a joint guides, in a frame whose third axis is that of the joint.
+
+    The joint bears what forces have across it.
+
+    Raises
+    ------
+    ProblemError
+        If something else than forces drives the body.
+    """
+    forced, values = np.asarray(motion.forced), np.zeros_like(motion.values)
+    values[:, 2] = motion.values[:, :3] @ rail.along
+    under = np.asarray(forced.all(axis=1))
+    still = np.append(~under, False) | np.append(False, ~under)  # rows between which it is moved
+    off = np.abs(motion.values[:, :3] - values[:, 2:3] * rail.along)[still].max(initial=0.0)
+    if not (under | ~forced.any(axis=1)).all() or motion.values[:, 3:].any() or off > 1e-9:
+        what = f"the rigid body {rail.body!r} is guided by a joint, and held, moved or turned otherwise"
+        raise ProblemError(what, place=f"line {rail.line}, <rigid_connector>", remedy="give it forces only")
+    return Motion(motion.times, values, under[:, None] & (np.arange(6) == 2))
+
+
+def has_same_rotation(values: Array, forced: NDArray[np.bool_]) -> bool:
+    """True if FEBio, which adds turns up step by step, and limbfit's one rotation vector agree on a motion.
+
+    ``values (n, 6)``, ``forced (n - 1, 6)``: they agree if it turns about one line, or if no given angle
+    turns it.
+    """
+    free = np.asarray(forced.any(axis=0))[3:]
+    turns = np.where(free, 0.0, values[:, 3:])
+    if free.any():
+        pushed = values[:, 3:].any()  # moments about three free axes would turn with the body
+        return bool(not turns.any() and (free.sum() == 1 or (free.all() and not pushed)))
+    longest = turns[np.linalg.norm(turns, axis=1).argmax()]
+    return bool(np.abs(np.cross(turns, longest)).max() <= 1e-9 * (longest @ longest))
+
+
+def find_straight_line(motion: Motion) -> tuple[Array, Array] | None:
+    """Return direction (3,) and advance (n,) mm of a motion along a line; None for any other motion."""
+    still = (
+        np.asarray(motion.forced).any() or motion.values[:, 3:].any() or (np.diff(motion.times) == 0).any()
+    )
+    lengths = np.linalg.norm(motion.values[:, :3], axis=1)
+    if still or not lengths.any():
+        return None
+    direction = motion.values[lengths.argmax(), :3] / lengths.max()
+    advance = motion.values[:, :3] @ direction
+    off = np.abs(motion.values[:, :3] - advance[:, None] * direction).max()
+    return (direction, advance) if off <= 1e-12 * lengths.max() else None
+
+
+def name_free(motion: Motion) -> str:
+    """Return FEBio's names of the freedoms that nothing holds at some time."""
+    return ", ".join(f"R{letter}" for letter, free in zip(FREEDOMS, motion.free) if free)
+
+
+def has_rotation(motion: Motion) -> bool:
+    """True if a motion turns its body by a given angle."""
+    return any(values.any() for values in motion.values[:, 3:].T)

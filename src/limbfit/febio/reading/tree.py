@@ -1,6 +1,6 @@
-"""XML of untrusted origin as a tree with line numbers, in bounded memory.
+"""XML of untrusted origin read as a tree with line numbers, in bounded memory.
 
-Python's own expat parser; a document type is refused, and with it every entity, external or nested.
+Python's own expat parser is used. A document type is refused, and with it every entity, external or nested.
 Nothing is ever opened but the file itself.
 """
 
@@ -15,25 +15,25 @@ from xml.parsers import expat
 
 from ...errors import ProblemError
 
-MOST_BYTES = 256 * 2**20  # some two million nodes
-MOST_DEPTH = 40
+MAX_BYTES = 256 * 2**20  # some two million nodes
+MAX_DEPTH = 40
 _CHUNK = 2**20
 
 
 @dataclass(slots=True)
-class Node:
+class XmlNode:
     """An element of the file; ``text`` is what stands between its tags, without that of its children."""
 
     tag: str
     attributes: dict[str, str]
     line: int
     text: str = ""
-    children: list[Node] = field(default_factory=list)
+    children: list[XmlNode] = field(default_factory=list)
 
-    def __iter__(self) -> Iterator[Node]:
+    def __iter__(self) -> Iterator[XmlNode]:
         return iter(self.children)
 
-    def __getitem__(self, i: int) -> Node:
+    def __getitem__(self, i: int) -> XmlNode:
         return self.children[i]
 
     def __len__(self) -> int:
@@ -41,106 +41,106 @@ class Node:
 
     @property
     def place(self) -> str:
-        """Where it is in the file."""
+        """Its place in the file."""
         return f"line {self.line}, <{self.tag}>"
 
-    def refuse(self, what: str, remedy: str | None = None) -> ProblemError:
-        """The error that says what is wrong here."""
+    def error(self, what: str, remedy: str | None = None) -> ProblemError:
+        """Return the error that says what is wrong here."""
         return ProblemError(what, place=self.place, remedy=remedy)
 
-    def all(self, tag: str) -> list[Node]:
-        """Children of that name."""
+    def all(self, tag: str) -> list[XmlNode]:
+        """Return the children of that name."""
         return [child for child in self.children if child.tag == tag]
 
-    def find(self, tag: str) -> Node | None:
-        """The one child of that name, if there is one."""
+    def find(self, tag: str) -> XmlNode | None:
+        """Return the one child of that name, if there is one."""
         found = self.all(tag)
         if len(found) > 1:
-            raise found[1].refuse("is there twice")
+            raise found[1].error("is there twice")
         return found[0] if found else None
 
-    def child(self, tag: str) -> Node:
-        """The one child of that name."""
+    def child(self, tag: str) -> XmlNode:
+        """Return the one child of that name, which must exist."""
         found = self.find(tag)
         if found is None:
-            raise self.refuse(f"has no <{tag}>")
+            raise self.error(f"has no <{tag}>")
         return found
 
     def attribute(self, name: str) -> str:
         value = self.attributes.get(name)
         if not value:
-            raise self.refuse(f"has no attribute {name!r}")
+            raise self.error(f"has no attribute {name!r}")
         return value
 
     def string(self, tag: str, default: str | None = None) -> str:
-        """The text of a child."""
+        """Return the text of a child."""
         found = self.find(tag)
         if found is None and default is not None:
             return default
         return self.child(tag).text.strip()
 
     def number(self, tag: str, default: float | None = None) -> float:
-        """The number in a child."""
+        """Return the number in a child."""
         found = self.find(tag)
         if found is None and default is not None:
             return default
         return self.child(tag).scalar()
 
     def flag(self, tag: str) -> bool:
-        """Whether a child says 1; without the child, no."""
+        """True if a child says 1; without the child it is False."""
         return self.number(tag, 0.0) != 0.0
 
     def scalar(self) -> float:
-        """The number that this element holds."""
+        """Return the number that this element holds."""
         return self.numbers(1)[0]
 
     def numbers(self, count: int) -> list[float]:
-        """The ``count`` finite numbers, separated by commas, that this element holds."""
+        """Return the ``count`` finite numbers, separated by commas, that this element holds."""
         try:
             values = [float(part) for part in self.text.split(",")]
         except ValueError:
-            raise self.refuse(f"{_short(self.text)} is not {count} numbers") from None
+            raise self.error(f"{_shorten(self.text)} is not {count} numbers") from None
         if len(values) != count:
-            raise self.refuse(f"{_short(self.text)} is not {count} numbers")
+            raise self.error(f"{_shorten(self.text)} is not {count} numbers")
         if not all(map(math.isfinite, values)):
-            raise self.refuse(f"{_short(self.text)} is not finite")
+            raise self.error(f"{_shorten(self.text)} is not finite")
         return values
 
     def integers(self) -> list[int]:
-        """The whole numbers, separated by commas, that this element holds."""
+        """Return the whole numbers, separated by commas, that this element holds."""
         try:
             return [int(part) for part in self.text.split(",")]
         except ValueError:
-            raise self.refuse(f"{_short(self.text)} is not whole numbers") from None
+            raise self.error(f"{_shorten(self.text)} is not whole numbers") from None
 
     def identity(self) -> int:
-        """The attribute ``id``."""
+        """Return the attribute ``id``."""
         text = self.attribute("id")
         if not text.isdecimal() or len(text) > 18:
-            raise self.refuse(f"id {_short(text)} is not a whole number")
+            raise self.error(f"id {_shorten(text)} is not a whole number")
         return int(text)
 
 
-def _short(text: str) -> str:
+def _shorten(text: str) -> str:
     text = text.strip()
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def read_tree(path: str | Path) -> Node:
-    """The root of an XML file.
+def read_tree(path: str | Path) -> XmlNode:
+    """Read the root of an XML file.
 
     Raises
     ------
     ProblemError
-        Where the file is missing, too large or nested too deeply, is not well-formed, or has a document type.
+        If the file is missing, too large or nested too deeply, is not well-formed, or has a document type.
     """
     file = Path(path)
-    builder = _Builder()
+    builder = _TreeBuilder()
     try:
         with file.open("rb") as stream:
-            if file.stat().st_size > MOST_BYTES:
+            if file.stat().st_size > MAX_BYTES:
                 raise ProblemError(
-                    f"has {file.stat().st_size / 2**20:.0f} MB; no more than {MOST_BYTES // 2**20} are read"
+                    f"has {file.stat().st_size / 2**20:.0f} MB; no more than {MAX_BYTES // 2**20} are read"
                 )
             while chunk := stream.read(_CHUNK):
                 builder.parser.Parse(chunk, False)
@@ -156,10 +156,10 @@ def read_tree(path: str | Path) -> Node:
     return builder.root
 
 
-class _Builder:
+class _TreeBuilder:
     def __init__(self) -> None:
-        self.root: Node | None = None
-        self.open: list[Node] = []
+        self.root: XmlNode | None = None
+        self.open: list[XmlNode] = []
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
         self.parser.buffer_size = _CHUNK
@@ -176,9 +176,9 @@ class _Builder:
         )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        node = Node(tag, attributes, self.parser.CurrentLineNumber)
-        if len(self.open) >= MOST_DEPTH:
-            raise node.refuse(f"lies deeper than {MOST_DEPTH} elements")
+        node = XmlNode(tag, attributes, self.parser.CurrentLineNumber)
+        if len(self.open) >= MAX_DEPTH:
+            raise node.error(f"lies deeper than {MAX_DEPTH} elements")
         if self.open:
             self.open[-1].children.append(node)
         else:

@@ -15,16 +15,16 @@ from ...errors import ProblemError
 from ...fe import Problem, Result, System, solve
 from ...fe.solution.control import schedule
 from ...febio import (
-    SLACK,
-    FaceWise,
-    Log,
+    TIME_TOLERANCE,
+    FacePenalties,
+    FebioLog,
     RunVerdict,
-    contact_of,
-    end_of_file,
+    build_contact,
+    build_result,
+    compute_end_time,
+    compute_mean_penalty,
     find_febio,
-    mean_penalty,
     read_log,
-    result_of_log,
 )
 from ...indentation import Parameters, first_steps
 from ...study import Study
@@ -95,21 +95,23 @@ def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
     times = np.minimum(other.times[1:], end)  # a table has nine digits
     if not len(times):  # FEBio got nowhere: all the way then
         times = schedule(problem.history, settings.steps)
-    contact = contact_of(problem, settings)
-    penalty = mean_penalty(contact, problem, float(times[0]))
+    contact = build_contact(problem, settings)
+    penalty = compute_mean_penalty(contact, problem, float(times[0]))
     steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
     system = System(problem)
-    weights = FaceWise(system, (contact,) * len(problem.rigid_bodies), times)
-    return solve(problem, steps, store="none", on_step=weights.after, system=system)
+    weights = FacePenalties(system, (contact,) * len(problem.rigid_bodies), times)
+    return solve(problem, steps, store="none", on_step=weights.update_after, system=system)
 
 
-def _of_log(problem: Problem, log: Log, file: Path) -> Result:
+def _of_log(problem: Problem, log: FebioLog, file: Path) -> Result:
     """A table from elsewhere, complete where it reaches the end of the history."""
-    reached, end = float(log.times[-1]), end_of_file(problem)
-    reason = "" if reached > end * (1.0 - SLACK) else f"the table ends at {reached:.4g} s of {end:.4g} s"
+    reached, end = float(log.times[-1]), compute_end_time(problem)
+    reason = (
+        "" if reached > end * (1.0 - TIME_TOLERANCE) else f"the table ends at {reached:.4g} s of {end:.4g} s"
+    )
     verdict = RunVerdict("partial" if reason else "normal", reason, reached, "")
     try:
-        return result_of_log(problem, log, verdict)
+        return build_result(problem, log, verdict)
     except ProblemError as error:
         raise ProblemError(error.what, file=file, remedy=error.remedy) from None
 

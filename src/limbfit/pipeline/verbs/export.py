@@ -16,10 +16,10 @@ from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import ELEMENTS, Problem
 from ...febio import (
-    Range,
-    check_fitted,
-    differences,
-    in_indenter_frame,
+    ParameterRange,
+    check_optimisable,
+    describe_differences,
+    turn_to_indenter_frame,
     write_feb,
     write_inp,
     write_optimisation,
@@ -177,26 +177,26 @@ def _write(
     settings = feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
         write_feb(problem, folder / f"{name}.feb", settings)
-        return (folder / f"{name}.feb",), differences(problem, settings)
+        return (folder / f"{name}.feb",), describe_differences(problem, settings)
     if to == FITTED:
         if problem.fibres is not None:
             raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
-        check_fitted(problem)
+        check_optimisable(problem)
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
         settings = replace(settings, penalty=None)
-        turned = in_indenter_frame(problem)
+        turned = turn_to_indenter_frame(problem)
         write_feb(turned, model, settings)
         ranges = _ranges(found, problem.mesh.region_names)
         iterations = found.context.study.calibration.max_iterations
         write_optimisation(control, ranges, *curve, iterations=iterations)
-        return (control, model), differences(turned, settings)
+        return (control, model), describe_differences(turned, settings)
     program = "abaqus" if to == "inp" else to
     write_inp(problem, folder / f"{name}.inp", program, settings)
     return (folder / f"{name}.inp",), ()
 
 
-def _ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, Range]:
+def _ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, ParameterRange]:
     """Start and bounds of the tissues, in the solver's units."""
     study = found.context.study
     ranges = {}
@@ -211,5 +211,5 @@ def _ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, Range]:
                 what = f"{tissue}.{key} = {value:g} lies outside its bounds, {lower[key]:g} to {upper[key]:g}"
                 raise InputError(what, file=study.file, place="material")
         start, lower, upper = map(study.law.in_solver_units, (start, lower, upper))
-        ranges[tissue] = Range(start, lower, upper, study.material.kappa_ratio)
+        ranges[tissue] = ParameterRange(start, lower, upper, study.material.kappa_ratio)
     return ranges

@@ -9,7 +9,7 @@ from typing import Any
 from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import Problem, Result
-from ...febio import FebSettings, end_of_file, find_febio, result_of_log, run_febio, write_feb
+from ...febio import FebSettings, build_result, compute_end_time, find_febio, run_febio, write_feb
 from ...indentation import Parameters, SiteModel, build_problem, first_steps, simulate_fields
 from ...mesh import read_vtu
 from ...study import Indentation as Planned
@@ -162,9 +162,9 @@ def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Res
     problem, options = site_problem(found), found.context.study.febio
     folder.mkdir(parents=True, exist_ok=True)
     write_feb(problem, folder / FEB_NAME, feb_settings(found, FORCES))
-    end = end_of_file(problem)
+    end = compute_end_time(problem)
     run = run_febio(program, folder, end, FORCES, threads=options.threads, time_limit_s=options.time_limit_s)
-    return result_of_log(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
+    return build_result(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
 
 
 def known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:

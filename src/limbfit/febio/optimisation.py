@@ -1,8 +1,8 @@
 """The control file of FEBio's parameter optimisation for one indentation (``febio4 -s control model.feb``).
 
-FEBio knows neither a modulus that enters two terms nor a bulk modulus that moves with it: they are
-parameters of their own, tied by linear constraints. Its objective is one component of a force: the model is
-written in the indenter's frame, where the force is along z.
+FEBio has neither a modulus that enters two terms nor a bulk modulus that moves with it: they are parameters
+of their own, tied by linear constraints. Its objective is one component of a force, so the model is written
+in the indenter's frame, where the force is along z.
 
 Source: FEBio User Manual 4.0, chapter 6.
 """
@@ -14,18 +14,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError, RunError
 from ..fe import Indenter, Problem
-from .faceting import INDENTER
+from .meshes import INDENTER
 
-Array = NDArray[np.float64]
-MOST = 64  # parameters, in FEBio
+MAX_PARAMETERS = 64  # parameters, in FEBio
 
 
 @dataclass(frozen=True)
-class Range:
+class ParameterRange:
     """Start and bounds of the parameters of `OgdenQLV` (MPa, s) of a tissue, by name and in their order."""
 
     start: Mapping[str, float]
@@ -35,12 +34,12 @@ class Range:
 
     @property
     def count(self) -> int:
-        """How many parameters of FEBio's it has: c and m twice each, k, and those of relaxation."""
+        """The number of FEBio's parameters: c and m twice each, k, and those of relaxation."""
         return 3 + len(self.start)
 
 
-def check_fitted(problem: Problem) -> None:
-    """Raise `ProblemError` where what comes before the indentation moves with the fitted parameters."""
+def check_optimisable(problem: Problem) -> None:
+    """Raise `ProblemError` if what comes before the indentation moves with the fitted parameters."""
     if problem.touch_down_s or problem.prestretch is not None or problem.bodies:
         raise ProblemError(
             "FEBio's fit cannot follow where a clamped, tensed or pre-strained limb is touched: it moves "
@@ -49,8 +48,8 @@ def check_fitted(problem: Problem) -> None:
         )
 
 
-def in_indenter_frame(problem: Problem) -> Problem:
-    """The same problem in the frame of its indenter, which goes along z."""
+def turn_to_indenter_frame(problem: Problem) -> Problem:
+    """Return the same problem in the frame of its indenter, which goes along z."""
     indenter = problem.indenter
     if indenter is None:
         raise ProblemError("there is no indenter")
@@ -69,7 +68,12 @@ def in_indenter_frame(problem: Problem) -> Problem:
 
 
 def write_optimisation(
-    path: str | Path, tissues: Mapping[str, Range], times: Array, force: Array, *, iterations: int = 25
+    path: str | Path,
+    tissues: Mapping[str, ParameterRange],
+    times: Array,
+    force: Array,
+    *,
+    iterations: int = 25,
 ) -> None:
     """Write the control file that fits the tissues to the force (n,) N at ``times (n,)`` s.
 
@@ -78,21 +82,23 @@ def write_optimisation(
     ProblemError
         For more tissues than FEBio can fit at once.
     RunError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     count = sum(tissue.count for tissue in tissues.values())
-    if count > MOST:
+    if count > MAX_PARAMETERS:
         raise ProblemError(
-            f"FEBio fits {MOST} parameters at most, not the {count} that {len(tissues)} tissues have there"
+            f"FEBio fits at most {MAX_PARAMETERS} parameters, but {len(tissues)} tissues have {count} there"
         )
     try:
         with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _lines(tissues, times, force, iterations))
+            stream.writelines(f"{line}\n" for line in _format_file(tissues, times, force, iterations))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
 
 
-def _lines(tissues: Mapping[str, Range], times: Array, force: Array, iterations: int) -> Iterator[str]:
+def _format_file(
+    tissues: Mapping[str, ParameterRange], times: Array, force: Array, iterations: int
+) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     yield "<!-- limbfit: parameters of the tissues from one record; mm, N, s, MPa -->"
     yield '<febio_optimize version="2.0">'
@@ -100,13 +106,13 @@ def _lines(tissues: Mapping[str, Range], times: Array, force: Array, iterations:
     yield f"<max_iter>{iterations}</max_iter><log_level>LOG_NEVER</log_level></Options>"
     yield "<Parameters>"
     for name, tissue in tissues.items():
-        for path, start, lower, upper in _parameters(tissue):
+        for path, start, lower, upper in _list_parameters(tissue):
             values = f"{start!r},{lower!r},{upper!r},{abs(start)!r}"
             yield f"<param name=\"fem.material('{name}').{path}\">{values}</param>"
     yield "</Parameters><Constraints>"
     counts = [tissue.count for tissue in tissues.values()]
     for first, tissue in zip(np.cumsum([0, *counts]), tissues.values()):
-        for ties in _ties(tissue):
+        for ties in _list_ties(tissue):
             row = np.zeros(sum(counts) + 1)
             row[first : first + len(ties)] = ties
             yield f"<constraint>{','.join(f'{value:.17g}' for value in row)}</constraint>"
@@ -119,8 +125,8 @@ def _lines(tissues: Mapping[str, Range], times: Array, force: Array, iterations:
     yield "</data></Objective></febio_optimize>"
 
 
-def _parameters(tissue: Range) -> Iterator[tuple[str, float, float, float]]:
-    """FEBio's name of a parameter, its start and bounds; the order is that of the constraints."""
+def _list_parameters(tissue: ParameterRange) -> Iterator[tuple[str, float, float, float]]:
+    """List FEBio's name of each parameter, its start and bounds, in the order of the constraints."""
     paths: Sequence[tuple[str, str, float]] = (
         ("elastic.c1", "c", 1.0),
         ("elastic.c2", "c", 1.0),
@@ -134,8 +140,8 @@ def _parameters(tissue: Range) -> Iterator[tuple[str, float, float, float]]:
         yield path, scale * tissue.start[name], low, high
 
 
-def _ties(tissue: Range) -> tuple[tuple[float, ...], ...]:
-    """c1 = c2, k = ratio c1 and m1 = -m2."""
+def _list_ties(tissue: ParameterRange) -> tuple[tuple[float, ...], ...]:
+    """List the constraints c1 = c2, k = ratio c1 and m1 = -m2."""
     return (
         (1.0, -1.0, 0.0, 0.0, 0.0),
         (tissue.kappa_ratio, 0.0, -1.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""What drives a problem, as FEBio's load curves, rigid conditions and steps of the analysis."""
+"""What drives a problem, written as FEBio's load curves, rigid conditions and steps of the analysis."""
 
 from __future__ import annotations
 
@@ -10,50 +10,50 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Motion, Problem
-from .reading.motions import agrees_in_turning, straight
+from .reading.rigid import find_straight_line, has_same_rotation
 
-Array = NDArray[np.float64]
 AXES, TURNS = "xyz", "uvw"
-HELD = "held"
-FRAME = "frame"  # the rigid body that rails are fixed to
+FIXED_SET = "held"
+FRAME_BODY = "frame"  # the rigid body that rails are fixed to
 
 
 @dataclass
-class Curves:
+class CurveList:
     """The load curves of a file; `add` gives a curve its number."""
 
     all: list[tuple[str, str, Array]] = field(default_factory=list)
 
     def add(self, name: str, points: Array, interpolate: str = "LINEAR") -> int:
-        """Points (n, 2): time, s, and value."""
+        """Add points (n, 2), time in s and value; return the number of the curve."""
         self.all.append((name, interpolate, points))
         return len(self.all)
 
-    def lines(self) -> Iterator[str]:
+    def format_lines(self) -> Iterator[str]:
         yield "<LoadData>"
         for i, (name, interpolate, points) in enumerate(self.all, 1):
             yield f'<load_controller id="{i}" name={quoteattr(name)} type="loadcurve">'
             yield f"<interpolate>{interpolate}</interpolate><extend>CONSTANT</extend><points>"
-            yield from (f"<pt>{row(point)}</pt>" for point in points)
+            yield from (f"<pt>{format_row(point)}</pt>" for point in points)
             yield "</points></load_controller>"
         yield "</LoadData>"
 
 
-def row(values: Iterable[float]) -> str:
-    """Numbers with commas, as they are."""
-    return ",".join(repr(float(value)) for value in values)
+def format_row(values: Iterable[float], separator: str = ",") -> str:
+    """Write numbers with commas, so that they are read back exactly."""
+    return separator.join(repr(float(value)) for value in values)
 
 
-def in_space(name: str, motion: Motion, frame: Array) -> Motion:
-    """A body's motion along and about the axes of space, from that in its ``frame (3, 3)``.
+def to_space(name: str, motion: Motion, frame: Array) -> Motion:
+    """Return a body's motion along and about the axes of space, from that in its ``frame (3, 3)``.
 
     Raises
     ------
     ProblemError
-        Where a force drives it along, or about, an axis that lies askew: FEBio holds and drives along its
-        own; where it turns about several axes, grows, or leaves a force open.
+        If a force drives it along, or about, an axis between those of space, because FEBio holds and drives
+        along its own; if it turns about several axes, grows, or leaves a force open.
     """
     if motion.grows:
         raise ProblemError(f"{name}: a body that grows is not written for FEBio, which has none")
@@ -72,21 +72,24 @@ def in_space(name: str, motion: Motion, frame: Array) -> Motion:
         if not np.allclose(np.abs(frame[main, range(3)]), 1.0, atol=1e-12):
             raise ProblemError(
                 f"{name}: a force along an axis that lies between x, y and z is not written for FEBio",
-                remedy="turn the problem first (limbfit.febio.in_indenter_frame)",
+                remedy="turn the problem first (limbfit.febio.turn_to_indenter_frame)",
             )
         own[:, block] = forced[:, block][:, main]
     values = motion.values @ turn
     values[:, :3] = np.where(np.abs(values[:, :3]) < 1e-15 * np.abs(values).max(), 0.0, values[:, :3])
-    if not agrees_in_turning(values, own):
+    if not has_same_rotation(values, own):
         raise ProblemError(
             f"{name}: a turn about several axes is not written for FEBio, which adds it up another way"
         )
     return Motion(motion.times, values, own)
 
 
-def guided(motion: Motion, frame: Array) -> Array | None:
-    """The direction (3,) along which a rail guides a body: where nothing drives it but a force, and what
-    moves it there, along one axis of its ``frame (3, 3)`` that lies askew; None for any other motion."""
+def find_rail(motion: Motion, frame: Array) -> Array | None:
+    """Return the direction (3,) along which a rail guides a body, or None for any other motion.
+
+    A rail is needed if nothing but a force drives the body, along one axis of its ``frame (3, 3)`` that lies
+    between the axes of space.
+    """
     (own,) = np.nonzero(motion.free)
     if len(own) != 1 or own[0] > 2 or motion.grows or np.isnan(motion.values).any():
         return None
@@ -95,33 +98,37 @@ def guided(motion: Motion, frame: Array) -> Array | None:
     return along if askew and not np.delete(motion.values, own[0], axis=1).any() else None
 
 
-def pushed(motion: Motion, along: Array) -> Motion:
-    """The motion in space of a body that a rail guides ``along (3,)``: it bears all but the force."""
+def to_rail_motion(motion: Motion, along: Array) -> Motion:
+    """Return the motion in space of a body guided ``along (3,)`` by a rail, which bears all but the force."""
     values = np.zeros((len(motion.times), 6))
     values[:, :3] = motion.values[:, :3].sum(axis=1)[:, None] * along
     under = np.asarray(np.asarray(motion.forced).any(axis=1))
     return Motion(motion.times, values, under[:, None].repeat(6, axis=1))
 
 
-def rail_lines(name: str, motion: Motion, along: Array, centre: Array, width: float) -> Iterator[str]:
-    """The joint that lets a body go along a line only, stiff to a thousandth of a mm and of a radian.
+def format_rail(name: str, motion: Motion, along: Array, centre: Array, width: float) -> Iterator[str]:
+    """Write the joint that lets a body go along a line only, stiff to a thousandth of a mm and of a radian.
 
-    FEBio's own force on the joint is left out: the body's stands among its loads.
+    FEBio's own force on the joint is left out, because the body's force stands among its loads.
     """
     under = np.append(False, np.asarray(motion.forced)[:, 0])
     stiff = 1e3 * float(np.linalg.norm(motion.values[under, :3], axis=1).max())
     across = np.eye(3)[np.argmin(np.abs(along))]
     yield f'<rigid_connector name="{name}_rail" type="rigid prismatic joint">'
-    yield f"<body_a>{FRAME}</body_a><body_b>{name}</body_b><laugon>PENALTY</laugon><tolerance>0</tolerance>"
+    yield f"<body_a>{FRAME_BODY}</body_a><body_b>{name}</body_b>"
+    yield "<laugon>PENALTY</laugon><tolerance>0</tolerance>"
     yield f"<force_penalty>{stiff!r}</force_penalty><moment_penalty>{stiff * width!r}</moment_penalty>"
-    yield f"<joint_origin>{row(centre)}</joint_origin><translation_axis>{row(along)}</translation_axis>"
-    yield f"<transverse_axis>{row(across)}</transverse_axis>"
+    yield f"<joint_origin>{format_row(centre)}</joint_origin>"
+    yield f"<translation_axis>{format_row(along)}</translation_axis>"
+    yield f"<transverse_axis>{format_row(across)}</transverse_axis>"
     yield "<prescribed_translation>0</prescribed_translation></rigid_connector>"
 
 
-def step_ends(motions: Iterable[Motion], end: float, settled: float = 0.0) -> list[float]:
-    """Where FEBio must begin another step, s, and the end: where what drives changes, and where pre-strained
-    tissue has ``settled``."""
+def find_step_ends(motions: Iterable[Motion], end: float, settled: float = 0.0) -> list[float]:
+    """Return the times at which FEBio must begin another step, s, and the end.
+
+    These are the times at which the kind of drive changes, and at which pre-strained tissue has ``settled``.
+    """
     found = {end} | ({settled} if settled else set())
     for motion in motions:
         times = np.asarray(motion.times)
@@ -129,18 +136,18 @@ def step_ends(motions: Iterable[Motion], end: float, settled: float = 0.0) -> li
     return sorted(found)
 
 
-def conditions(name: str, motion: Motion, ends: list[float], curves: Curves) -> list[list[str]]:
-    """The conditions of a rigid body in every step, of its motion in space."""
+def format_conditions(name: str, motion: Motion, ends: list[float], curves: CurveList) -> list[list[str]]:
+    """Write the conditions of a rigid body in every step, from its motion in space."""
     words: list[list[str]] = []
     for begin, end in pairwise([0.0, *ends]):
-        times, values, forced = _part(motion, begin, end)
+        times, values, forced = _cut_motion(motion, begin, end)
         label = name if len(ends) == 1 else f"{name}_{len(words) + 1}"
-        words.append(list(_conditions(name, label, times, values, forced, curves)))
+        words.append(list(_format_step_conditions(name, label, times, values, forced, curves)))
     return words
 
 
-def _part(motion: Motion, begin: float, end: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Times (k,), values (k, 6) and drives of a motion between two ends of steps."""
+def _cut_motion(motion: Motion, begin: float, end: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return times (k,), values (k, 6) and drives of a motion between two ends of steps."""
     times = np.asarray(motion.times)
     inner = times[(times > begin) & (times < end)]
     # Of two values at the start of a step the later one holds, at its end the earlier.
@@ -150,29 +157,29 @@ def _part(motion: Motion, begin: float, end: float) -> tuple[Array, Array, NDArr
     return np.array([begin, *inner, end]), values, motion.at(end)[1]
 
 
-def _conditions(
-    name: str, label: str, times: Array, values: Array, forced: NDArray[np.bool_], curves: Curves
+def _format_step_conditions(
+    name: str, label: str, times: Array, values: Array, forced: NDArray[np.bool_], curves: CurveList
 ) -> Iterator[str]:
     moving = np.asarray(values.any(axis=0))
     free = forced | moving
     if not free.all():
         held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(AXES + TURNS))
         yield f'<rigid_bc name="{label}_guide" type="rigid_fixed"><rb>{name}</rb>{held}</rigid_bc>'
-    on_line = None if forced.any() else straight(Motion(times - times[0], values))
+    on_line = None if forced.any() else find_straight_line(Motion(times - times[0], values))
     if on_line is not None:  # one curve, and its share along each axis
         direction, advance = on_line
         number = curves.add(f"{label}_advance", np.column_stack([times, advance]))
         for i in np.flatnonzero(direction):
-            yield _driven(label, name, "rigid_displacement", AXES[i], number, direction[i])
+            yield _format_drive(label, name, "rigid_displacement", AXES[i], number, direction[i])
         return
     for i in np.flatnonzero(moving):
         turn, letter = i > 2, (AXES + TURNS)[i]
         kind = ("rigid_displacement", "rigid_rotation", "rigid_force", "rigid_moment")[2 * forced[i] + turn]
         number = curves.add(f"{label}_{kind[6:]}_{letter}", np.column_stack([times, values[:, i]]))
-        yield _driven(label, name, kind, letter, number, 1.0)
+        yield _format_drive(label, name, kind, letter, number, 1.0)
 
 
-def _driven(label: str, name: str, kind: str, letter: str, curve: int, factor: float) -> str:
+def _format_drive(label: str, name: str, kind: str, letter: str, curve: int, factor: float) -> str:
     force = kind in ("rigid_force", "rigid_moment")
     tag, dof = (
         ("rigid_load", f"R{letter}") if force else ("rigid_bc", letter if letter in AXES else f"R{letter}")
@@ -184,10 +191,10 @@ def _driven(label: str, name: str, kind: str, letter: str, curve: int, factor: f
     )
 
 
-def boundary_lines(problem: Problem, curves: Curves) -> Iterator[str]:
-    """Nodes held, and those that follow the history."""
+def format_boundary(problem: Problem, curves: CurveList) -> Iterator[str]:
+    """Write the nodes that are held, and those that follow the history."""
     if len(problem.fixed):
-        yield f'<bc name="held" node_set="{HELD}" type="zero displacement">'
+        yield f'<bc name="held" node_set="{FIXED_SET}" type="zero displacement">'
         yield "<x_dof>1</x_dof><y_dof>1</y_dof><z_dof>1</z_dof></bc>"
     history, number = problem.history, 0
     for i, support in enumerate(problem.supports, 1):
@@ -201,8 +208,8 @@ def boundary_lines(problem: Problem, curves: Curves) -> Iterator[str]:
         yield f'<value lc="{number}">{support.factor!r}</value><relative>0</relative></bc>'
 
 
-def pressure_lines(problem: Problem, curves: Curves) -> Iterator[str]:
-    """Follower pressures."""
+def format_pressures(problem: Problem, curves: CurveList) -> Iterator[str]:
+    """Write follower pressures."""
     for i, one in enumerate(problem.pressures, 1):
         times = np.asarray(one.times)
         number = curves.add(f"pressure_{i}", np.column_stack([times, np.asarray(one.values)]))
