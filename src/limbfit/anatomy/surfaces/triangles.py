@@ -25,6 +25,8 @@ Faces = NDArray[np.int64]
 _SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
 _SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
+_LARGE = 4.0  # of the median face's size: larger ones are looked for in pieces
+_AT_ONCE = 20_000  # faces whose neighbours are held in memory
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Surface:
     def search(self) -> Search:
         """Its trees for nearest points and signed distances."""
         return Search(self.points, self.faces)
+
+    @cached_property
+    def crossings(self) -> NDArray[np.int64]:
+        """(p, 2) pairs of faces that cross; see :func:`self_intersections`."""
+        return _find_crossings(self)
 
     @property
     def triangles(self) -> Array:
@@ -233,10 +240,11 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
 
 
 def self_intersections(surface: Surface) -> NDArray[np.int64]:
-    """(p, 2) pairs of faces without a common point of which an edge of one pierces the other.
+    """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
+    return surface.crossings
 
-    Candidates are pairs whose bounding spheres meet; each edge is then tested against the other triangle.
-    """
+
+def _find_crossings(surface: Surface) -> NDArray[np.int64]:
     pairs = _near_pairs(surface)
     triangles = surface.triangles
     crossing = np.zeros(len(pairs), dtype=bool)
@@ -248,36 +256,66 @@ def self_intersections(surface: Surface) -> NDArray[np.int64]:
 
 
 def _near_pairs(surface: Surface) -> NDArray[np.int64]:
-    """Pairs of faces that share no point and whose bounding boxes overlap."""
-    triangles = surface.triangles
-    centre = triangles.mean(axis=1)
-    radius = np.linalg.norm(triangles - centre[:, None], axis=2).max(axis=1)
-    lists = _pairs_within(centre, radius)
-    low, high = triangles.min(axis=1), triangles.max(axis=1)
-    i, j = lists.T
-    apart = np.any((low[i] > high[j]) | (low[j] > high[i]), axis=1)
-    lists = lists[~apart]
-    shared = (surface.faces[lists[:, 0]][:, :, None] == surface.faces[lists[:, 1]][:, None, :]).any(
-        axis=(1, 2)
-    )
-    return lists[~shared]
+    """Pairs (p, 2) of faces that share no point and may cross: bounding boxes of pieces of them overlap.
 
-
-def _pairs_within(centre: Array, radius: Array) -> NDArray[np.int64]:
-    """Pairs (p, 2) whose spheres may meet; faces of a size together, as large ones are few."""
-    octave = np.floor(np.log2(radius / radius.min())).astype(int)
-    groups = [np.flatnonzero(octave == k) for k in np.unique(octave)]
+    Pieces whose spheres meet are looked up in trees, one for each octave of sizes, some pieces at a time.
+    """
+    owner, pieces = _split_large(surface.triangles)
+    low, high, centre = pieces.min(axis=1), pieces.max(axis=1), pieces.mean(axis=1)
+    radius = _radii(pieces)
+    octave = np.floor(np.log2(np.maximum(radius, 1e-6 * radius.max()))).astype(int)
+    groups = [np.flatnonzero(octave == n) for n in np.unique(octave)]
     trees = [cKDTree(centre[group]) for group in groups]
     found = []
-    for i, (group, tree) in enumerate(zip(groups, trees)):
-        reach = radius[group].max()
-        found.append(group[tree.query_pairs(2 * reach, output_type="ndarray")])
-        for larger, other in zip(groups[i + 1 :], trees[i + 1 :]):
-            near = other.query_ball_tree(tree, reach + radius[larger].max())
-            counts = [len(members) for members in near]
-            members = group[np.concatenate([np.array(m, dtype=np.int64) for m in near])]
-            found.append(np.column_stack([members, np.repeat(larger, counts)]))
-    return np.concatenate(found).astype(np.int64).reshape(-1, 2)
+    for n, group in enumerate(groups):
+        for part in np.array_split(group, -(-len(group) // _AT_ONCE)):
+            tree = cKDTree(centre[part])
+            for other, larger in zip(groups[n:], trees[n:]):
+                reach = float(radius[part].max() + radius[other].max())
+                near = tree.sparse_distance_matrix(larger, reach, output_type="ndarray")
+                i, j = part[near["i"]], other[near["j"]]
+                apart = np.any((low[i] > high[j]) | (low[j] > high[i]), axis=1)
+                found.append(_distinct(owner[i[~apart]], owner[j[~apart]], surface.faces))
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def _distinct(i: NDArray[np.int64], j: NDArray[np.int64], faces: Faces) -> NDArray[np.int64]:
+    """Pairs (p, 2) of faces, the lower number first, each once, without those that share a point."""
+    keys = np.unique(np.minimum(i, j) * len(faces) + np.maximum(i, j))
+    pairs = np.column_stack(np.divmod(keys, len(faces)))
+    first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
+    return pairs[~(first[:, :, None] == second[:, None, :]).any(axis=(1, 2))]
+
+
+def _split_large(triangles: Array) -> tuple[NDArray[np.int64], Array]:
+    """Triangles (m, 3, 3) with the large ones halved until they are of a usual size, and whose each is.
+
+    The flat caps of scans consist of long slivers, to each of which thousands of small faces are near.
+    """
+    owner = np.arange(len(triangles))
+    usual = _LARGE * float(np.median(_radii(triangles)))
+    owners, pieces = [], []
+    while len(owner):
+        large = _radii(triangles) > usual
+        owners.append(owner[~large])
+        pieces.append(triangles[~large])
+        owner, triangles = np.repeat(owner[large], 2), _halve(triangles[large])
+    return np.concatenate(owners), np.concatenate(pieces)
+
+
+def _halve(triangles: Array) -> Array:
+    """(2 m, 3, 3) halves of triangles (m, 3, 3), cut at the middle of the longest edge."""
+    longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).argmax(axis=1)
+    order = (longest[:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(triangles, order[:, :, None], axis=1), 1, 0)
+    middle = (a + b) / 2
+    halves = np.stack([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)], axis=1)
+    return halves.reshape(-1, 3, 3)
+
+
+def _radii(triangles: Array) -> Array:
+    """(m,) largest distance of a corner from the centroid."""
+    return np.linalg.norm(triangles - triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
 
 
 def _pierces(start: Array, end: Array, triangle: Array) -> NDArray[np.bool_]:
