@@ -15,6 +15,7 @@ from limbfit.mesh import Mesh, boundary_faces, quality, write_vtu
 from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door
+from limbfit.studio.scene import anatomy_of
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
@@ -55,6 +56,22 @@ def test_a_surface_is_sent_as_it_is(page, study):
     assert len(arrays["faces"]) == pv.read(study / "skin.stl").n_cells
     assert np.abs(arrays["points"][:, 2]).max() <= 120.01
     assert page.get("/api/model/surface/none").status_code == 422
+
+
+def test_surfaces_are_read_again_only_where_they_or_what_is_said_of_them_changed(study):
+    folder = StudyFolder(study / "study.toml")
+    first = anatomy_of(folder, folder.load())
+    assert anatomy_of(folder, folder.load()) is first
+    text = folder.file.read_text()
+    folder.file.write_text(text.replace('"tibia.stl" }', '"tibia.stl" }\nunit = "cm"'))
+    assert np.ptp(anatomy_of(folder, folder.load()).skin.points) == pytest.approx(
+        10 * np.ptp(first.skin.points)
+    )
+    folder.file.write_text(text)
+    skin = pv.read(study / "skin.stl")
+    skin.points *= 1.1
+    skin.save(study / "skin.stl")
+    assert np.ptp(anatomy_of(folder, folder.load()).skin.points) > 1.05 * np.ptp(first.skin.points)
 
 
 def test_a_click_becomes_a_site_of_the_study_within_a_millimetre(page, study):

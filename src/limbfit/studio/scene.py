@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from ..anatomy.sites.sites import project_to_skin
 from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
+from ..pipeline.shared.artefacts import digest
 from ..pipeline.stages.sites import place_site
 from ..pipeline.stages.surfaces import given_anatomy
 from ..study import Site, Study
@@ -25,6 +27,23 @@ SKIN = "skin"
 
 def anatomy_of(folder: StudyFolder, study: Study) -> Anatomy | None:
     """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
+    return _anatomy(folder, surfaces_mark(folder, study))
+
+
+def surfaces_mark(folder: StudyFolder, study: Study) -> str:
+    """Changes with the files of the limb's surfaces and with what the study says of them."""
+    given, geometry = study.surfaces, study.geometry
+    files = [] if given is None else [given.skin, *given.bones.values()]
+    files += [one.surface for one in geometry.regions if one.surface is not None]
+    made = sorted((folder.results / "surfaces").glob("*"))
+    stated = digest(*(one and one.model_dump(mode="json") for one in (given, geometry)))
+    return f"{fingerprint([*made, *map(study.path, files)])} {stated}"
+
+
+@lru_cache(maxsize=1)
+def _anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
+    """The last one is kept, by its ``mark``: to mend and check given surfaces can take seconds."""
+    study = folder.load()
     if _is_made(folder):
         return load_anatomy(folder.results / "surfaces")
     return None if study.surfaces is None else given_anatomy(study)[0]

@@ -29,7 +29,7 @@ from .identification_routes import last_run
 from .model_routes import Place, StrictModel, Text
 from .playback import arrays_of
 from .processes import running, start_socket, starting
-from .scene import anatomy_of, on_skin
+from .scene import anatomy_of, on_skin, surfaces_mark
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/socket")
@@ -184,7 +184,7 @@ def _handles(folder: StudyFolder, study: Study) -> list[list[float]]:
         return []
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
     try:
-        limb = _profile(folder, _surfaces_mark(folder, study))
+        limb = _profile(folder, surfaces_mark(folder, study))
         if table.trimline and not table.trim_planes:
             return [[*map(float, row)] for row in on_limb(limb, frame, np.array(table.trimline))]
         return [[*map(float, row)] for row in brim_of(limb, frame, trim_of(study, anatomy), HANDLES)]
@@ -228,14 +228,7 @@ def _mark(folder: StudyFolder, study: Study) -> str:
     table = study.socket
     file = fingerprint([] if table.file is None else [study.path(table.file)])
     stated = digest(table.model_dump(mode="json", exclude={"design", "loads"}))
-    return f"{_surfaces_mark(folder, study)} {file} {stated}"
-
-
-def _surfaces_mark(folder: StudyFolder, study: Study) -> str:
-    given = study.surfaces
-    files = [study.path(path) for path in (() if given is None else (given.skin, *given.bones.values()))]
-    stated = digest(study.geometry.model_dump(mode="json"))
-    return f"{fingerprint([folder.results / 'surfaces' / 'surfaces.json', *files])} {stated}"
+    return f"{surfaces_mark(folder, study)} {file} {stated}"
 
 
 @lru_cache(maxsize=2)
@@ -293,7 +286,7 @@ def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
         raise InputError(NONE_YET)
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with blaming(study, "socket.trimline"):
-        limb = _profile(folder, _surfaces_mark(folder, study))
+        limb = _profile(folder, surfaces_mark(folder, study))
         points = on_limb(limb, frame, np.array(line.points))
         trimmed(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())
