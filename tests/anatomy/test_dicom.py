@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from limbs import CALF, DIRECTIONS, IDENTITY, volume, write_dicom
@@ -122,12 +120,7 @@ def test_a_truncated_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("prefix", "shown"),
-    [
-        ("IM", r" \(IM\d+\.dcm\)"),
-        ("series 4/slice_", r" \(series 4/slice_\d+\.dcm\)"),
-        ("DOEJANE", ""),
-        ("4711081", ""),
-    ],
+    [("IM", " (IM_002.dcm)"), ("ser 4/slice", " (ser 4/slice_002.dcm)"), ("DOEJANE", ""), ("4711081", "")],
 )
 def test_a_damaged_file_is_named_by_its_number_and_by_a_name_that_is_nobodys(tmp_path, prefix, shown):
     folder = tmp_path / "mri"
@@ -135,8 +128,8 @@ def test_a_damaged_file_is_named_by_its_number_and_by_a_name_that_is_nobodys(tmp
     write_dicom(folder, volume(np.eye(3)), prefix=prefix)
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     files[2].write_bytes(files[2].read_bytes()[:200])
-    told = f"{re.escape(str(folder))}: file 3 of {len(files)} by name{shown}: the DICOM file is cut short or damaged;"
-    assert re.match(told, refusal(folder))
+    told = f"{folder}: file 3 of {len(files)} by name{shown}: the DICOM file is cut short or damaged;"
+    assert refusal(folder).startswith(told)
     assert (files[2].name in refusal(folder)) == bool(shown)
 
 

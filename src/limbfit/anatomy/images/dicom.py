@@ -20,27 +20,7 @@ from .dicom_headers import SliceHeader, read_headers
 from .dicom_pixels import read_pixels
 from .dicom_stack import same_plane_geometry, stacked
 
-_PLAIN_WORDS = frozenset(
-    [
-        "dcm",
-        "dicom",
-        "ima",
-        "im",
-        "img",
-        "image",
-        "i",
-        "slice",
-        "mr",
-        "ct",
-        "pt",
-        "ser",
-        "series",
-        "s",
-        "se",
-        "frame",
-        "z",
-    ]
-)
+_PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
 _MAX_COUNT = 9999  # of files; a larger number may be that of a person
 
 
@@ -75,7 +55,7 @@ def list_series(folder: str | Path) -> list[Series]:
 
 
 def _shown_name(path: Path) -> str:
-    """The name of a file in brackets, if it holds words of machines and counters only, nothing of a person."""
+    """The name of a file in brackets, if it holds only words of machines and counters."""
     words, numbers = re.findall(r"[^\W\d_]+", str(path)), re.findall(r"\d+", str(path))
     is_plain = all(word.lower() in _PLAIN_WORDS for word in words)
     return f" ({path.as_posix()})" if is_plain and all(int(n) <= _MAX_COUNT for n in numbers) else ""
