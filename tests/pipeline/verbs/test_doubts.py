@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
+import nibabel
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
+from limbs import leg_image
+
 from conftest import write_trace
-from limbfit import check_study, load_study
+from limbfit import check_study, load_study, run_study
+from limbfit.anatomy.imaging import write_labels, write_volume
+from limbfit.report.page import Bullets
 from limbfit.report.sections.doubts import doubts
-from limbfit.report.store import Results
+from limbfit.report.sections.sections import model
+from limbfit.report.store import Results, load_store
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])
 
@@ -75,6 +85,32 @@ def test_a_wrong_axis_is_told_with_its_angle(five):
     found = flags(five)
     assert [(flag["sites"], flag["kind"]) for flag in found] == [(["2"], "axis")]
     assert found[0]["evidence"]["axis_deg"] == pytest.approx(90, abs=8)
+
+
+def test_an_image_that_says_twice_where_it_lies_is_told_by_check_stage_and_report(tmp_path):
+    """Read by its sform, where its labels are; its qform is 30 mm off."""
+    image, labels = leg_image([4.0, 4.0, 5.0], (32, 32, 32), np.eye(3))
+    write_volume(tmp_path / "image.nii", image)
+    write_labels(tmp_path / "labels.seg.nrrd", labels)
+    header = nibabel.load(tmp_path / "image.nii")
+    qform = header.affine.copy()
+    qform[0, 3] += 30.0
+    header.set_qform(qform, 1)
+    header.set_sform(header.affine, 1)
+    nibabel.save(nibabel.Nifti1Image(np.asarray(header.dataobj), None, header.header), tmp_path / "two.nii")
+    (tmp_path / "study.toml").write_text(
+        '[study]\nname = "leg"\n[image]\npath = "two.nii"\n[segmentation]\nlabels = "labels.seg.nrrd"\n'
+        '[[sites]]\nname = "1"\nposition = [0.0, 0.0, 0.0]\ndepth_mm = 5.0\n'
+    )
+    study = load_study(tmp_path)
+    words = "image: its qform and sform differ by up to 30.0 mm; the sform is used"
+    facts = check_study(study, listener=lambda event: None)["facts"]
+    assert sum(fact.startswith(f"warning: {words}") for fact in facts) == 1
+    said = []
+    run_study(study, until="segment", listener=lambda event: said.append(event.text))
+    assert sum(text.startswith(f"warning: {words}") for text in said) == 1
+    bullets = [block for block in model(load_store(study.results)).blocks if isinstance(block, Bullets)]
+    assert bullets[0].items[0].startswith(words)
 
 
 def section(tmp_path, **predict):
