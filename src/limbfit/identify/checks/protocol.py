@@ -23,7 +23,7 @@ from ..uncertainty.noise import compute_skin_similarity
 from ..uncertainty.uncertainty import NORMAL_95
 from .design import Criterion, NoiseModel, compute_field_information, compute_information
 
-_MAX_VARIANCE = 25.0  # of a logarithm: no factor is told beyond exp(50), however little is known
+_MAX_VARIANCE = 25.0  # of a logarithm: no factor is reported beyond exp(50), however little is known
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,11 @@ class RecordNoise:
         parts: tuple[int, Array, float],
         parameters: Array,
     ) -> Array:
-        """Return the information (p, p) of a record with ``values`` (g, n) beside its force, ``slopes`` (g,
-        n, p).
+        """Return the information (p, p) of a record's force and of all that is measured beside it.
 
-        ``parts`` says what the values are: first so many of layers, then three components of each of the
-        points (k, 3) mm on the skin, then speeds, of which there are so many readings.
+        ``values`` (g, n) are measured beside the force, ``slopes`` (g, n, p) are their derivatives. ``parts``
+        says what the values are: first so many of layers, then three components of each of the points (k, 3)
+        mm on the skin, then speeds, of which there are so many readings.
         """
         layers, points_mm, readings = parts
         information, waves = self.compute_force_information(force, parameters), layers + 3 * len(points_mm)

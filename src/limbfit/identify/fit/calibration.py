@@ -29,10 +29,10 @@ from .trust_region import FIRST_RADIUS, SearchPoint, SearchStep, minimise
 
 # Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
 _START_SHIFTS = (0.0, 0.0, 0.1, 0.25, 0.5)
-# Of the tissues' own starts, put on the start of the next stage until it completes
+# Shares of the ratios between the tissues' own starts; the next stage begins with the first that completes.
 _RATIO_SHARES = (1.0, 0.5, 0.0)
 _PAPER_CHANGE = 0.01
-_VALLEY_STEPS = 4  # steps
+_VALLEY_STEPS = 4
 _MAX_TRIES = 3  # of a simulation that completed before
 START_WARNINGS = ("slipped", "folded")
 _MAX_FOLD_REFUSALS = 3  # trials of a stage that fold anew are refused; more are taken for what they are
@@ -170,8 +170,7 @@ class _Search:
         self._stored = {parameters.tobytes(): self._accepted}
 
     def find_start(self) -> tuple[SearchState, SearchPoint]:
-        """Find a first point at which all simulations complete, at the start or towards the middle of the
-        bounds.
+        """Find a first point at which all simulations complete: the start, or nearer to the bounds' middle.
 
         A point at which nothing slips is preferred. Folded elements may come from the mesh and are only
         reported.
