@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
@@ -17,6 +18,7 @@ from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Socket, read_socket, rectified
 from limbfit.socket.shape import closed_by_fans
 from limbfit.socket.trim import Trim
+from limbfit.socket.wall import wall
 
 TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])
 
@@ -116,6 +118,18 @@ def test_of_a_wall_the_inner_side_is_taken(tmp_path: Path, turned: bool) -> None
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=2e-3)
     assert len(socket.faces) == pytest.approx(len(drawn().faces), rel=0.01)
     assert "4.0 mm" in socket.notes[-1]
+
+
+def test_the_wall_that_limbfit_makes_for_printing_is_read_back(tmp_path: Path) -> None:
+    """Its inner face, and of the rolled brim what looks inward: less than the wall is thick."""
+    write_surface(tmp_path / "socket.stl", wall(drawn(), CUT_NORMAL, 4.0))
+    socket = read(tmp_path / "socket.stl")
+    own = igl.point_mesh_squared_distance(socket.points, face().points, face().faces)[0]
+    back = igl.point_mesh_squared_distance(face().points, socket.points, socket.faces)[0]
+    assert np.sqrt(back.max()) < 0.01
+    above = socket.points[:, 2] > face().points[drawn().brim, 2].min()
+    assert np.sqrt(own[~above].max()) < 0.01
+    assert np.sqrt(own.max()) < 4.0
 
 
 def moved(*by: float) -> Surface:
