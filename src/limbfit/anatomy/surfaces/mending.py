@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import igl
+import manifold3d
 import numpy as np
-import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -318,18 +318,13 @@ def _capped(surface: Surface, rim: Array, name: str, file: Path | None) -> tuple
 
 def _triangulated(polygon: Array, normal: Array) -> Ints | None:
     """Triangles (n - 2, 3) that fill a flat polygon (n, 3), seen from ``normal``; None where none do."""
-    size = len(polygon)
-    outline = pv.PolyData(polygon, faces=np.array([size, *range(size)]))
-    faces = outline.triangulate().regular_faces.astype(np.int64)
-    if len(faces) != size - 2:
-        return None
-    flat = Surface(polygon, faces)
-    if flat.face_normals.sum(axis=0) @ normal < 0:
-        flat = flat.flipped
+    along = np.linalg.svd(normal[None])[2][1]
+    flat = polygon @ np.column_stack([along, np.cross(normal, along)])
+    faces = manifold3d.triangulate([flat]).astype(np.int64)
     # Of a simple outline the triangles' areas add up to that of the outline.
-    if not np.isclose(flat.area, np.linalg.norm(_area_vector(polygon)), rtol=1e-6):
+    if not np.isclose(Surface(polygon, faces).area, np.linalg.norm(_area_vector(polygon)), rtol=1e-6):
         return None
-    return flat.faces
+    return faces
 
 
 def _uncrossed(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
