@@ -15,11 +15,11 @@ Units: s, mm, N; force positive when pushing, displacement positive into the lim
 from .creep import Creep, regularise_creep
 from .layers import Layers, Thinning, read_layers, thinnings
 from .reading import read_trace
-from .record import COLUMNS, Trace, check_trace
+from .record import COLUMNS, Remark, Trace, check_trace
 from .regularise import Regularised, regularise
 from .surface import SurfaceMeans, SurfaceMotion, in_contact, read_surface_motion
 from .touchdown import TouchDown, find_touch_down, touch_down_at
-from .understanding import Remark, Understood, understand
+from .understanding import Understood, understand
 from .waves import WaveMeans, WaveSpeeds, read_wave_speeds
 
 __all__ = [

@@ -10,9 +10,10 @@ from scipy.optimize import least_squares
 
 from ..errors import TraceError
 from ..phases import MotionPhase, find_phases, tolerance_mm, way_in
-from .numerics import Array, bins, noise_level, straight
+from .numerics import Array, bins, noise_level, resolution, straight
 
 _MAX_KNOTS = 41
+_STEPS = 0.7  # of a step in which the displacement comes: half of one is rounded, and corners are off too
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,10 @@ class BrokenLine:
         """When the indenter starts to move in."""
         return next((phase.start_s for phase in self.phases if phase.kind == "load"), float(self.times[0]))
 
+    def path(self, at: Array) -> Array:
+        """The way that the indenter has gone, in and out, since the first corner, at times (n,) s; mm."""
+        return np.interp(at, self.times, np.r_[0.0, np.cumsum(np.abs(np.diff(self.values)))])
+
     def time_at(self, displacement: float, back: bool = False) -> float:
         """When the line passes a displacement on the first way in, or for the last time ``back`` out (the
         end where it stays beyond)."""
@@ -62,7 +67,8 @@ def broken_line(
     quantity: str = "displacement",
     unit: str = "mm",
 ) -> BrokenLine:
-    """Fit as few straight pieces as describe the displacement to 0.3 % of the travel (or its noise).
+    """Fit as few straight pieces as describe the displacement to 0.3 % of the travel (or its noise, or the
+    steps that it comes in).
 
     So is a force that is stated instead: ``quantity`` and ``unit`` are for messages.
 
@@ -77,7 +83,8 @@ def broken_line(
     t, u, _ = bins(time, displacement, 5000)
     at, coarse, n = bins(t, u, 300)
     travel = float(np.ptp(coarse))
-    tolerance = max(0.003 * travel, 4 * noise_level(u) / np.sqrt(float(n.mean())))
+    noise = 4 * noise_level(u) / np.sqrt(float(n.mean()))
+    tolerance = max(0.003 * travel, noise, _STEPS * resolution(displacement))
     knots = np.array([time[0], time[-1]])
     while True:
         knots, values = _place_knots(t, u, knots)

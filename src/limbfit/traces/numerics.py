@@ -9,10 +9,26 @@ from scipy.interpolate import make_interp_spline
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_COARSE = 0.75  # of the samples: so many have a value that another one has too
+
 
 def noise_level(values: Array) -> float:
     """Standard deviation of white noise on a smooth curve, from second differences (robust)."""
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6.0))
+
+
+def resolution(values: Array) -> float:
+    """The step in which values (n,) come; zero where hardly any of them is there twice."""
+    levels, counts = np.unique(values, return_counts=True)
+    levels = levels[counts > 1]
+    if len(levels) < 2 or counts[counts > 1].sum() < _COARSE * len(values):
+        return 0.0
+    return float(np.median(np.diff(levels)))
+
+
+def runs(true: Bools) -> NDArray[np.int64]:
+    """First and one beyond the last (k, 2) of every run of what is true (n,)."""
+    return np.flatnonzero(np.diff(np.r_[False, true, False])).reshape(-1, 2)
 
 
 def rms(residual: Array) -> float:

@@ -57,12 +57,15 @@ class Onset:
     misfit: float
 
 
-def find_onset(part: OnsetPart, scatter: Scatter, around: Onset | None = None) -> Onset:
+def find_onset(
+    part: OnsetPart, scatter: Scatter, around: Onset | None = None, before_mm: float = 0.0
+) -> Onset:
     """The mean place over its likelihood, the noise's correlation known and the shape of the onset not.
 
     Stiffness and baseline are integrated out (both flat, the stiffness by the force at the end of the part),
     exponent and memory summed over a grid; the place over one that spans the part, or a finer one ``around``
-    what was found so.
+    what was found so.  With ``before_mm`` it may lie by so much before the part, and the sensor was zeroed
+    wherever the part begins.
     """
     covariance = block_covariance(scatter.sd_N, scatter.lag, np.full(len(part.time_s), part.samples))
     covariance += (_LEAST_NOISE * part.rise_N) ** 2 * np.eye(len(part.time_s))
@@ -72,10 +75,10 @@ def find_onset(part: OnsetPart, scatter: Scatter, around: Onset | None = None) -
     if around is not None:
         reach = _AROUND * around.sd
         low, high = max(around.place_mm - reach, low), min(around.place_mm + reach, high)
-    return _weighed(part, whiten, np.linspace(low, high, _PLACES))
+    return _weighed(part, whiten, np.linspace(low - before_mm, high, _PLACES), zeroed=before_mm == 0.0)
 
 
-def _weighed(part: OnsetPart, whiten: Array, places: Array) -> Onset:
+def _weighed(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -> Onset:
     """Every onset that starts at one of the places (m,), weighed by its likelihood."""
     shapes = _shapes(part, places) @ whiten.T
     one, force = whiten.sum(axis=1), whiten @ part.force_N
@@ -88,7 +91,9 @@ def _weighed(part: OnsetPart, whiten: Array, places: Array) -> Onset:
     misfit = np.where(stiffness > 0, yy - baseline * oy - stiffness * ay, np.inf)
     # A record without slack leaves the baseline free to take up the onset: hold it to a zeroed sensor,
     # loosely, and not where it is far from zero.
-    weight = -0.5 * np.log(determinant) - np.log1p((baseline / (_ZEROED * part.rise_N)) ** 2)
+    weight = -0.5 * np.log(determinant)
+    if zeroed:
+        weight -= np.log1p((baseline / (_ZEROED * part.rise_N)) ** 2)
     least, free = float(misfit.min()), max(len(force) - 5, 1)
     weight -= 0.5 * misfit / max(1.0, least / free)
     share = np.exp(weight - weight.max())
@@ -108,13 +113,13 @@ def _shapes(part: OnsetPart, places: Array) -> Array:
     elastic = np.concatenate([depth ** EXPONENTS[:, None], *stiffening], axis=1)
     shapes = [elastic]
     for tau in TAU_S:
-        memory = _memory(part.time_s, elastic, tau)
+        memory = compute_memory(part.time_s, elastic, tau)
         shapes += [elastic + gamma * memory for gamma in GAMMA]
     stacked = np.stack(shapes)
     return np.asarray(stacked / np.maximum(stacked[..., -1:], 1e-300))
 
 
-def _memory(time: Array, elastic: Array, tau: float) -> Array:
+def compute_memory(time: Array, elastic: Array, tau: float) -> Array:
     """What relaxes with ``tau`` of an elastic force (..., n) that is straight between the times (n,)."""
     step = np.diff(time)
     decay = np.exp(-step / tau)

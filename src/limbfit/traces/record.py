@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,20 @@ class Trace:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Remark:
+    """Something to know about a record: its kind, what, its likely cause, the remedy, and the numbers.
+
+    ``adds_sd_mm`` among the numbers is the standard deviation of the touch-down that it alone makes.
+    """
+
+    kind: str
+    what: str
+    cause: str
+    remedy: str
+    evidence: Mapping[str, float]
+
+
 def check_trace(
     trace: Trace, *, columns: tuple[str, str, str] = COLUMNS, file: str | Path | None = None
 ) -> None:
@@ -38,7 +53,7 @@ def check_trace(
     Raises
     ------
     TraceError
-        Too short, not finite, time not increasing, never in contact, or units that cannot be right: travel
+        Too short, not finite, time going back, never in contact, or units that cannot be right: travel
         outside 0.2-60 mm, speed outside 0.05-50 mm/s, peak force outside 0.05-200 N.
     """
     series = (trace.time_s, trace.displacement_mm, trace.force_N)
@@ -51,10 +66,14 @@ def check_trace(
     if len(trace.time_s) < MIN_SAMPLES:
         what = f"only {len(trace.time_s)} samples"
         raise TraceError(what, file=file, remedy=f"a record needs at least {MIN_SAMPLES}")
-    back = np.flatnonzero(np.diff(trace.time_s) <= 0)
+    steps = np.diff(trace.time_s)
+    back = np.flatnonzero(steps < 0)
     if back.size:
-        what = f"time does not increase at sample {back[0] + 2}"
-        raise TraceError(what, file=file, place=columns[0], remedy="remove doubled or unsorted samples")
+        what = f"time goes back at sample {back[0] + 2}"
+        raise TraceError(what, file=file, place=columns[0], remedy="remove or sort the samples")
+    if (times := int((steps > 0).sum()) + 1) < MIN_SAMPLES:
+        what = f"only {times} different times for {len(trace.time_s)} samples"
+        raise TraceError(what, file=file, place=columns[0], remedy="export times with more digits")
     _check_contact(trace, columns, file)
     _check_units(trace, columns, file)
 

@@ -36,6 +36,8 @@ _ONSET_LEVEL = 0.05  # of the peak force: more of the onset is no power law, whe
 _LEAST_LEVEL_NOISE = 45.0  # and never less than this many standard deviations of what means of it scatter
 _LEAST_TRAVEL = 0.03  # of the way in: a force that jumps before the indenter moves is no onset
 _MEANS = 120  # that part as so many means
+_BEFORE_SHARE, _BEFORE_MM = 0.2, 1.0  # of the way in; how far before the record the skin may have been met
+_BINS = 200
 _APPROACH = 3.0  # times the onset: more of what came before it says nothing more about it
 
 
@@ -61,10 +63,7 @@ def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
     scatter = scatter_of(force)
     part = _part(time, travel, force, moving, scatter)
     rough = find_onset(part, scatter)
-    # Smooth on either side of touch-down only: the kink in between is no noise.
-    met = int(np.searchsorted(travel, rough.place_mm))
-    scatter = scatter_of(force[:met], force[met:])
-    part = _part(time, travel, force, moving, scatter)
+    scatter, part = _near(rough.place_mm, time, travel, force, moving)
     onset = find_onset(part, scatter, rough)
     return TouchDown(
         time_s=float(np.interp(onset.place_mm, np.maximum.accumulate(travel), time)),
@@ -74,6 +73,26 @@ def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
         baseline_N=onset.baseline_N,
         in_contact_at_start=bool(onset.place_mm - travel[0] < 2 * onset.sd and moving < MIN_SAMPLES),
     )
+
+
+def deviation_before(trace: Trace, line: BrokenLine, touch: TouchDown) -> float:
+    """How far off (mm, root mean square) a touch-down is that may lie before the start of the record, with a
+    sensor that was zeroed in contact."""
+    time, travel, force = _way_in(trace, line)
+    moving = int(np.searchsorted(time, line.start_s))
+    scatter, part = _near(touch.displacement_mm, time, travel, force, moving)
+    before = min(_BEFORE_SHARE * float(travel[-1] - travel[0]), _BEFORE_MM)
+    onset = find_onset(part, scatter, before_mm=before)
+    return float(np.hypot(onset.sd, onset.place_mm - touch.displacement_mm))
+
+
+def _near(
+    place_mm: float, time: Array, travel: Array, force: Array, moving: int
+) -> tuple[Scatter, OnsetPart]:
+    """The noise on either side of a touch-down, as the kink in between is none, and the part to look at."""
+    met = int(np.searchsorted(travel, place_mm))
+    scatter = scatter_of(force[:met], force[met:])
+    return scatter, _part(time, travel, force, moving, scatter)
 
 
 def _way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
@@ -87,7 +106,7 @@ def _way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
 
 def _part(time: Array, travel: Array, force: Array, moving: int, scatter: Scatter) -> OnsetPart:
     """The low-force part of a way in, as means."""
-    at, smooth, _ = bins(np.arange(len(force), dtype=float), force, 200)
+    at, smooth, _ = bins(np.arange(len(force), dtype=float), force, _BINS)
     base = float(np.median(force[: max(moving, len(force) // 50, 1)]))
     rise = float(smooth.max()) - base
     if rise <= 0.1 * float(np.ptp(smooth)):
@@ -120,3 +139,11 @@ def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
             remedy=f"give a time from {first:.3f} s to before {last:.3f} s",
         )
     return replace(_from_onset(trace, line), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
+
+
+def depth_at(trace: Trace, line: BrokenLine, touch: TouchDown, force_N: float) -> float:
+    """How deep the indenter is when the force first reaches so much, mm."""
+    way = (trace.time_s >= touch.time_s) & (trace.time_s <= line.peak_s)
+    time, force, _ = bins(trace.time_s[way], trace.force_N[way] - touch.baseline_N, _BINS)
+    first = int(np.argmax(force >= min(force_N, float(force.max()))))
+    return max(float(line(time[first])) - touch.displacement_mm, touch.uncertainty_mm)

@@ -7,7 +7,6 @@ nobody knows.  What was done, and what someone should know, stands in ``remarks`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,14 +15,27 @@ from scipy.ndimage import median_filter
 
 from ..errors import TraceError
 from .displacement import BrokenLine, broken_line
-from .numerics import Array, Bools, bins, noise_level
-from .record import Trace
+from .faults import (
+    coarse_steps,
+    find_frozen,
+    find_gaps,
+    find_steps,
+    frozen_remarks,
+    gap_remarks,
+    mend_times,
+    saturation,
+    step_remarks,
+)
+from .numerics import Array, Bools, bins, noise_level, resolution, runs
+from .passivity import lag_remarks, swing_remarks
+from .record import Remark, Trace
 from .scatter import scatter_of
-from .touchdown import TouchDown, find_touch_down, touch_down_at
+from .touchdown import TouchDown, depth_at, deviation_before, find_touch_down, touch_down_at
 
 _SPIKE_WIDTH = 2  # samples; what lasts longer may have happened
 _SPIKE_NOISE = 8.0  # standard deviations
 _SPIKE_STEPS = 6.0  # times the usual step between the samples around it: a corner is no spike
+_SPIKE_RESOLUTION = 2.5  # steps in which the values come
 _SPIKE_SHARE = 0.02  # of the range: less does no harm
 _MOST_SPIKES = 0.01  # of the samples
 _AROUND = 4  # samples on either side
@@ -31,6 +43,9 @@ _CLEAR_MM = 0.1  # and two standard deviations of touch-down: off the skin
 _LEAST_CLEAR = 20  # samples
 _DRIFT_SHARE = 0.01  # of the peak force, over the record: less does no harm
 _DRIFT_SD = 5.0
+_WARMING = (0.05, 0.1, 0.2, 0.4, 0.8)  # of the record: times with which a warming may fade
+_BENT = 16.0  # of squared misfit in variances, by which a straight drift is worse
+_ONSET_S = 0.5
 _MOST_DRIFT = 0.3  # of the peak force: more is no sensor to correct
 _PRELOAD_SHARE = 0.05  # of the peak force
 _START_FORCE_SHARE = 0.25  # of the peak force, where there are too few samples for a slope
@@ -41,17 +56,6 @@ _START_SLOPE = 0.25  # of the mean slope of the way in
 _LEAST_START = 8  # samples
 _RISE_SHARE = 0.5  # of the largest force: the rise in which a stated force meets the skin
 _BINS = 200
-
-
-@dataclass(frozen=True)
-class Remark:
-    """Something to know about a record: its kind, what, its likely cause, the remedy, and the numbers."""
-
-    kind: str
-    what: str
-    cause: str
-    remedy: str
-    evidence: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -76,15 +80,54 @@ def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool 
         Where it begins in contact, where more than 1 % of its samples stick out, where its force drifts by
         more than 30 % of the peak, or as `find_touch_down` and `touch_down_at` do.
     """
-    trace, remarks = _without_spikes(trace)
+    trace, doubled = mend_times(trace)
+    trace, spikes = _without_spikes(trace)
     line = broken_line(trace.time_s, trace.displacement_mm)
     _check_start(trace, line)
-    level = _level_ends(trace, line)
-    touch = _touch_down(level, touch_down_s, forced)
-    straight, drift = _without_drift(trace, line, touch)
-    if straight is not level:
-        touch = _touch_down(straight, touch_down_s, forced)
-    return Understood(straight, touch, (*remarks, *drift, *_start_remark(touch, touch_down_s)))
+    rise, gaps = _rise(trace), find_gaps(trace, line)
+    frozen = [] if forced else find_frozen(trace, line, rise)
+    lost = gaps + [(float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])) for run in frozen]
+    steps = [] if forced else find_steps(trace, line, rise, lost)
+    straight = trace if steps else _level_ends(trace, line)
+    touch = _touch_down(straight, touch_down_s, forced)
+    drift: list[Remark] = []
+    if not steps:
+        level, (straight, drift) = straight, _without_drift(trace, line, touch)
+        if straight is not level:
+            touch = _touch_down(straight, touch_down_s, forced)
+    remarks = [
+        *doubled,
+        *spikes,
+        *coarse_steps(trace, line, rise),
+        *gap_remarks(gaps, line, touch.time_s),
+        *frozen_remarks(trace, frozen, line, touch.time_s),
+        *step_remarks(steps),
+        *drift,
+        *([] if forced else _against_passive(straight, line, touch, rise, lost, steps)),
+        *(_start_remark(straight, line, touch) if touch.in_contact_at_start and touch_down_s is None else ()),
+    ]
+    added = [remark.evidence.get("adds_sd_mm", 0.0) for remark in remarks]
+    wide = float(np.linalg.norm([touch.uncertainty_mm, *added]))
+    return Understood(straight, replace(touch, uncertainty_mm=wide), tuple(remarks))
+
+
+def _against_passive(
+    trace: Trace,
+    line: BrokenLine,
+    touch: TouchDown,
+    rise_N: float,
+    lost: list[tuple[float, float]],
+    steps: list[tuple[float, float]],
+) -> list[Remark]:
+    """Remarks on a force that no passive tissue gives, each looked for where no other explains it."""
+    at_top = saturation(trace, line, rise_N)
+    if at_top:
+        return at_top
+    way_in = (trace.time_s <= line.peak_s) & (trace.time_s >= touch.time_s)
+    scatter = scatter_of(trace.force_N[trace.time_s < touch.time_s], trace.force_N[way_in])
+    swing = [] if lost else swing_remarks(trace, line, touch, scatter, rise_N, [at for at, _ in steps])
+    odd = [*lost, *((at, at) for at, _ in steps)]
+    return [*swing, *lag_remarks(trace, line, touch, scatter, odd)]
 
 
 def _touch_down(trace: Trace, stated_s: float | None, forced: bool) -> TouchDown:
@@ -129,15 +172,13 @@ def _spikes(values: Array) -> Bools:
     """Which samples (n,) stick out from the median of their neighbours, one or two in a row."""
     off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="nearest")
     noise = max(1.4826 * float(np.median(np.abs(off))), noise_level(values))
-    out = np.abs(off) > max(
-        _SPIKE_NOISE * noise, _SPIKE_SHARE * float(np.ptp(np.percentile(values, [1, 99])))
-    )
+    share = _SPIKE_SHARE * float(np.ptp(np.percentile(values, [1, 99])))
+    out = np.abs(off) > max(_SPIKE_NOISE * noise, share, _SPIKE_RESOLUTION * resolution(values))
     steps = np.abs(np.diff(values))
     for i in np.flatnonzero(out):
         before, after = steps[max(i - 1 - _AROUND, 0) : max(i - 1, 0)], steps[i + 2 : i + 2 + _AROUND]
         out[i] = abs(off[i]) > _SPIKE_STEPS * np.median(np.r_[before, after])
-    edges = np.flatnonzero(np.diff(np.r_[False, out, False]))
-    for start, end in edges.reshape(-1, 2):
+    for start, end in runs(out):
         if end - start > _SPIKE_WIDTH:
             out[start:end] = False
     return np.asarray(out, dtype=bool)
@@ -171,6 +212,7 @@ def _clear(trace: Trace, line: BrokenLine, touch: TouchDown) -> Bools:
 
 
 def _without_drift(trace: Trace, line: BrokenLine, touch: TouchDown) -> tuple[Trace, list[Remark]]:
+    """The record without its drift: a straight line, or what warms up where a straight one is not it."""
     clear = _clear(trace, line, touch)
     if clear.sum() < _LEAST_CLEAR:
         return trace, []
@@ -178,7 +220,8 @@ def _without_drift(trace: Trace, line: BrokenLine, touch: TouchDown) -> tuple[Tr
     slope, residual = _straight(time, force)
     scatter = scatter_of(*np.split(residual, np.flatnonzero(np.diff(np.flatnonzero(clear)) > 1) + 1))
     spread = float(np.sqrt(np.sum((time - time.mean()) ** 2)))
-    sd = scatter.sd_N * float(np.sqrt((1 + scatter.lag) / (1 - scatter.lag))) / spread
+    noise = scatter.sd_N * float(np.sqrt((1 + scatter.lag) / (1 - scatter.lag)))
+    sd = noise / spread
     peak = _rise(trace)
     total = slope * float(np.ptp(trace.time_s))
     if abs(slope) < _DRIFT_SD * sd or abs(total) < _DRIFT_SHARE * peak:
@@ -190,11 +233,49 @@ def _without_drift(trace: Trace, line: BrokenLine, touch: TouchDown) -> tuple[Tr
             place="force_N",
             remedy="let the sensor warm up, zero it, and record again",
         )
-    straight = replace(trace, force_N=trace.force_N - slope * (trace.time_s - trace.time_s[0]))
     numbers = {"drift_N_per_s": slope, "drift_sd_N_per_s": sd, "drift_N": total}
+    shapes, misfits = _drifts(time, force, trace.time_s)
+    excess = (misfits - misfits.min()) / noise**2
+    weights = np.exp(-0.5 * excess) / np.exp(-0.5 * excess).sum()
+    drift = shapes[0]
+    if excess[0] > _BENT:
+        drift = shapes[int(np.argmin(misfits))]
+        first, last = np.diff(drift)[[0, -1]] / np.diff(trace.time_s)[[0, -1]]
+        what += f", and not along a straight line ({first:+.2g} N/s at its start, {last:+.2g} at its end)"
+        numbers |= {"drift_start_N_per_s": float(first), "drift_end_N_per_s": float(last)}
+    numbers["adds_sd_mm"] = _drift_sd(trace, line, touch, shapes - drift, weights)
+    straight = replace(trace, force_N=trace.force_N - (drift - drift[0]))
     remedy = "let the sensor warm up before recording"
-    remark = Remark("drift", what + "; taken off", "a sensor that warms up", remedy, numbers)
-    return straight, [remark]
+    return straight, [Remark("drift", what + "; taken off", "a sensor that warms up", remedy, numbers)]
+
+
+def _drifts(time: Array, force: Array, at: Array) -> tuple[Array, Array]:
+    """A straight drift and those that fade with `_WARMING` of the record, at times (n,) s: forces (k, n) that
+    fit what is clear of the skin, and their squared misfits (k,)."""
+    shapes, misfits = [], []
+    whole = float(np.ptp(at))
+    for fading in (np.inf, *(share * whole for share in _WARMING)):
+
+        def shape(t: Array, fading: float = fading) -> Array:
+            return t - at[0] if np.isinf(fading) else -np.expm1(-(t - at[0]) / fading)
+
+        basis = np.stack([np.ones_like(time), shape(time)], axis=1)
+        (level, size), *_ = np.linalg.lstsq(basis, force, rcond=None)
+        shapes.append(level + size * shape(at))
+        misfits.append(float(np.sum((force - basis @ [level, size]) ** 2)))
+    return np.array(shapes), np.array(misfits)
+
+
+def _drift_sd(trace: Trace, line: BrokenLine, touch: TouchDown, others: Array, weights: Array) -> float:
+    """What drifts of other shapes (k, n), as likely as their weights (k,), make of the touch-down, mm.
+
+    By the force that they leave at the onset from its level before: where that is reached.
+    """
+    met = int(np.searchsorted(trace.time_s, touch.time_s))
+    deep = min(int(np.searchsorted(trace.time_s, touch.time_s + _ONSET_S)), len(trace.time_s) - 1)
+    change = others[:, deep] - others[:, : met + 1].mean(axis=1)
+    rms = float(np.sqrt(weights @ change**2))
+    return max(depth_at(trace, line, touch, rms) - touch.uncertainty_mm, 0.0)
 
 
 def _straight(time: Array, force: Array) -> tuple[float, Array]:
@@ -247,13 +328,20 @@ def _rises_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
     return slope - doubt > least
 
 
-def _start_remark(touch: TouchDown, stated_s: float | None) -> list[Remark]:
-    if not touch.in_contact_at_start or stated_s is not None:
-        return []
+def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown) -> list[Remark]:
+    """A record without an approach: the skin may have been met before it, and the sensor zeroed there."""
     what = (
         f"no approach is seen before the skin is met after {touch.displacement_mm:.2f} +- "
         f"{touch.uncertainty_mm:.2f} mm: the touch-down rests on a sensor that was zero at the start"
     )
     numbers = {"touch_down_mm": touch.displacement_mm, "touch_down_sd_mm": touch.uncertainty_mm}
+    _, force, count = bins(trace.time_s, trace.force_N, _BINS)
+    preload = touch.baseline_N - float(force.min())
+    pressed = preload > _BY_CHANCE * noise_level(trace.force_N) / float(np.sqrt(count.min()))
+    if pressed:
+        what += f"; it was not, as the force is {preload:.2g} N lower once the indenter is drawn back"
+        numbers["preload_N"] = preload
+    if pressed or line.values[-1] > line.values[0] - _CLEAR_MM:
+        numbers["adds_sd_mm"] = deviation_before(trace, line, touch)
     cause = "a record that starts on the skin"
     return [Remark("start", what, cause, "start some tenths of a millimetre clear of it", numbers)]

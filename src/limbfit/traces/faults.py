@@ -1,0 +1,235 @@
+"""What goes wrong in the instrument: times that are rounded, samples that are lost, a force that is frozen, at
+the end of its range, that jumps, or that comes in coarse steps.
+
+What is certain is mended (times); of the rest a remark says what, where and how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .displacement import BrokenLine
+from .numerics import Array, Bools, bins, noise_level, resolution, runs
+from .record import Remark, Trace
+
+_FEW_DOUBLED = 0.2  # of the samples: more of them share a time because times are rounded
+_ROUNDED = 0.75  # of the resolution that an even clock may be off the times that are stated
+_GAP_STEPS = 3.0  # times nearly all steps between samples
+_MOVED = 0.01  # of the travel: where the indenter moves less, nothing is missed
+_FROZEN_SAMPLES = 15
+_JUMP_NOISE = 6.0  # standard deviations
+_CONTACT = 0.05  # of the rise
+_COARSE_FORCE, _COARSE_TRAVEL = 0.01, 0.005  # of the rise, of the travel
+_DITHERED = 0.6  # of a step: where neighbours scatter by more, means of them know better than a step
+_BINS = 400
+_TOP_NOISE = 4.0  # standard deviations
+_FLAT = 4.0  # times the way that noise would keep a turning force near its top
+_FLAT_SHARE = 0.02  # of the travel
+_STEP_S = 0.08  # on either side of a step
+_STEP_SAMPLES = (6, 40)
+_STEP_SD, _STEP_SHARE = 8.0, 0.02  # standard deviations; of the rise
+_STEP_STEPS = 2.5  # times the resolution
+_PULLED = 0.1  # of the rise: what lets go of the skin may jump
+_SHARP = 0.25  # of a step that shorter windows may find more or less: a kink halves with them
+
+
+def mend_times(trace: Trace) -> tuple[Trace, list[Remark]]:
+    """Rows that are there twice are left out, samples that share a rounded time are spread evenly."""
+    time = trace.time_s
+    same = np.r_[False, np.diff(time) == 0.0]
+    count, n = int(same.sum()), len(time)
+    if not count:
+        return trace, []
+    twice = same & np.r_[False, (np.diff(trace.displacement_mm) == 0.0) & (np.diff(trace.force_N) == 0.0)]
+    if np.array_equal(twice, same) and count < _FEW_DOUBLED * n:
+        kept = Trace(time[~same], trace.displacement_mm[~same], trace.force_N[~same])
+        what = f"{count} of {n} rows are there twice and were left out once"
+        cause = "an export that repeats rows"
+        return kept, [Remark("rows", what, cause, "check the export", {"doubled_rows": float(count)})]
+    size = float(np.median(np.diff(time[~same])))
+    spread = replace(trace, time_s=_spread(time, same, size))
+    what = (
+        f"{count} of {n} samples have the time of the sample before; they were spread over {size:.3g} s each"
+    )
+    numbers = {"doubled_times": float(count), "time_step_s": size}
+    return spread, [
+        Remark("times", what, "times that are rounded in the export", "export more digits", numbers)
+    ]
+
+
+def _spread(time: Array, same: Bools, size: float) -> Array:
+    """Even times (n,) where an even clock fits the stated ones; else those of each time over its step."""
+    index = np.arange(len(time), dtype=float)
+    start, step = np.polynomial.polynomial.polyfit(index, time, 1)
+    even = start + step * index
+    if np.abs(even - time).max() <= _ROUNDED * size:
+        return np.asarray(even)
+    first = np.flatnonzero(~same)
+    count = np.diff(np.r_[first, len(time)])
+    within = (index - np.repeat(first, count) + 0.5) / np.repeat(count, count) - 0.5
+    return np.asarray(time + size * within)
+
+
+def find_gaps(trace: Trace, line: BrokenLine) -> list[tuple[float, float]]:
+    """From when to when (s) samples are lost while the indenter moves."""
+    steps = np.diff(trace.time_s)
+    long = np.flatnonzero(steps > _GAP_STEPS * np.percentile(steps, 99))
+    travel = float(np.ptp(line.values))
+    spans = [(float(trace.time_s[i]), float(trace.time_s[i + 1])) for i in long]
+    return [(a, b) for a, b in spans if np.ptp(line.path(np.array([a, b]))) > _MOVED * travel]
+
+
+def gap_remarks(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> list[Remark]:
+    """One remark for each gap; where the skin is met in one, anywhere in it."""
+    remarks = []
+    for start, end in gaps:
+        moved = float(np.ptp(line.path(np.array([start, end]))))
+        what = f"no samples from {start:.2f} s to {end:.2f} s, while the indenter moves by {moved:.2g} mm"
+        numbers = {"start_s": start, "end_s": end, "moved_mm": moved} | _within(start, end, line, met_s)
+        cause = "samples that the logger lost"
+        remarks.append(Remark("gap", what, cause, "record again: the force there is a guess", numbers))
+    return remarks
+
+
+def _within(start: float, end: float, line: BrokenLine, met_s: float) -> dict[str, float]:
+    """What a span without a force adds to the deviation of a touch-down in it or next to it."""
+    if not start - (end - start) <= met_s <= end + (end - start):
+        return {}
+    return {"adds_sd_mm": float(np.ptp(line(np.array([start, end])))) / float(np.sqrt(12.0))}
+
+
+def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
+    """Runs of samples of one and the same force, while the indenter moves.
+
+    The force jumps at their end, or is at no level at which a force that scatters could stay.
+    """
+    force, path = trace.force_N, line.path(trace.time_s)
+    noise, size = noise_level(force), resolution(force)
+    jump = max(2.5 * size, _JUMP_NOISE * noise, _MOVED * rise_N)
+    in_contact = force > np.percentile(force, 2) + _CONTACT * rise_N
+    found = []
+    for start, end in runs(np.diff(force) == 0.0):
+        last = end  # of the equal samples start..end
+        if last - start + 1 < _FROZEN_SAMPLES or path[last] - path[start] < _MOVED * float(
+            np.ptp(line.values)
+        ):
+            continue
+        away = last + 1 < len(force) and abs(force[last + 1] - force[last]) > jump
+        odd = size < noise and in_contact[start] and force[start] < force.max()
+        if away or odd:
+            found.append(slice(start, last + 1))
+    return found
+
+
+def frozen_remarks(trace: Trace, frozen: list[slice], line: BrokenLine, met_s: float) -> list[Remark]:
+    remarks = []
+    for run in frozen:
+        start, end = float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])
+        moved, force = float(np.ptp(line.path(np.array([start, end])))), float(trace.force_N[run.start])
+        what = (
+            f"the force stays at exactly {force:.3g} N from {start:.2f} s to {end:.2f} s, while the indenter "
+            f"moves by {moved:.2g} mm"
+        )
+        numbers = {"start_s": start, "end_s": end, "force_N": force, "moved_mm": moved}
+        numbers |= _within(start, end, line, met_s)
+        remarks.append(Remark("frozen", what, "a sensor that froze", "check it, and record again", numbers))
+    return remarks
+
+
+def saturation(trace: Trace, line: BrokenLine, rise_N: float) -> list[Remark]:
+    """A force that stays at its top, while the indenter moves, for longer than noise at a turn explains."""
+    near = trace.time_s < 2 * line.peak_s - line.start_s  # a slow way out would have few bins for the turn
+    time, force, _ = bins(trace.time_s[near], trace.force_N[near], _BINS)
+    noise = max(noise_level(force), 1e-3 * rise_N)
+    top = float(np.median(force[force > force.max() - _TOP_NOISE * noise]))
+    low = np.flatnonzero(force < top - _TOP_NOISE * noise)
+    peak = int(np.argmax(force))
+    before, after = low[low < peak], low[low > peak]
+    if not before.size:
+        return []
+    a, b = int(before[-1]), int(after[0]) if after.size else len(force) - 1
+    path = line.path(time)
+    flat, by_noise, wide = float(path[b] - path[a]), 0.0, max((b - a) // 4, 2)
+    for edge, beyond in (
+        (a, max(a - wide, 0)),
+        *([(b, min(b + wide, len(force) - 1))] if after.size else []),
+    ):
+        steep = (force[edge] - force[beyond]) / max(abs(path[edge] - path[beyond]), 1e-12)
+        by_noise += _TOP_NOISE * noise / steep if steep > 0.0 else np.inf
+    if flat < max(_FLAT * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
+        return []
+    what = f"the force stays at {top:.3g} N while the indenter moves by {flat:.2g} mm"
+    numbers = {"limit_N": top, "start_s": float(time[a]), "end_s": float(time[b]), "moved_mm": flat}
+    cause = "a sensor or an amplifier at the end of its range"
+    return [Remark("saturation", what, cause, "choose a larger range and record again", numbers)]
+
+
+def find_steps(
+    trace: Trace, line: BrokenLine, rise_N: float, spans: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """When (s) the force jumps from one sample to the next and stays there, and by how much (N).
+
+    Not looked at: corners of the displacement, ``spans`` of time, and what lets go of the skin.
+    """
+    time, force = trace.time_s, trace.force_N
+    rate = 1.0 / float(np.median(np.diff(time)))
+    m = int(np.clip(round(_STEP_S * rate), *_STEP_SAMPLES))
+    if len(force) < 4 * m:
+        return []
+    whole, half = _jumps(force, m), _jumps(force, m // 2)
+    sd = 1.4826 * float(np.median(np.abs(whole)))
+    least = max(_STEP_SD * sd, _STEP_SHARE * rise_N, _STEP_STEPS * resolution(force))
+    sharp = np.abs(half - whole) < _SHARP * np.abs(whole) + sd
+    steps = (np.abs(whole) > least) & sharp
+    near = (m + 1) / rate
+    for start, end in [(t, t) for t in line.times] + spans:
+        steps[(time > start - near) & (time < end + near)] = False
+    base = float(np.percentile(force, 2))
+    steps[(time > line.peak_s) & (force < base + _PULLED * rise_N)] = False
+    found = []
+    while steps.any():
+        k = int(np.argmax(np.where(steps, np.abs(whole), 0.0)))
+        found.append((float(time[k]), float(whole[k])))
+        steps[max(k - 2 * m, 0) : k + 2 * m] = False
+    return sorted(found)
+
+
+def _jumps(force: Array, m: int) -> Array:
+    """How far the straight line through the ``m`` samples from each on starts above the end of that through
+    the ``m`` before it, (n,) N; none at the ends."""
+    x = np.arange(m) + 0.5
+    weights = np.linalg.pinv(np.stack([np.ones(m), x], axis=1))[0]  # of the line's value at 0
+    inside = np.convolve(force, np.r_[weights[::-1], -weights], mode="valid")
+    jumps = np.zeros(len(force))
+    jumps[m : m + len(inside)] = inside
+    return jumps
+
+
+def step_remarks(steps: list[tuple[float, float]]) -> list[Remark]:
+    remarks = []
+    for at, size in steps:
+        what = f"the force jumps by {size:+.2g} N from one sample to the next, at {at:.2f} s"
+        cause = "a slip of the limb, a knock at the sensor or its amplifier's range"
+        numbers = {"time_s": at, "step_N": size}
+        remarks.append(Remark("step", what, cause, "record again: nobody knows which part is right", numbers))
+    return remarks
+
+
+def coarse_steps(trace: Trace, line: BrokenLine, rise_N: float) -> list[Remark]:
+    """Remarks on a force or a displacement whose steps are larger than what its neighbours scatter by."""
+    remarks = []
+    for kind, values, unit, least in (
+        ("force", trace.force_N, "N", _COARSE_FORCE * rise_N),
+        ("displacement", trace.displacement_mm, "mm", _COARSE_TRAVEL * float(np.ptp(line.values))),
+    ):
+        size = resolution(values)
+        scatter = float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
+        if size < least or scatter > _DITHERED * size:
+            continue
+        what = f"the {kind} comes in steps of {size:.3g} {unit}"
+        cause = f"a sensor or an export that rounds the {kind}"
+        numbers = {f"step_{unit}": size}
+        remarks.append(Remark("resolution", what, cause, "record with a finer range or more digits", numbers))
+    return remarks
