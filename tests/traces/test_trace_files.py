@@ -77,7 +77,7 @@ def replace(line, text):
         (replace(7, "0.1"), "line 7, column displacement_mm: the row is too short"),
         (replace(7, "0.1,0.1,nan"), "force_N: nan in sample 6"),
         (replace(7, "0.1,0.1,inf"), "force_N: inf in sample 6"),
-        (replace(7, "9.1,0.1,0.1"), "time_s: time does not increase at sample 7; remove"),
+        (replace(7, "9.1,0.1,0.1"), "time_s: time goes back at sample 7; remove or sort"),
         (lambda lines: lines.__delitem__(slice(12, None)), "only 11 samples; a record needs at least 20"),
         (lambda lines: lines.clear(), "the file is empty"),
     ],

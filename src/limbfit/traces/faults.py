@@ -1,5 +1,6 @@
-"""What goes wrong in the instrument: times that are rounded, samples that are lost, a force that is frozen, at
-the end of its range, that jumps, or that comes in coarse steps.
+"""What goes wrong in the instrument.
+
+Times are rounded, samples lost; a force is frozen, at the end of its range, jumps, or comes in coarse steps.
 
 What is certain is mended (times); of the rest a remark says what, where and how much.
 """
@@ -13,6 +14,7 @@ import numpy as np
 from .displacement import BrokenLine
 from .numerics import Array, Bools, bins, noise_level, resolution, runs
 from .record import Remark, Trace
+from .touchdown import TouchDown, depth_at
 
 _FEW_DOUBLED = 0.2  # of the samples: more of them share a time because times are rounded
 _ROUNDED = 0.75  # of the resolution that an even clock may be off the times that are stated
@@ -138,20 +140,25 @@ def frozen_remarks(trace: Trace, frozen: list[slice], line: BrokenLine, met_s: f
     return remarks
 
 
-def saturation(trace: Trace, line: BrokenLine, rise_N: float) -> list[Remark]:
-    """A force that stays at its top, while the indenter moves, for longer than noise at a turn explains."""
+def saturation_remarks(
+    trace: Trace, line: BrokenLine, rise_N: float, spans: list[tuple[float, float]]
+) -> list[Remark]:
+    """A force that stays at its top, while the indenter moves, for longer than noise at a turn explains; not
+    where ``spans`` of time lack a force."""
     near = trace.time_s < 2 * line.peak_s - line.start_s  # a slow way out would have few bins for the turn
     time, force, _ = bins(trace.time_s[near], trace.force_N[near], _BINS)
-    noise = max(noise_level(force), 1e-3 * rise_N)
+    noise = max(noise_level(force), 1e-3 * rise_N, resolution(trace.force_N) / 4)
     top = float(np.median(force[force > force.max() - _TOP_NOISE * noise]))
     low = np.flatnonzero(force < top - _TOP_NOISE * noise)
     peak = int(np.argmax(force))
     before, after = low[low < peak], low[low > peak]
     if not before.size:
         return []
-    a, b = int(before[-1]), int(after[0]) if after.size else len(force) - 1
+    a, b = int(before[-1]), int(after[0]) if after.size else len(force)
     path = line.path(time)
-    flat, by_noise, wide = float(path[b] - path[a]), 0.0, max((b - a) // 4, 2)
+    if any(start < time[b - 1] and end > time[a] for start, end in spans):
+        return []
+    flat, by_noise, wide = float(path[b - 1] - path[a + 1]), 0.0, max((b - a) // 4, 2)
     for edge, beyond in (
         (a, max(a - wide, 0)),
         *([(b, min(b + wide, len(force) - 1))] if after.size else []),
@@ -161,7 +168,7 @@ def saturation(trace: Trace, line: BrokenLine, rise_N: float) -> list[Remark]:
     if flat < max(_FLAT * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
         return []
     what = f"the force stays at {top:.3g} N while the indenter moves by {flat:.2g} mm"
-    numbers = {"limit_N": top, "start_s": float(time[a]), "end_s": float(time[b]), "moved_mm": flat}
+    numbers = {"limit_N": top, "start_s": float(time[a + 1]), "end_s": float(time[b - 1]), "moved_mm": flat}
     cause = "a sensor or an amplifier at the end of its range"
     return [Remark("saturation", what, cause, "choose a larger range and record again", numbers)]
 
@@ -217,8 +224,11 @@ def step_remarks(steps: list[tuple[float, float]]) -> list[Remark]:
     return remarks
 
 
-def coarse_steps(trace: Trace, line: BrokenLine, rise_N: float) -> list[Remark]:
-    """Remarks on a force or a displacement whose steps are larger than what its neighbours scatter by."""
+def resolution_remarks(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float) -> list[Remark]:
+    """Remarks on a force or a displacement whose steps are larger than what its neighbours scatter by.
+
+    A touch-down is then known to where the force reaches the standard deviation of what is rounded.
+    """
     remarks = []
     for kind, values, unit, least in (
         ("force", trace.force_N, "N", _COARSE_FORCE * rise_N),
@@ -231,5 +241,7 @@ def coarse_steps(trace: Trace, line: BrokenLine, rise_N: float) -> list[Remark]:
         what = f"the {kind} comes in steps of {size:.3g} {unit}"
         cause = f"a sensor or an export that rounds the {kind}"
         numbers = {f"step_{unit}": size}
+        if unit == "N":
+            numbers["adds_sd_mm"] = depth_at(trace, line, touch, size / float(np.sqrt(12.0)))
         remarks.append(Remark("resolution", what, cause, "record with a finer range or more digits", numbers))
     return remarks

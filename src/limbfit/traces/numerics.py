@@ -9,6 +9,7 @@ from scipy.interpolate import make_interp_spline
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_GAP = 10.0  # usual steps in time
 _COARSE = 0.75  # of the samples: so many have a value that another one has too
 
 
@@ -24,6 +25,12 @@ def resolution(values: Array) -> float:
     if len(levels) < 2 or counts[counts > 1].sum() < _COARSE * len(values):
         return 0.0
     return float(np.median(np.diff(levels)))
+
+
+def split_at_gaps(time: Array, values: Array) -> list[Array]:
+    """Values (n,) at times (n,) in parts without gaps of more than ten usual steps between them."""
+    steps = np.diff(time)
+    return np.split(values, np.flatnonzero(steps > _GAP * np.median(steps)) + 1) if len(steps) else [values]
 
 
 def runs(true: Bools) -> NDArray[np.int64]:

@@ -31,7 +31,7 @@ _DELAYS = 41
 _BINS = 200
 _LAG_SD = 5.0  # standard deviations
 _LAG_STEPS = 1.5  # times the time between samples: nobody synchronises better
-_LAG_HARM = 0.5  # standard deviations of touch-down
+_LAG_HARM = 0.3  # standard deviations of touch-down
 _IN_CONTACT = 0.03  # of the rise
 _CYCLES = np.geomspace(0.15, 0.6, 21)  # per second: how people breathe, at rest and not
 _POWERS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
@@ -42,7 +42,7 @@ _SWING_BINS = 400
 _SWING_F = 25.0  # squared misfit that a swing explains, in what is left
 _SWING_SHARE = 0.6  # of what noise does not explain
 _SWING_FREE = 0.1  # of a swing that passive forces must leave
-_SWING_RISE = 0.006  # of the rise: less does no harm
+_SWING_RISE = 0.015  # of the rise: less does no harm
 
 
 def lag_remarks(

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import TraceError
 from .displacement import BrokenLine, broken_line
-from .numerics import Array, bins
+from .numerics import Array, bins, split_at_gaps
 from .onset import OnsetPart, find_onset
 from .record import MIN_SAMPLES, Trace
 from .scatter import Scatter, scatter_of
@@ -38,6 +38,7 @@ _LEAST_TRAVEL = 0.03  # of the way in: a force that jumps before the indenter mo
 _MEANS = 120  # that part as so many means
 _BEFORE_SHARE, _BEFORE_MM = 0.2, 1.0  # of the way in; how far before the record the skin may have been met
 _BINS = 200
+_APPROACH_MM = 0.1  # less of it before the skin is none
 _APPROACH = 3.0  # times the onset: more of what came before it says nothing more about it
 
 
@@ -60,7 +61,7 @@ def find_touch_down(trace: Trace) -> TouchDown:
 def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
     time, travel, force = _way_in(trace, line)
     moving = int(np.searchsorted(time, line.start_s))
-    scatter = scatter_of(force)
+    scatter = scatter_of(*split_at_gaps(time, force))
     part = _part(time, travel, force, moving, scatter)
     rough = find_onset(part, scatter)
     scatter, part = _near(rough.place_mm, time, travel, force, moving)
@@ -71,7 +72,9 @@ def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
         uncertainty_mm=onset.sd,
         exponent=onset.exponent,
         baseline_N=onset.baseline_N,
-        in_contact_at_start=bool(onset.place_mm - travel[0] < 2 * onset.sd and moving < MIN_SAMPLES),
+        in_contact_at_start=bool(
+            onset.place_mm - travel[0] < max(2 * onset.sd, _APPROACH_MM) and moving < MIN_SAMPLES
+        ),
     )
 
 
@@ -91,7 +94,8 @@ def _near(
 ) -> tuple[Scatter, OnsetPart]:
     """The noise on either side of a touch-down, as the kink in between is none, and the part to look at."""
     met = int(np.searchsorted(travel, place_mm))
-    scatter = scatter_of(force[:met], force[met:])
+    parts = (split_at_gaps(time[side], force[side]) for side in (slice(met), slice(met, None)))
+    scatter = scatter_of(*(part for side in parts for part in side))
     return scatter, _part(time, travel, force, moving, scatter)
 
 

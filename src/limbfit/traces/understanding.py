@@ -16,14 +16,14 @@ from scipy.ndimage import median_filter
 from ..errors import TraceError
 from .displacement import BrokenLine, broken_line
 from .faults import (
-    coarse_steps,
     find_frozen,
     find_gaps,
     find_steps,
     frozen_remarks,
     gap_remarks,
     mend_times,
-    saturation,
+    resolution_remarks,
+    saturation_remarks,
     step_remarks,
 )
 from .numerics import Array, Bools, bins, noise_level, resolution, runs
@@ -88,17 +88,17 @@ def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool 
     frozen = [] if forced else find_frozen(trace, line, rise)
     lost = gaps + [(float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])) for run in frozen]
     steps = [] if forced else find_steps(trace, line, rise, lost)
-    straight = trace if steps else _level_ends(trace, line)
-    touch = _touch_down(straight, touch_down_s, forced)
+    level = straight = trace if steps else _level_ends(trace, line)
+    touch = _touch_down(level, touch_down_s, forced)
     drift: list[Remark] = []
     if not steps:
-        level, (straight, drift) = straight, _without_drift(trace, line, touch)
-        if straight is not level:
-            touch = _touch_down(straight, touch_down_s, forced)
+        straight, drift = _without_drift(trace, level, line, touch)
+    if straight is not level:
+        touch = _touch_down(straight, touch_down_s, forced)
     remarks = [
         *doubled,
         *spikes,
-        *coarse_steps(trace, line, rise),
+        *resolution_remarks(trace, line, touch, rise),
         *gap_remarks(gaps, line, touch.time_s),
         *frozen_remarks(trace, frozen, line, touch.time_s),
         *step_remarks(steps),
@@ -120,7 +120,7 @@ def _against_passive(
     steps: list[tuple[float, float]],
 ) -> list[Remark]:
     """Remarks on a force that no passive tissue gives, each looked for where no other explains it."""
-    at_top = saturation(trace, line, rise_N)
+    at_top = saturation_remarks(trace, line, rise_N, lost)
     if at_top:
         return at_top
     way_in = (trace.time_s <= line.peak_s) & (trace.time_s >= touch.time_s)
@@ -184,13 +184,18 @@ def _spikes(values: Array) -> Bools:
     return np.asarray(out, dtype=bool)
 
 
+def _ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
+    """Samples (n,) before the way in and after the last way out, with the indenter where it began."""
+    back = line(trace.time_s) < line.values[0] + _CLEAR_MM
+    return back & (trace.time_s < line.peak_s), back & (trace.time_s > _release_s(line))
+
+
 def _level_ends(trace: Trace, line: BrokenLine) -> Trace:
     """The record without the line from its start to its end, where the indenter is back where it began.
 
     Only there a drift shows before the touch-down is known: near the skin it looks like an onset.
     """
-    back = line(trace.time_s) < line.values[0] + _CLEAR_MM
-    before, after = back & (trace.time_s < line.peak_s), back & (trace.time_s > _release_s(line))
+    before, after = _ends(trace, line)
     if min(before.sum(), after.sum()) < _LEAST_CLEAR:
         return trace
     change = float(np.median(trace.force_N[after]) - np.median(trace.force_N[before]))
@@ -211,9 +216,16 @@ def _clear(trace: Trace, line: BrokenLine, touch: TouchDown) -> Bools:
     return np.asarray(line(trace.time_s) < touch.displacement_mm - margin)
 
 
-def _without_drift(trace: Trace, line: BrokenLine, touch: TouchDown) -> tuple[Trace, list[Remark]]:
+def _without_drift(
+    trace: Trace, level: Trace, line: BrokenLine, touch: TouchDown
+) -> tuple[Trace, list[Remark]]:
     """The record without its drift: a straight line, or what warms up where a straight one is not it."""
     clear = _clear(trace, line, touch)
+    fallen = level.force_N[-1] > trace.force_N[-1]
+    if level is not trace and not (
+        touch.in_contact_at_start and fallen
+    ):  # that shows what it was zeroed under
+        clear |= np.logical_or(*_ends(trace, line))
     if clear.sum() < _LEAST_CLEAR:
         return trace, []
     time, force = trace.time_s[clear], trace.force_N[clear]
