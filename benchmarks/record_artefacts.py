@@ -7,8 +7,8 @@ Records with a known touch-down are drawn from (seed, kind, number): a power-law
 relaxation is pushed in, held or not, and drawn back, and noise is added.  Then something goes wrong with
 them, by a random amount (``ARTEFACTS``), or nothing does (``CLEAN``).  Each is read as limbfit reads it.  An
 artefact is covered where the true touch-down lies within 1.96 stated standard deviations or where the record
-is refused or carries a remark on that artefact.  The exit code is 0 when 95 % of the artefacts are covered, and at most
-2 % of the clean records carry a remark.
+is refused or carries a remark on that artefact.  The exit code is 0 when 95 % of the artefacts are covered,
+and at most 2 % of the clean records carry a remark.
 """
 
 from __future__ import annotations
@@ -189,7 +189,9 @@ def late(random: Random, press: Press) -> Case:
 def breathing_force(random: Random, press: Press) -> Case:
     force = press.force(press.time_s)
     size = random.uniform(0.03, 0.1) * press.peak_N
-    return _case(press, random, force + size * _breath(random)(press.time_s) * (force > 0.0))
+    return _case(
+        press, random, force + size * _breath(random)(press.time_s) * np.clip(force / size, 0.0, 1.0)
+    )
 
 
 def breathing_motion(random: Random, press: Press) -> Case:

@@ -29,6 +29,7 @@ _BINS = 400
 _TOP_NOISE = 4.0  # standard deviations
 _FLAT = 4.0  # times the way that noise would keep a turning force near its top
 _FLAT_SHARE = 0.02  # of the travel
+_FLAT_BINS = 4
 _STEP_S = 0.08  # on either side of a step
 _STEP_SAMPLES = (6, 40)
 _STEP_SD, _STEP_SHARE = 8.0, 0.02  # standard deviations; of the rise
@@ -165,7 +166,7 @@ def saturation_remarks(
     ):
         steep = (force[edge] - force[beyond]) / max(abs(path[edge] - path[beyond]), 1e-12)
         by_noise += _TOP_NOISE * noise / steep if steep > 0.0 else np.inf
-    if flat < max(_FLAT * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
+    if b - a <= _FLAT_BINS or flat < max(_FLAT * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
         return []
     what = f"the force stays at {top:.3g} N while the indenter moves by {flat:.2g} mm"
     numbers = {"limit_N": top, "start_s": float(time[a + 1]), "end_s": float(time[b - 1]), "moved_mm": flat}

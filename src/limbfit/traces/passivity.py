@@ -27,7 +27,7 @@ _SHARPLY = 0.5  # of the largest speed: a corner at which the speed changes by m
 _WINDOW_S = 1.0  # on either side of a corner
 _LEAST_SAMPLES = 8  # on either side
 _LATEST = 0.4  # of the window
-_DELAYS = 41
+_DELAYS = 25
 _BINS = 200
 _LAG_SD = 5.0  # standard deviations
 _LAG_STEPS = 1.5  # times the time between samples: nobody synchronises better
@@ -68,9 +68,8 @@ def lag_remarks(
         found.append(_delay(time, force, scatter))
     if not found:
         return []
-    delays, sds = np.array(found).T
-    weights = 1.0 / sds**2
-    delay, sd = float(weights @ delays / weights.sum()), float(1.0 / np.sqrt(weights.sum()))
+    # At none of them may it be late, and at some memory hides a delay.
+    delay, sd = max(found, key=lambda one: one[0] / one[1])
     met = float(np.interp(touch.time_s, (line.times[1:] + line.times[:-1]) / 2, speed))
     late_mm = delay * abs(met)
     step = float(np.median(np.diff(trace.time_s)))
@@ -90,19 +89,26 @@ def lag_remarks(
 def _delay(time: Array, force: Array, scatter: Scatter) -> tuple[float, float]:
     """By how much the kink of a force is late, s, and its standard deviation: parabolas that meet there."""
     x, y, n = bins(time, force, _BINS)
+    alike = (1.0 + scatter.lag) / (1.0 - scatter.lag)
+    noise = scatter.sd_N**2 * min(alike, float(n.mean())) + 1e-18
     widest = _LATEST * min(-time[0], time[-1])
     delays = np.linspace(-widest, widest, _DELAYS)
-    left = np.empty(_DELAYS)
-    for k, delay in enumerate(delays):
-        beyond = np.maximum(x - delay, 0.0)
-        basis = np.stack([np.ones_like(x), x, x**2, beyond, beyond**2], axis=1) * np.sqrt(n)[:, None]
-        left[k] = _misfit(basis, np.sqrt(n) * y)
-    alike = (1.0 + scatter.lag) / (1.0 - scatter.lag)
-    variance = max(left.min() / max(len(x) - 6, 1), scatter.sd_N**2 * min(alike, float(n.mean())) + 1e-18)
-    weights = np.exp(-0.5 * (left - left.min()) / variance)
-    weights /= weights.sum()
-    mean = float(weights @ delays)
-    return mean, float(np.sqrt(weights @ (delays - mean) ** 2 + (delays[1] - delays[0]) ** 2 / 12))
+    for _ in range(2):
+        left = np.array([_kinked(x, y, n, delay) for delay in delays])
+        variance = max(left.min() / max(len(x) - 6, 1), noise)
+        weights = np.exp(-0.5 * (left - left.min()) / variance)
+        weights /= weights.sum()
+        mean, step = float(weights @ delays), delays[1] - delays[0]
+        sd = float(np.sqrt(weights @ (delays - mean) ** 2 + step**2 / 12))
+        delays = np.linspace(mean - 5 * sd, mean + 5 * sd, _DELAYS)
+    return mean, sd
+
+
+def _kinked(x: Array, y: Array, n: Array, delay: float) -> float:
+    """What two parabolas that meet at ``delay`` leave of means ``y`` (k,) of ``n`` samples each."""
+    beyond = np.maximum(x - delay, 0.0)
+    basis = np.stack([np.ones_like(x), x, x**2, beyond, beyond**2], axis=1)
+    return _misfit(basis * np.sqrt(n)[:, None], np.sqrt(n) * y)
 
 
 def _misfit(basis: Array, y: Array) -> float:

@@ -349,9 +349,10 @@ def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown) -> list[Rema
     numbers = {"touch_down_mm": touch.displacement_mm, "touch_down_sd_mm": touch.uncertainty_mm}
     _, force, count = bins(trace.time_s, trace.force_N, _BINS)
     preload = touch.baseline_N - float(force.min())
-    pressed = preload > _BY_CHANCE * noise_level(trace.force_N) / float(np.sqrt(count.min()))
+    by_chance = _BY_CHANCE * noise_level(trace.force_N) / float(np.sqrt(count.min()))
+    pressed = preload > max(by_chance, _DRIFT_SHARE * _rise(trace))
     if pressed:
-        what += f"; it was not, as the force is {preload:.2g} N lower once the indenter is drawn back"
+        what += f"; drawn back it shows {preload:.2g} N less, as if it had been zeroed in contact"
         numbers["preload_N"] = preload
     if pressed or line.values[-1] > line.values[0] - _CLEAR_MM:
         numbers["adds_sd_mm"] = deviation_before(trace, line, touch)
