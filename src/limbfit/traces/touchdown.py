@@ -42,20 +42,20 @@ _APPROACH_MM = 0.1  # less of it before the skin is none
 _APPROACH = 3.0  # times the onset: more of what came before it says nothing more about it
 
 
-def find_touch_down(trace: Trace) -> TouchDown:
+def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
     """Where the skin is met, from the shape of the onset of force.
 
     A flat punch meets a curved limb at a corner first, so the force starts like a power of the depth and any
     threshold is late. Every onset of a power law with memory is compared with the low-force part of loading,
     under noise as correlated as the record shows it to be, and the touch-down is the mean over their
-    likelihood (see `onset`).
+    likelihood (see `onset`).  ``line`` is the displacement's broken line, where it is known already.
 
     Raises
     ------
     TraceError
         Where the force does not rise on the way in.
     """
-    return _from_onset(trace, broken_line(trace.time_s, trace.displacement_mm))
+    return _from_onset(trace, line or broken_line(trace.time_s, trace.displacement_mm))
 
 
 def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:

@@ -88,13 +88,11 @@ def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool 
     frozen = [] if forced else find_frozen(trace, line, rise)
     lost = gaps + [(float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])) for run in frozen]
     steps = [] if forced else find_steps(trace, line, rise, lost)
-    level = straight = trace if steps else _level_ends(trace, line)
-    touch = _touch_down(level, touch_down_s, forced)
-    drift: list[Remark] = []
-    if not steps:
-        straight, drift = _without_drift(trace, level, line, touch)
-    if straight is not level:
-        touch = _touch_down(straight, touch_down_s, forced)
+    level = _without_steps(trace, steps) if steps else _level_ends(trace, line)
+    touch = _touch_down(level, line, touch_down_s, forced)
+    straight, drift = (trace, []) if steps else _without_drift(trace, level, line, touch)
+    if straight is not level and not steps:
+        touch = _touch_down(straight, line, touch_down_s, forced)
     remarks = [
         *doubled,
         *spikes,
@@ -130,12 +128,12 @@ def _against_passive(
     return [*swing, *lag_remarks(trace, line, touch, scatter, odd)]
 
 
-def _touch_down(trace: Trace, stated_s: float | None, forced: bool) -> TouchDown:
+def _touch_down(trace: Trace, line: BrokenLine, stated_s: float | None, forced: bool) -> TouchDown:
     """Under a stated force from its rise alone: it turns where the skin is met, and creeps far beyond."""
     if stated_s is not None:
         return touch_down_at(trace, stated_s)
     if not forced:
-        return find_touch_down(trace)
+        return find_touch_down(trace, line)
     most = int(np.argmax(trace.force_N >= _RISE_SHARE * trace.force_N.max()))
     return find_touch_down(Trace(trace.time_s[:most], trace.displacement_mm[:most], trace.force_N[:most]))
 
@@ -182,6 +180,12 @@ def _spikes(values: Array) -> Bools:
         if end - start > _SPIKE_WIDTH:
             out[start:end] = False
     return np.asarray(out, dtype=bool)
+
+
+def _without_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
+    """The record without the jumps of its force: the onset is seen in it, whichever side of one is right."""
+    jumped = sum(size * (trace.time_s >= at) for at, size in steps)
+    return replace(trace, force_N=trace.force_N - jumped)
 
 
 def _ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
