@@ -11,6 +11,7 @@ Bools = NDArray[np.bool_]
 
 _GAP = 10.0  # usual steps in time
 _COARSE = 0.75  # of the samples: so many have a value that another one has too
+_RESTED = 0.2  # of the changes: so many come after two samples alike
 
 
 def noise_level(values: Array) -> float:
@@ -19,12 +20,15 @@ def noise_level(values: Array) -> float:
 
 
 def resolution(values: Array) -> float:
-    """The step in which values (n,) come; zero where hardly any of them is there twice."""
+    """The step in which values (n,) come; zero where hardly any of them is there twice, or where they change
+    from one to the next without a rest, as even samples of a ramp that is gone in and out."""
     levels, counts = np.unique(values, return_counts=True)
-    levels = levels[counts > 1]
-    if len(levels) < 2 or counts[counts > 1].sum() < _COARSE * len(values):
+    repeated = counts > 1
+    changes = np.diff(values) != 0.0
+    rested = np.count_nonzero(changes[1:] & ~changes[:-1])
+    if repeated.sum() < 2 or counts[repeated].sum() < _COARSE * len(values):
         return 0.0
-    return float(np.median(np.diff(levels)))
+    return float(np.median(np.diff(levels[repeated]))) if rested > _RESTED * changes.sum() else 0.0
 
 
 def split_at_gaps(time: Array, values: Array) -> list[Array]:

@@ -1,8 +1,9 @@
 """What a record is before it is regularised: mended where that is safe, refused where it cannot be used.
 
-Single samples that stick out are replaced by their neighbours' line, a force that drifts is set straight by
-what the sensor says clear of the skin, and a record that begins in contact is refused: where its skin was met
-nobody knows.  What was done, and what someone should know, stands in ``remarks``.
+Rows that are there twice are left out, rounded times are spread, single samples that stick out are replaced
+by their neighbours' line, a force that drifts is set straight by what the sensor says clear of the skin, and
+a record that begins in contact is refused: where its skin was met nobody knows.  What was done, and what
+someone should know (`faults`, `passivity`), stands in ``remarks``; the touch-down's deviation counts it.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool 
         *step_remarks(steps),
         *drift,
         *([] if forced else _against_passive(straight, line, touch, rise, lost, steps)),
-        *(_start_remark(straight, line, touch) if touch.in_contact_at_start and touch_down_s is None else ()),
+        *([] if touch_down_s is not None else _start_remark(straight, line, touch, forced)),
     ]
     added = [remark.evidence.get("adds_sd_mm", 0.0) for remark in remarks]
     wide = float(np.linalg.norm([touch.uncertainty_mm, *added]))
@@ -344,8 +345,10 @@ def _rises_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
     return slope - doubt > least
 
 
-def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown) -> list[Remark]:
+def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown, forced: bool) -> list[Remark]:
     """A record without an approach: the skin may have been met before it, and the sensor zeroed there."""
+    if not touch.in_contact_at_start:
+        return []
     what = (
         f"no approach is seen before the skin is met after {touch.displacement_mm:.2f} +- "
         f"{touch.uncertainty_mm:.2f} mm: the touch-down rests on a sensor that was zero at the start"
@@ -358,7 +361,7 @@ def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown) -> list[Rema
     if pressed:
         what += f"; drawn back it shows {preload:.2g} N less, as if it had been zeroed in contact"
         numbers["preload_N"] = preload
-    if pressed or line.values[-1] > line.values[0] - _CLEAR_MM:
+    if not forced and (pressed or line.values[-1] > line.values[0] - _CLEAR_MM):
         numbers["adds_sd_mm"] = deviation_before(trace, line, touch)
     cause = "a record that starts on the skin"
     return [Remark("start", what, cause, "start some tenths of a millimetre clear of it", numbers)]
