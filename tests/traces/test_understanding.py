@@ -201,6 +201,20 @@ def test_check_tells_what_was_mended(study):
     json.dumps(found)
 
 
+def test_check_tells_what_is_wrong_and_not_mended(study):
+    def spoil(table):
+        table[:, 2] = np.minimum(table[:, 2], 0.7 * table[:, 2].max())
+        return table[(table[:, 0] < 2.0) | (table[:, 0] > 2.6)]
+
+    change(study, "1", spoil)
+    found = checked(study)
+    assert {(flag["sites"][0], flag["kind"]) for flag in found["flags"]} == {
+        ("1", "gap"),
+        ("1", "saturation"),
+    }
+    assert any("site 1: the force stays at" in flag["text"] for flag in found["flags"])
+
+
 def test_check_names_the_file_of_a_record_that_begins_in_contact(study):
     change(study, "1", lambda table: table[200:800])
     with pytest.raises(InputError, match=r"1\.csv.*force_N: the record begins in contact") as caught:
