@@ -74,6 +74,23 @@ def test_motion_of_a_limb() -> None:
     assert motion.correlation > 0.95
 
 
+def test_motion_between_fine_images_is_as_exact() -> None:
+    """Voxels of 0.5 mm, of blobs that the shift moves analytically."""
+    random = np.random.default_rng(0)
+    centres, widths = random.uniform(12, 48, (14, 3)), random.uniform(4, 8, 14)
+    k, j, i = np.mgrid[:120, :120, :120].astype(np.float32) * 0.5
+
+    def blobs(shift: np.ndarray) -> Volume:
+        total = np.zeros(k.shape, np.float32)
+        for (x, y, z), width in zip(centres + shift, widths):
+            total += np.exp(-((i - x) ** 2 + (j - y) ** 2 + (k - z) ** 2) / width**2)
+        return Volume(total, np.full(3, 0.5), np.zeros(3), np.eye(3))
+
+    shift = np.array([1.3, -0.8, 0.45])
+    motion = limb_motion(blobs(np.zeros(3)), blobs(shift), np.ones(k.shape, bool))
+    assert np.abs(motion.apply(centres + shift) - centres).max() < 0.05
+
+
 @pytest.mark.slow
 def test_another_limb_is_no_motion() -> None:
     _, _, plain, _ = scans(1)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import SimpleITK as sitk  # noqa: N813
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.optimize import least_squares
@@ -22,6 +23,7 @@ from ..grid import Volume
 Array = NDArray[np.float64]
 
 _LEVELS_MM = (6.0, 2.5)  # of smoothing: the first reaches far, the second is exact
+_FINEST_MM = 1.0  # of voxels: finer ones are joined, as the smoothing does not show them
 _SAMPLES = 20000
 _BORDER_MM = 10.0  # of the image: what is nearer may have no partner in the other
 _ARM_MM = 50.0  # a turn of 1 / _ARM_MM rad counts as much as a shift of 1 mm
@@ -71,6 +73,7 @@ def limb_motion(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> LimbMo
     """
     index = _sample(image, limb)
     points = image.index_to_point(index)
+    image, moved = _coarsen(image), _coarsen(moved)
     centre = points.mean(axis=0)
     unknowns = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     for sigma in _LEVELS_MM:
@@ -104,6 +107,12 @@ def _sample(image: Volume, limb: NDArray[np.bool_]) -> Array:
     voxels = voxels[inside]
     chosen = voxels[random.choice(len(voxels), min(_SAMPLES, len(voxels)), replace=False)]
     return chosen + random.uniform(-0.5, 0.5, chosen.shape)
+
+
+def _coarsen(volume: Volume) -> Volume:
+    """The means of blocks of voxels that are not larger than 1 mm."""
+    factors = np.maximum((_FINEST_MM / volume.spacing).astype(int), 1)
+    return Volume.from_sitk(sitk.BinShrink(volume.to_sitk(), factors.tolist()))
 
 
 def _placed(points: Array, centre: Array, unknowns: Array) -> Array:
