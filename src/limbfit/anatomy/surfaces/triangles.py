@@ -25,7 +25,7 @@ Faces = NDArray[np.int64]
 _SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
 _SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
-_LARGE = 2.0  # of the median face's size: larger ones are looked for in pieces
+_LARGE = 4.0  # of the median face's size: larger ones are looked for in pieces
 _AT_ONCE = 20_000  # faces whose neighbours are held in memory
 
 
