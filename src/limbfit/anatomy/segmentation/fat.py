@@ -74,7 +74,7 @@ def _half_way(levels: Field, rind: Mask, spacing: Spacing) -> Field:
         _interpolate_places(np.interp(np.arange(n) / e, c, np.arange(len(c))), len(c))
         for n, e, c in zip(levels.shape, every, centres)
     )
-    return j @ np.tensordot(k, found.astype(np.float32), 1) @ i.T
+    return np.asarray(j @ np.tensordot(k, found.astype(np.float32), 1) @ i.T, dtype=np.float32)
 
 
 def _between(values: Field) -> float:
