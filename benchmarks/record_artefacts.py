@@ -325,7 +325,7 @@ def _correlated(random: Random, press: Press) -> Case:
     return _case(replace(press, noise_N=1e-6), random, press.force(at) + press.noise_N * noise)
 
 
-def _linear_drift_free_offset(random: Random, press: Press) -> Case:
+def _offset(random: Random, press: Press) -> Case:
     return _case(press, random, press.force(press.time_s) + random.uniform(-3.0, 3.0))
 
 
@@ -376,7 +376,7 @@ CLEAN: dict[str, Make] = {
     "25 Hz": _ordinary(rate_Hz=25.0),
     "30 % of samples missing": _missing,
     "clock jitter 4 ms": _jittered,
-    "offset of up to 3 N": _linear_drift_free_offset,
+    "offset of up to 3 N": _offset,
     "sticks to the skin": _sticky,
 }
 
@@ -461,8 +461,10 @@ def main() -> int:
     clean = table("clean record", chosen[1], options.draws, options.seed)
     covered = np.mean([r.told or r.within for found in artefacts.values() for r in found] or [True])
     alarms = np.mean([r.told for found in clean.values() for r in found] or [False])
-    print(f"{100 * covered:.1f} % of the artefacts are told or within 1.96 standard deviations")
-    print(f"{100 * alarms:.1f} % of the clean records are told as something else")
+    if artefacts:
+        print(f"{100 * covered:.1f} % of the artefacts are told or within 1.96 standard deviations")
+    if clean:
+        print(f"{100 * alarms:.1f} % of the clean records are told as something else")
     print(f"{time.process_time() - began:.0f} s of processor time")
     if options.json:
         rows = {name: [asdict(r) for r in found] for name, found in {**artefacts, **clean}.items()}

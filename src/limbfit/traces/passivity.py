@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from ..phases import MotionPhase
 from .displacement import BrokenLine
-from .numerics import Array, bins, noise_level
+from .numerics import Array, bins, noise_level, resolution
 from .onset import compute_memory
 from .record import Remark, Trace
 from .scatter import Scatter
@@ -73,7 +73,8 @@ def lag_remarks(
     met = float(np.interp(touch.time_s, (line.times[1:] + line.times[:-1]) / 2, speed))
     late_mm = delay * abs(met)
     step = float(np.median(np.diff(trace.time_s)))
-    if delay < max(_LAG_SD * sd, _LAG_STEPS * step) or late_mm < _LAG_HARM * touch.uncertainty_mm:
+    unseen = resolution(trace.displacement_mm) / float(np.abs(speed).max())  # of when a corner was
+    if delay < max(_LAG_SD * sd, _LAG_STEPS * step, unseen) or late_mm < _LAG_HARM * touch.uncertainty_mm:
         return []
     what = (
         f"the force turns {delay:.2g} +- {sd:.1g} s after the displacement, which no passive tissue does: "
