@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
-from limbfit.anatomy.grid import FAT, LabelMap
+from limbfit.anatomy.grid import BONES, FAT, LabelMap
 from limbfit.anatomy.labels.quality import assess
 from limbfit.anatomy.segmentation.one_limb import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, signed_distance
-from limbfit.phantom.geometry import BONES, Limb, gradient_of, make_limb
+from limbfit.phantom.geometry import Limb, gradient_of, make_limb
 from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, image_of, make_grid
 from limbfit.phantom.surfaces import true_anatomy
 

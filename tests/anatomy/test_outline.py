@@ -9,7 +9,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 from limbs import write_dicom
 
-from limbfit.anatomy.grid import FAT, Volume
+from limbfit.anatomy.grid import BONES, FAT, Volume
 from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.morphology import compute_depth
 from limbfit.anatomy.segmentation.body import limb_mask, smoothed
@@ -18,7 +18,7 @@ from limbfit.anatomy.segmentation.fat import bright_fat, subcutaneous
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.segmentation.supports import without_supports
 from limbfit.errors import ImageError
-from limbfit.phantom.geometry import BONES, SKIN_AND_FAT, Limb, make_limb
+from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb
 from limbfit.phantom.mri import CONTRASTS, image_of, make_grid
 
 SEED = 2

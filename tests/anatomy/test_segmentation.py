@@ -136,13 +136,14 @@ def shaft(low: int, high: int, centre: int, radius: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("bones", "expected"),
     [
-        ([shaft(5, 100, 30, 9)], ["tibia"]),
+        ([shaft(5, 100, 30, 14)], ["bone-1"]),  # a thigh
+        ([shaft(5, 100, 40, 9), shaft(3, 100, 15, 8)], ["bone-1", "bone-2"]),  # a forearm
         ([shaft(5, 100, 30, 9), shaft(8, 96, 10, 4)], ["tibia", "fibula"]),
         (
             [shaft(60, 100, 30, 14), shaft(5, 58, 30, 11), shaft(8, 52, 10, 4), shaft(64, 76, 50, 6)],
             ["femur", "tibia", "fibula", "patella"],
         ),
-        ([shaft(5, 100, 30, 9), shaft(40, 46, 10, 4)], ["tibia", "bone-1"]),
+        ([shaft(5, 100, 30, 9), shaft(40, 46, 10, 4)], ["bone-1", "bone-2"]),
         ([], []),
     ],
 )

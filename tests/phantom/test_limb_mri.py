@@ -8,10 +8,10 @@ import pydicom
 import pytest
 import SimpleITK as sitk  # noqa: N813
 
-from limbfit.phantom.geometry import BONES, SKIN_AND_FAT, make_limb
+from limbfit.anatomy.grid import BONES
+from limbfit.phantom.geometry import SKIN_AND_FAT, make_limb
 from limbfit.phantom.mri import (
     BIAS,
-    CORTEX_MM,
     FULL_SCALE,
     MARKER_HEIGHT_MM,
     NOISE,
@@ -117,7 +117,7 @@ def test_contrast_is_that_of_an_ultra_short_echo(limb, clean, points) -> None:
     tibia, femur = limb.bone("tibia", points), limb.bone("femur", points)
     fat = np.median(clean[(skin < -1.2) & (skin > -1.8) & (bones > 6)])
     muscle = np.median(clean[(skin < -8) & (bones > 6)])
-    cortex = np.median(clean[np.abs(tibia + CORTEX_MM["tibia"] / 2) < 0.4])
+    cortex = np.median(clean[np.abs(tibia + limb.shape.cortex_mm["tibia"] / 2) < 0.4])
     marrow = np.median(clean[femur < -8])
     air = clean[skin > 6].max()
     assert air < 1e-9

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from socket_limbs import round_limb
 
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
 from limbfit.pipeline.shared.socket_shape import load_of, regions_of, socket_of
 from limbfit.pipeline.verbs.check import check_study
@@ -48,7 +50,7 @@ def test_a_study_without_the_table_has_a_socket(tmp_path: Path) -> None:
         ("single stance", 1.0, 2.0)
     ]
     assert study.socket.liner.parameters == {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0}
-    force, moment, point = load_of(study, study.socket.loads[0], round_limb())
+    force, moment, point = load_of(study, study.socket.loads[0], round_limb(), drawn(study))
     np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
     np.testing.assert_allclose(point, knee_centre(round_limb()))
@@ -76,14 +78,31 @@ def test_loads_of_ones_own(tmp_path: Path) -> None:
         "[socket.liner]\nmaterial = 'gel'\nm = 4\n"
     )
     study = study_of(tmp_path, text)
-    force, moment, point = load_of(study, study.socket.loads[0], round_limb())
+    force, moment, point = load_of(study, study.socket.loads[0], round_limb(), drawn(study))
     assert force.tolist() == [0, 10, 500]
     assert moment.tolist() == [1e4, 0, 0]
     assert point.tolist() == [0, 0, 90]
-    force, moment, _ = load_of(study, study.socket.loads[1], round_limb())
+    force, moment, _ = load_of(study, study.socket.loads[1], round_limb(), drawn(study))
     np.testing.assert_allclose(force, [200.0, -200.0, 1100.0])  # medial is +x: the fibula lies at -x
     np.testing.assert_allclose(moment, np.cross([50.0, -50.0, 0.0], force))
     assert study.socket.liner.parameters == {"c_kPa": 40.0, "m": 4.0, "gamma": 0.3, "tau_s": 1.0}
+
+
+@pytest.mark.parametrize("load", ["", 'name = "mine"\nforce_N = [0, 0, 800]\n'])
+def test_a_limb_without_a_tibia_is_loaded_through_its_middle_at_the_brim(tmp_path: Path, load: str) -> None:
+    study = study_of(tmp_path, load and f"[[socket.loads]]\n{load}", bones=False)
+    assert "cm3" in check_study(study_of(tmp_path, "[socket]\nhold_s = 1\n", bones=False))["facts"][-1]
+    limb = round_limb()
+    bare = replace(
+        limb, bones={}, skin=Surface(limb.skin.points + np.array([7.0, -3.0, 0.0]), limb.skin.faces)
+    )
+    socket = socket_of(study, bare, bare.skin)
+    force, moment, point = load_of(study, study.socket.loads[0], bare, socket)
+    np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
+    np.testing.assert_allclose(moment, 0.0, atol=1e-9)
+    np.testing.assert_allclose(point, [7.0, -3.0, socket.points[socket.brim, 2].mean()], atol=0.1)
+    assert point[2] == pytest.approx(120.0, abs=2.0)  # 30 mm below the cut, less what the flare takes
+    assert not {name for name in regions_of(study, bare) if "tibia" in name or "knee" in name}
 
 
 def test_check_draws_the_socket(tmp_path: Path) -> None:
@@ -133,7 +152,11 @@ BAD: dict[str, tuple[str, str, bool]] = {
         True,
     ),
     "nowhere.stl does not exist": ('[socket]\nfile = "nowhere.stl"\n', "", True),
-    "the knee centre is not known": ("[socket]\nhold_s = 1\n", "state the point", False),
+    "passes beside the knee centre, which is not known": (
+        '[socket]\nside = "left"\n[[socket.loads]]\nname = "x"\npreset = "toe-off"\n',
+        "state point",
+        False,
+    ),
     "medial and lateral are not known": (
         '[[socket.loads]]\nname = "x"\npreset = "toe-off"\npoint = [0, 0, 120]\n',
         "socket.side",

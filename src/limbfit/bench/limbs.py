@@ -16,7 +16,7 @@ from ..anatomy.segmentation.voxels import label_map
 from ..anatomy.sites.sites import indenter_axis
 from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
 from ..errors import InputError
-from ..phantom.geometry import BONES, make_limb
+from ..phantom.geometry import make_limb
 from ..phantom.mri import make_grid
 
 Array = NDArray[np.float64]
@@ -49,15 +49,15 @@ def limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
 def phantom_limb(seed: int, detail: str = "paper") -> Anatomy:
     """The surfaces of a phantom as a label map on its scanner's grid shows them."""
     limb, grid = make_limb(seed), make_grid(make_limb(seed), detail, seed)
-    skin, *bones = np.zeros((1 + len(BONES), *grid.shape), dtype=bool)
+    skin, *bones = np.zeros((1 + len(limb.bone_names), *grid.shape), dtype=bool)
     for k in range(0, grid.shape[0], SLAB):
         slab = slice(k, min(k + SLAB, grid.shape[0]))
         points = grid.points(slab, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
         skin[slab] = limb.skin(points) < 0
-        for bone, name in zip(bones, BONES):
+        for bone, name in zip(bones, limb.bone_names):
             bone[slab] = limb.bone(name, points) < 0
     voxels = Grid(skin, np.array(grid.spacing), grid.origin, grid.direction)
-    return _checked(build_anatomy(label_map(voxels, skin, dict(zip(BONES, bones)))))
+    return _checked(build_anatomy(label_map(voxels, skin, dict(zip(limb.bone_names, bones)))))
 
 
 def openlimb_mean(folder: Path) -> Anatomy:

@@ -27,6 +27,11 @@ class Detail(StrEnum):
     paper = "paper"
 
 
+class LimbKind(StrEnum):
+    transtibial = "transtibial"
+    transfemoral = "transfemoral"
+
+
 class SolverName(StrEnum):
     limbfit = "limbfit"
     febio = "febio"
@@ -61,6 +66,7 @@ def phantom(
         Detail, typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
     ] = Detail.coarse,
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
+    limb: Annotated[LimbKind, typer.Option(help="which limb was amputated")] = LimbKind.transtibial,
     fat: Annotated[bool, typer.Option("--fat", help="three tissues: skin, fat and muscle")] = False,
     tendon: Annotated[
         bool, typer.Option("--tendon", help="also a patellar tendon, a tissue of its own in the muscle")
@@ -89,6 +95,7 @@ def phantom(
             surface=surface,
             shear_waves=shear_waves,
             tendon=tendon,
+            limb=limb.value,
             listener=listener,
         )
     if as_json:

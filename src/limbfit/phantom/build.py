@@ -33,7 +33,6 @@ from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
 from .record import Ramp, Seen, record, write_surface, write_ultrasound, write_waves
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
-from .socket import STUDY as SOCKET_STUDY
 from .socket import write_socket
 from .studyfile import study_text
 from .surfaces import true_anatomy
@@ -85,6 +84,7 @@ def make_phantom(
     surface: bool = False,
     shear_waves: bool = False,
     tendon: bool = False,
+    limb: str = "transtibial",
     mapping: Mapping = map,
     progress: Listener | None = None,
 ) -> dict[str, Any]:
@@ -102,6 +102,7 @@ def make_phantom(
     surface : beside each record how the skin around the indenter moved, to 0.05 mm at 5 Hz.
     shear_waves : beside each record the speeds of shear waves under the indenter, to 0.1 m/s at 1 Hz.
     tendon : also a patellar tendon, a stiffer region of the muscle, in a label map that the study names.
+    limb : which kind, ``transtibial`` or ``transfemoral``.
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
     progress : called with what is being done, how much of it is done, and of how much.
@@ -114,27 +115,27 @@ def make_phantom(
     Raises
     ------
     InputError
-        For a folder that is not empty, or an unknown detail or site.
+        For a folder that is not empty, an unknown detail, limb or site, or a tendon of a thigh.
     """
     folder = Path(folder)
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
-    limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon)
+    patient = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
     seen = Seen(ultrasound, surface, shear_waves)
     parameters = true_parameters(seed, fat, tendon)
-    everywhere = true_sites(limb, seed)
+    everywhere = true_sites(patient, seed)
     indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
     with _appearing(folder) as work:
-        truth = _truth(limb, everywhere, detail, seed, parameters)
-        text, anatomy = study_text(indented, detail, seed, limb, seen), true_anatomy(limb)
+        truth = _truth(patient, everywhere, detail, seed, parameters)
+        anatomy = true_anatomy(patient)
         if socket:
-            truth["socket"] = write_socket(work, limb, anatomy)
-            text += SOCKET_STUDY
-        _write_images(work, limb, everywhere, detail, seed, tell)
+            truth["socket"] = write_socket(work, patient, anatomy)
+        _write_images(work, patient, everywhere, detail, seed, tell)
         truth["sites"] = _write_traces(
-            work, limb, anatomy, indented, detail, seed, parameters, mapping, tell, seen
+            work, patient, anatomy, indented, detail, seed, parameters, mapping, tell, seen
         )
+        text = study_text(indented, detail, seed, patient, seen, socket)
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
@@ -287,6 +288,7 @@ def _truth(
         "kappa_ratio": KAPPA_RATIO,
         "indenter_mm": INDENTER_MM,
         "limb": {
+            "kind": limb.kind,
             "shape_mm_rad": asdict(limb.shape),
             "rotation": limb.rotation.tolist(),
             "origin_mm": limb.origin.tolist(),

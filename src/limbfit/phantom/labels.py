@@ -8,7 +8,7 @@ import numpy as np
 
 from ..anatomy.grid import DEFAULT_NAMES
 from ..anatomy.imaging import LabelMap, write_labels
-from .geometry import BONES, Limb
+from .geometry import Limb
 from .mri import SLAB, ScanGrid
 
 FILE = Path("labels") / "labels.seg.nrrd"
@@ -25,7 +25,7 @@ def true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
         part = (limb.skin(points) < 0).astype(np.uint8)
         if limb.has_tendon:
             part[limb.tendon(points) < 0] = TENDON_VALUE
-        for name in BONES:
+        for name in limb.bone_names:
             part[limb.bone(name, points) < 0] = values[name]
         array[k] = part
     names = {value: name for value, name in DEFAULT_NAMES.items() if (array == value).any()}

@@ -22,10 +22,10 @@ from pydicom.valuerep import format_number_as_ds
 from scipy.special import ndtr
 
 from ..anatomy.grid import Volume
-from .geometry import BONES, PROXIMAL_CUT_MM, Limb, rotation_about
+from .fields import PROXIMAL_CUT_MM
+from .geometry import Limb, rotation_about
 
 FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
-CORTEX_MM = {"tibia": 3.2, "fibula": 2.4, "patella": 2.4, "femur": 2.8}
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
 NOISE = MUSCLE / 27.0
 BIAS = 0.2
@@ -132,8 +132,8 @@ def _tissue(
     if limb.has_tendon:
         (band,) = _occupancy(limb.tendon(points), spacing, (0.0,))
         signal += (levels.tendon - signal) * band
-    for name in BONES:
-        bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, CORTEX_MM[name]))
+    for name, cortex in limb.shape.cortex_mm.items():
+        bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, cortex))
         signal = signal * (1 - bone) + levels.cortex * bone + (levels.marrow - levels.cortex) * marrow
     return signal, skin
 

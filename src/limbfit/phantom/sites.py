@@ -1,7 +1,8 @@
 """Where a phantom is indented, how deep, and along which axis: 18 places in four regions, as in the paper.
 
 Places are given around the limb (angle from anterior through medial, radians) and along it (millimetres
-below the knee joint), so that they keep their anatomical meaning when a seed changes the limb.
+below the knee joint, or a thigh's proximal cut), so that they keep their anatomical meaning when a seed
+changes the limb.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import SiteError
 from .geometry import Limb
 from .mri import SkinMarker
+from .shank import Shank
 
 INDENTER_MM, INDENTER_EDGE_MM = 20.0, 2.0
 SAFE_SHARE = 0.4  # of the thinnest soft tissue under the indenter
@@ -26,12 +28,12 @@ PATELLAR, TIBIA, LATERAL, POSTERIOR = "patellar tendon", "tibia", "lateral", "po
 
 @dataclass(frozen=True)
 class Place:
-    """A place on the limb: angle (rad), distance below the joint (mm), wanted depth (mm)."""
+    """A place on the limb: angle (rad), distance below its shape's datum (mm), wanted depth (mm)."""
 
     name: str
     region: str
     angle: float
-    below_joint: float
+    below: float
     depth: float
 
 
@@ -39,16 +41,23 @@ def _places(region: str, depth: float, first: int, spots: Sequence[tuple[float, 
     return [Place(f"{first + i:02d}", region, angle, below, depth) for i, (angle, below) in enumerate(spots)]
 
 
-PLACES = (
+SHANK_PLACES = (
     *_places(PATELLAR, 5.0, 1, [(0.0, 7.0), (-0.45, 16.0), (0.45, 16.0)]),
     *_places(TIBIA, 3.5, 4, [(0.95, 46.0), (0.95, 72.0), (0.95, 98.0), (0.35, 42.0), (1.0, 124.0)]),
     *_places(LATERAL, 5.0, 9, [(-0.8, 44.0), (-0.85, 72.0), (-0.85, 100.0), (-1.3, 58.0), (-1.3, 86.0)]),
     *_places(POSTERIOR, 7.0, 14, [(3.14, 38.0), (2.75, 64.0), (-2.7, 64.0), (3.14, 92.0), (3.14, 120.0)]),
 )
+_COLUMN = ((0.0, 75.0), (0.3, 105.0), (-0.3, 105.0), (0.0, 130.0), (0.0, 160.0))
+THIGH_PLACES = (
+    *_places("anterior", 6.0, 1, [(0.0, 95.0), (-0.45, 125.0), (0.45, 125.0)]),
+    *_places("medial", 6.0, 4, [(0.5 * np.pi + aside, below) for aside, below in _COLUMN]),
+    *_places("lateral", 5.0, 9, [(-0.5 * np.pi + aside, below) for aside, below in _COLUMN]),
+    *_places("posterior", 7.0, 14, [(np.pi + aside, below) for aside, below in _COLUMN]),
+)
 FITTED = ("01", "05", "10", "15")
 DETAIL_SITES = {
     "coarse": (*FITTED, "13", "17"),
-    "paper": tuple(place.name for place in PLACES),
+    "paper": tuple(place.name for place in SHANK_PLACES),
 }
 
 
@@ -72,8 +81,9 @@ class TrueSite:
 
 def true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
     """All 18 sites of a limb."""
+    places = SHANK_PLACES if isinstance(limb.shape, Shank) else THIGH_PLACES
     return tuple(
-        _true_site(limb, place, np.random.default_rng([seed, 6, i])) for i, place in enumerate(PLACES)
+        _true_site(limb, place, np.random.default_rng([seed, 6, i])) for i, place in enumerate(places)
     )
 
 
@@ -100,7 +110,7 @@ def markers_of(sites: Sequence[TrueSite]) -> tuple[SkinMarker, ...]:
 
 
 def _true_site(limb: Limb, place: Place, random: np.random.Generator) -> TrueSite:
-    position = limb.skin_point(place.angle, limb.shape.joint - place.below_joint)
+    position = limb.skin_point(place.angle, limb.shape.datum - place.below)
     footprint = _footprint(limb, position)
     axis = limb.inward(footprint).mean(axis=0)
     axis /= np.linalg.norm(axis)

@@ -11,9 +11,10 @@ from ..anatomy.frame import limb_frame
 from ..anatomy.surfaces.surfacefiles import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..socket import Area, Recipe, Socket, read_socket, rectified
-from ..socket.landmarks import directions, knee_centre
+from ..socket.landmarks import Directions, directions, knee_centre
 from ..socket.regions import default_regions
 from ..socket.trim import Trim
+from .fields import Array
 from .geometry import Limb
 from .surfaces import outer_surface
 
@@ -21,47 +22,57 @@ FILE = Path("socket") / "socket.stl"
 LINER_MM = 6.0
 REDUCTION_PERCENT = 3.0
 BELOW_KNEE_MM, BAND_MM = 10.0, 6.0  # of the brim at the back, and of the skin that says how far back it is
+BELOW_CUT_MM = 30.0  # of a thigh's brim
 # Region, radius and depth (mm) of what is pressed in or relieved.
-AREAS = (
-    ("patellar tendon", 25.0, 4.0),
-    ("medial proximal", 30.0, 3.0),
-    ("posterior proximal", 35.0, 4.0),
-    ("tibial crest", 25.0, -2.0),
-    ("fibular head", 20.0, -3.0),
-    ("distal tibia", 25.0, -3.0),
-)
-STUDY = f"""
-[socket]                  # the face of a rectified socket, around the limb with a liner of {LINER_MM:g} mm
-file = "{FILE.as_posix()}"
-"""
+AREAS = {
+    "transtibial": (
+        ("patellar tendon", 25.0, 4.0),
+        ("medial proximal", 30.0, 3.0),
+        ("posterior proximal", 35.0, 4.0),
+        ("tibial crest", 25.0, -2.0),
+        ("fibular head", 20.0, -3.0),
+        ("distal tibia", 25.0, -3.0),
+    ),
+    "transfemoral": (
+        ("anterior proximal", 40.0, 4.0),
+        ("posterior proximal", 40.0, 3.0),
+        ("lateral middle", 40.0, 3.0),
+        ("lateral distal", 30.0, -3.0),
+    ),
+}
 
 
-def make_socket(anatomy: Anatomy, outer: Surface) -> tuple[Socket, list[Area]]:
-    """The socket around a limb in a liner, and its areas, of which one bears on the patellar tendon.
+def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> tuple[Socket, list[Area]]:
+    """The socket around a limb in a liner, and its areas: a shank's bears on the patellar tendon.
 
     Parameters
     ----------
-    anatomy : of the limb, with a tibia and a patella.
+    anatomy : of the limb; of a shank, with a tibia and a patella.
     outer : the closed surface of the liner, LPS mm, flat at the same proximal cut.
+    kind : of limb, one of ``LIMBS``.
 
     Raises
     ------
     SurfaceError
         Where the limb has no place for it.
     """
-    regions = default_regions(anatomy, directions(anatomy))
-    areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS]
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    return rectified(outer, frame, Recipe(_trim(anatomy), REDUCTION_PERCENT, areas)), areas
+    known = directions(anatomy, "right")
+    regions = default_regions(anatomy, known)
+    areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS[kind]]
+    knee, frame = knee_centre(anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    trim = _below_cut(anatomy) if knee is None else _around_tendon(anatomy, known, knee)
+    return rectified(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
 
 
-def _trim(anatomy: Anatomy) -> Trim:
+def _below_cut(anatomy: Anatomy) -> Trim:
+    return Trim([(anatomy.cut_point - BELOW_CUT_MM * anatomy.cut_normal, anatomy.cut_normal)])
+
+
+def _around_tendon(anatomy: Anatomy, known: Directions, knee: Array) -> Trim:
     """As of a patellar-tendon-bearing socket: from the patella's middle to below the knee at the back.
 
     A brim below the knee all around would cut through the bar on the tendon, half of which lies above it.
     """
-    known, knee = directions(anatomy), knee_centre(anatomy)
-    assert knee is not None  # the phantom has a tibia
     front, skin = anatomy.bones["patella"].points.mean(axis=0), anatomy.skin.points
     near = np.abs(anatomy.height(skin) - anatomy.height(knee) + BELOW_KNEE_MM) < BAND_MM
     behind = ((skin[near] - knee) @ known.anterior).min()
@@ -73,7 +84,7 @@ def _trim(anatomy: Anatomy) -> Trim:
 def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
     """Write the socket of a limb into a study's folder and read it back; returns what is true of it."""
     outer = outer_surface(limb, LINER_MM)
-    socket, areas = make_socket(anatomy, outer)
+    socket, areas = make_socket(anatomy, outer, limb.kind)
     (folder / FILE).parent.mkdir()
     write_surface(folder / FILE, socket.surface)
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)

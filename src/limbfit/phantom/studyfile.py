@@ -8,7 +8,10 @@ from ..anatomy.meshing.layers import LayerSpec
 from .geometry import TENDON, Limb
 from .labels import FILE, TENDON_LABEL
 from .record import NOTHING, Seen
+from .shank import Shank
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
+from .socket import FILE as SOCKET_FILE
+from .socket import LINER_MM
 
 _HEAD = """\
 # A synthetic residuum with known truth: compare what limbfit finds with truth.json.
@@ -16,7 +19,7 @@ _HEAD = """\
 
 [study]
 name = "phantom, seed {seed}"
-description = "Synthetic transtibial residuum, {detail} detail"
+description = "Synthetic {kind} residuum, {detail} detail"
 
 [image]
 path = "mri/plain"        # DICOM, ultra-short echo time
@@ -80,6 +83,12 @@ ultrasound = "traces/site-{name}-layers.csv"   # thickness of the tissues under 
 _WAVES = """\
 shear_waves = "traces/site-{name}-waves.csv"   # how fast shear waves were under the indenter meanwhile
 """
+_SIDE = """\
+side = "right"            # of the patient: no fibula beside a tibia says so
+"""
+_FILE = f"""\
+file = "{SOCKET_FILE.as_posix()}"   # a rectified face, around the limb with a liner of {LINER_MM:g} mm
+"""
 _SURFACE = """\
 surface = "traces/site-{name}-surface.csv"     # how the skin around the indenter moved meanwhile
 """
@@ -91,11 +100,13 @@ def study_text(
     seed: int,
     limb: Limb,
     seen: Seen = NOTHING,
+    socket: bool = False,
 ) -> str:
     """The content of ``study.toml`` for some sites of a limb."""
     head = _HEAD.format(
         seed=seed,
         detail=detail,
+        kind=limb.kind,
         layers=_layers(limb.layers),
         labels=_LABELS if limb.has_tendon else "",
         regions=_REGIONS if limb.has_tendon else "",
@@ -112,7 +123,13 @@ def study_text(
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
         for one, line in zip(seen, (_ULTRASOUND, _SURFACE, _WAVES), strict=True):
             parts += [line.format(name=site.name)] if one else []
-    return "".join(parts)
+    return "".join([*parts, *_socket(limb, socket)])
+
+
+def _socket(limb: Limb, made: bool) -> list[str]:
+    """The table of the socket, where it says anything."""
+    lines = [_SIDE] * (not isinstance(limb.shape, Shank)) + [_FILE] * made
+    return ["\n[socket]\n", *lines] if lines else []
 
 
 def _layers(layers: Sequence[LayerSpec]) -> str:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import bodies, from_pyvista, half_edges
-from .geometry import BONES, PROXIMAL_CUT_MM, TENDON, Limb, bone_field, skin_field
+from .fields import PROXIMAL_CUT_MM, skin_field
+from .geometry import TENDON, Limb
 
 Array = NDArray[np.floating]
 Field = Callable[[Array], Array]
@@ -40,7 +41,7 @@ def true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     shape = limb.shape
     box = Box((-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM), spacing)
     skin = contour(lambda p: skin_field(shape, p), box)
-    bones = {name: _bone(limb, name, spacing / 1.5) for name in BONES}
+    bones = {name: _bone(limb, name, spacing / 1.5) for name in limb.bone_names}
     regions = {TENDON: _placed(limb, _tendon(limb, spacing / 2))} if limb.has_tendon else {}
     return Anatomy(
         skin=_placed(limb, skin),
@@ -60,11 +61,11 @@ def outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surf
 
 def _bone(limb: Limb, name: str, spacing: float) -> Surface:
     box = Box((-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM), spacing)
-    return contour(lambda p: bone_field(limb.shape, name, p), box)
+    return contour(lambda p: limb.shape.bone_field(name, p), box)
 
 
 def _tendon(limb: Limb, spacing: float) -> Surface:
-    middle = limb.shape.joint - 12.0
+    middle = limb.shape.datum - 12.0
     box = Box((-24.0, -66.0, middle - 36.0), (24.0, -22.0, middle + 36.0), spacing)
     return contour(lambda p: limb.tendon(limb.to_patient(p)), box)
 

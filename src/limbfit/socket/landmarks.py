@@ -1,4 +1,4 @@
-"""Where anterior and medial are on a limb, and where its knee is."""
+"""Where anterior and medial are on a limb, where its knee is, and about which point it is loaded."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..anatomy.frame import limb_frame
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..errors import SurfaceError
+from .shape import measure_section, section
 
 Array = NDArray[np.float64]
 
@@ -86,3 +88,19 @@ def knee_centre(anatomy: Anatomy) -> Array | None:
     height = anatomy.height(tibia.points)
     top = tibia.points[height > height.max() - PLATEAU_MM]
     return np.asarray((top.min(axis=0) + top.max(axis=0)) / 2)
+
+
+def load_point(anatomy: Anatomy, brim: Array) -> Array:
+    """(3,) LPS mm, the point about which loads are meant where none is stated.
+
+    It is the knee centre; where that is not known, the centre of the limb's section at the height of the
+    brim, whose points are ``brim`` (k, 3).
+    """
+    knee = knee_centre(anatomy)
+    if knee is not None:
+        return knee
+    frame, skin = limb_frame(anatomy.cut_point, anatomy.cut_normal), anatomy.skin
+    z = min(float(frame.to_limb(brim)[:, 2].mean()), -1.0)  # below the cut, which closes the skin
+    local = Surface(frame.to_limb(skin.points), skin.faces)
+    x, y, _ = measure_section(section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))
+    return frame.to_patient(np.array([x, y, z]))

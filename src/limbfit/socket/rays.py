@@ -22,7 +22,7 @@ from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
 from ..errors import SurfaceError
-from .shape import section
+from .shape import measure_section, section
 
 Array = NDArray[np.float64]
 
@@ -162,21 +162,13 @@ def _rays(local: Surface) -> Rays:
             remedy="move the proximal cut up",
         )
     levels = np.linspace(bottom, -BELOW_CUT_MM, LEVELS + 2)[1:]
-    measured = np.array([_centre(section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0))) for z in levels])
+    measured = np.array([measure_section(section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0))) for z in levels])
     mean_radius = np.sqrt(measured[:, 2] / np.pi)
     # The end is as high as the limb is wide there; a long one keeps half of the limb for its shank.
     rounded = np.flatnonzero(levels - bottom >= np.minimum(mean_radius, 0.5 * (-bottom)))[0]
     centre_z = float(levels[rounded])
     line = np.polyfit(levels[rounded:] - centre_z, measured[rounded:, :2], DEGREE)
     return Rays(line, centre_z, float(mean_radius[rounded]), -centre_z)
-
-
-def _centre(segments: Array) -> Array:
-    """Centre (x, y) and area of what section segments (k, 2, 3) enclose."""
-    a, b = segments[:, 0, :2], segments[:, 1, :2]
-    twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    area = twice.sum() / 2
-    return np.append((twice[:, None] * (a + b)).sum(axis=0) / (6 * area), abs(area))
 
 
 def hits_of(surface: Surface, starts: Array, ways: Array) -> list[Array]:

@@ -92,6 +92,14 @@ def section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
     return np.stack([np.where(turned, first, second), np.where(turned, second, first)], axis=1)
 
 
+def measure_section(segments: Array) -> Array:
+    """Centre (x, y) and area of what section segments (k, 2, 3) across z enclose."""
+    a, b = segments[:, 0, :2], segments[:, 1, :2]
+    twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    area = twice.sum() / 2
+    return np.append((twice[:, None] * (a + b)).sum(axis=0) / (6 * area), abs(area))
+
+
 def circumference(surface: Surface, point: ArrayLike, normal: ArrayLike) -> float:
     """Length of a surface's section by a plane, mm: what a thread along the surface measures."""
     segments = section(surface, point, normal)

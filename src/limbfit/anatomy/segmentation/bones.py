@@ -147,8 +147,9 @@ def name_bones(bones: list[Mask], spacing: Spacing) -> list[str]:
     """Names by size and place; slices run from distal to proximal, ``bones`` from large to small.
 
     The femur is the upper of two large bones that lie one above the other; the tibia the largest below it;
-    the fibula the slender one beside the tibia; the patella the compact one at the femur's height. What fits
-    none of these is ``bone-1`` and so on.
+    the fibula the slender one beside the tibia, at most half of it; the patella the compact one at the
+    femur's height. One long bone alone is a thigh's or an upper arm's, two of a size are a forearm's. What
+    fits none of these is ``bone-1`` and so on.
     """
     shapes = [_Extent.of(bone, spacing) for bone in bones]
     names: dict[int, str] = {}
@@ -161,12 +162,11 @@ def name_bones(bones: list[Mask], spacing: Spacing) -> list[str]:
         names |= {lower: "tibia", upper: "femur"}
     else:
         lower, upper = 0, None
-        names[0] = "tibia"
-    rest = [n for n in range(len(bones)) if n not in names]
+    rest = [n for n in range(len(bones)) if n not in (lower, upper)]
     for n in rest:
         shape = shapes[n]
-        if "fibula" not in names.values() and shape.slender and shape.overlap(shapes[lower]) > 0.5:
-            names[n] = "fibula"
+        if "fibula" not in names.values() and shape.is_fibula_of(shapes[lower]):
+            names |= {lower: "tibia", n: "fibula"}
         elif "patella" not in names.values() and upper is not None and shape.overlap(shapes[upper]) > 0.5:
             names[n] = "patella"
     unknown = iter(range(1, len(bones) + 1))
@@ -193,11 +193,11 @@ class _Extent:
             volume=float(areas.sum() * np.prod(spacing)),
         )
 
-    @property
-    def slender(self) -> bool:
-        """More than two and a half times as long as wide."""
+    def is_fibula_of(self, tibia: _Extent) -> bool:
+        """More than two and a half times as long as wide, beside the tibia, and at most half of it."""
         length = self.high - self.low
-        return length > 2.5 * float(np.sqrt(self.volume / length))
+        slender = length > 2.5 * float(np.sqrt(self.volume / length))
+        return slender and self.overlap(tibia) > 0.5 and self.volume <= 0.5 * tibia.volume
 
     def overlap(self, other: _Extent) -> float:
         """Part of the shorter one's length that both share."""

@@ -15,6 +15,7 @@ from ...donning import Donned
 from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
+from ...socket.landmarks import bone
 from ...socket.published import published
 from ...study import Study
 from ..shared.artefacts import write_json, write_table
@@ -79,7 +80,8 @@ def run_socket(
         "parameters_from": parameters_from,
         "socket": _shape(limb, socket),
         "mesh": facts,
-        "published": published(limb.faces(mesh, socket)),
+        # All that was found is of transtibial limbs.
+        "published": published(limb.faces(mesh, socket)) if bone(limb.anatomy, "tibia") else [],
         "samples": None,
     }
     if covariance is not None and samples:

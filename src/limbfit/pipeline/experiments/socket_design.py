@@ -82,7 +82,7 @@ def undeformed_socket(
         recipe, frame = recipe_of(study, anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
         plain = rectified(outer, frame, replace(recipe, reduction_percent=0.0))
         for load in study.socket.loads:
-            load_of(study, load, anatomy)
+            load_of(study, load, anatomy, plain)
         regions, middles = regions_of(study, anatomy), outer.triangles.mean(axis=1)
         covered = covered_regions(middles, anatomy.skin, regions, plain)
         check_regions(study, [one.region for one in study.socket.design.regions], f"{PLACE}.regions", covered)

@@ -35,7 +35,7 @@ from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
-from ...socket.landmarks import directions, knee_centre
+from ...socket.landmarks import directions, load_point
 from ...socket.regions import SkinRegion
 from ...study import Study
 from ..shared.artefacts import digest, file_digest, read_json
@@ -93,6 +93,7 @@ class SocketLimb:
 
     def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, dict[str, Any]]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
+        self.fit(brim)  # a load that is not known is refused before anything is meshed
         file = folder / MESH
         if not is_meshed(file):
             context.tell(name, 0, 0, "a mesh of the whole limb")
@@ -120,14 +121,13 @@ class SocketLimb:
     def fit(self, socket: Socket) -> SocketFit:
         """How a socket comes on this limb, and its loads."""
         table, known = self.study.socket, directions(self.anatomy, self.study.socket.side)
-        knee = knee_centre(self.anatomy)
         loads = []
         for load in table.loads:
-            force, moment, point = load_of(self.study, load, self.anatomy)
+            force, moment, point = load_of(self.study, load, self.anatomy, socket)
             loads.append(Load(load.name, force, moment, point, load.duration_s, load.hold_s))
         depth = float(np.ptp(socket.points @ known.proximal))
         return SocketFit(
-            pivot=self.anatomy.cut_point if knee is None else knee,
+            pivot=load_point(self.anatomy, socket.points[socket.brim]),
             proximal=known.proximal,
             anterior=known.anterior,
             friction=table.friction,

@@ -17,7 +17,7 @@ from ...errors import StudyError, SurfaceError
 from ...laws import FIBRED
 from ...socket import Area, Recipe, Socket, read_socket, rectified
 from ...socket.bones import refuse_bones
-from ...socket.landmarks import bone, directions, knee_centre
+from ...socket.landmarks import bone, directions, knee_centre, load_point
 from ...socket.loads import STANDARD_LOADS
 from ...socket.regions import SkinRegion, default_regions, stated_region
 from ...socket.targets import Target
@@ -134,7 +134,9 @@ def check_regions(study: Study, names: Sequence[str], place: str, known: Collect
         )
 
 
-def load_of(study: Study, load: SocketLoadTable, anatomy: Anatomy) -> tuple[Array, Array, Array]:
+def load_of(
+    study: Study, load: SocketLoadTable, anatomy: Anatomy, socket: Socket
+) -> tuple[Array, Array, Array]:
     """Force (3,) N and moment (3,) N mm on the socket about a point (3,) mm, all LPS.
 
     Raises
@@ -142,17 +144,18 @@ def load_of(study: Study, load: SocketLoadTable, anatomy: Anatomy) -> tuple[Arra
     StudyError
         Where the knee centre or the side of the limb must be known and is not.
     """
-    point = knee_centre(anatomy) if load.point is None else np.array(load.point)
-    if point is None:
+    stated, standard = load.point, STANDARD_LOADS[load.preset] if load.preset else None
+    if stated is None and standard and standard.beside_knee and knee_centre(anatomy) is None:
         raise StudyError(
-            "the knee centre is not known: no bone is named tibia",
+            f"{load.preset!r} passes beside the knee centre, which is not known: no bone is named tibia",
             file=study.file,
-            place=f"socket.loads.{load.name}.point",
-            remedy="state the point about which the moment is meant (LPS, mm)",
+            place=f"socket.loads.{load.name}.preset",
+            remedy='state point, beside which it passes (LPS, mm), or force_N, or take "single stance"',
         )
-    if load.preset is None:
+    point = load_point(anatomy, socket.points[socket.brim]) if stated is None else np.array(stated)
+    if standard is None:
         return np.array(load.force_N), np.array(load.moment_Nmm), point
-    standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
+    weight = study.socket.body_weight_N
     with blaming(study):
         known = directions(anatomy, study.socket.side)
         return standard.force(weight, known), standard.moment(weight, known), point
@@ -182,9 +185,10 @@ def loadable_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     StudyError
         With the key and the remedy.
     """
+    socket = socket_of(study, anatomy, outer)
     for load in study.socket.loads:
-        load_of(study, load, anatomy)
-    return socket_of(study, anatomy, outer)
+        load_of(study, load, anatomy, socket)
+    return socket
 
 
 def covered_regions(

@@ -28,6 +28,7 @@ def make_phantom_study(
     surface: bool = False,
     shear_waves: bool = False,
     tendon: bool = False,
+    limb: str = "transtibial",
     listener: Listener = quiet,
     workers: int = 0,
 ) -> dict[str, Any]:
@@ -49,6 +50,7 @@ def make_phantom_study(
             surface=surface,
             shear_waves=shear_waves,
             tendon=tendon,
+            limb=limb,
             mapping=mapping,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
         )

@@ -164,7 +164,7 @@ def settling_figure(content: Json) -> Figure:
         axes[1].plot(time, [row["move_mm"][2] for row in steps], color=SIMULATED)
         axes[2].plot(time, [row["peak_kPa"] for row in steps], color=SIMULATED, label="largest")
         axes[2].plot(time, [row["mean_kPa"] for row in steps], "--", color=THIRD, label="mean")
-        labels = ("Force on the socket (N)", "Move towards the knee (mm)", "Pressure (kPa)")
+        labels = ("Force on the socket (N)", "Move towards the body (mm)", "Pressure (kPa)")
         for ax, label in zip(axes, labels, strict=True):
             ax.set(xlabel="Time (s)", ylabel=label)
             for end in [content["donning"]["time_s"], *(load["time_s"] for load in content["loads"])]:

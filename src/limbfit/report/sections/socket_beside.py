@@ -67,6 +67,8 @@ def interval_blocks(held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
 def published_blocks(content: Json, held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
     """What others found over the regions of this result, beside its pressures when a part has been held."""
     found = content["published"]
+    if not found:
+        return ()
     here = {row["region"]: row for row in held["regions"]}
     regions = dict.fromkeys(name for one in found for name in one["regions"])
     head = ("Region", "Here: mean (kPa)", "Here: peak (kPa)", "Found by others", "How", "Source")

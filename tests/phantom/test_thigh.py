@@ -1,0 +1,115 @@
+"""The transfemoral phantom: a thigh by its sizes, segmented as it is, from the folder to the report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_phantom_folder import cubic_law
+
+from limbfit import run_study
+from limbfit.anatomy.segmentation.segmentation import segment
+from limbfit.errors import InputError
+from limbfit.phantom import Limb, make_limb, make_phantom, true_sites
+from limbfit.phantom.mri import image_of, make_grid
+from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
+from limbfit.phantom.socket import LINER_MM, make_socket
+from limbfit.phantom.surfaces import outer_surface, true_anatomy
+from limbfit.pipeline.shared.socket_shape import load_of, regions_of
+from limbfit.study import load_study
+
+THIGH = "transfemoral"
+
+
+def thigh(seed: int) -> Limb:
+    return make_limb(seed, kind=THIGH)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_its_sizes_are_those_of_a_thigh_and_its_sites_lie_deep_over_the_femur(seed: int) -> None:
+    limb = thigh(seed)
+    anatomy = true_anatomy(limb, 6.0)
+    assert list(anatomy.bones) == ["femur"]
+    assert 1.9 < anatomy.skin.volume / 1e6 < 3.5  # litres
+    femur = anatomy.bones["femur"].points
+    assert anatomy.height(femur).max() == pytest.approx(6.0, abs=1e-6)  # out of the cut
+    assert 30.0 < limb.to_limb(femur)[:, 2].min() < 50.0  # padded by muscle
+    assert limb.skin(femur[anatomy.height(femur) < 0.0]).max() < -25.0
+    sites = true_sites(limb, seed)
+    assert all(site.thickness > 20.0 and site.depth <= SAFE_SHARE * site.thickness for site in sites)
+    positions = np.array([site.position for site in sites])
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    assert apart[~np.eye(len(sites), dtype=bool)].min() > 25.0
+    outward = {name: -np.mean([s.axis for s in sites if s.region == name], axis=0) for name in regions(sites)}
+    sides = outward["anterior"], -outward["posterior"], outward["medial"], -outward["lateral"]
+    for side, direction in zip(sides, np.repeat([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]], 2, axis=0), strict=True):
+        assert side @ (limb.rotation @ direction) > 0.8
+
+
+def regions(sites) -> set[str]:
+    return {site.region for site in sites}
+
+
+def test_the_default_segmentation_finds_its_femur_and_calls_it_no_tibia() -> None:
+    limb = thigh(0)
+    grid = make_grid(limb, "coarse", 0)
+    labels = segment(image_of(limb, grid, seed=0), bias_correction=False)
+    assert labels.bone_names == ("bone-1",)
+    points = grid.points(*(slice(0, size) for size in grid.shape))
+    bone, whole = limb.bone("femur", points) < 0, limb.skin(points) < 0
+    for mask, true in ((labels.mask("bone-1"), bone), (labels.array > 0, whole)):
+        assert 2.0 * (mask & true).sum() / (mask.sum() + true.sum()) > 0.98  # Dice
+
+
+def test_its_socket_presses_in_where_it_says() -> None:
+    anatomy, liner = true_anatomy(thigh(0), 8.0), outer_surface(thigh(0), LINER_MM, 8.0)
+    socket, areas = make_socket(anatomy, liner, THIGH)
+    assert -40.0 < anatomy.height(socket.points[socket.brim]).mean() < -25.0
+    depth = socket.offset(liner)
+    for area in areas:
+        near = np.linalg.norm(socket.points - area.position, axis=1).argmin()
+        assert depth[near] == pytest.approx(area.depth_mm + 1.8, abs=1.2)  # and 3 % of some 60 mm
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"limb": "forearm"}, "unknown limb 'forearm'"),
+        ({"limb": THIGH, "tendon": True}, "no patellar tendon"),
+    ],
+)
+def test_a_limb_that_there_is_not_is_refused(tmp_path: Path, keywords, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make_phantom(tmp_path / "study", mapping=cubic_law, **keywords)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_its_study_needs_no_tibia(tmp_path: Path) -> None:
+    truth = make_phantom(tmp_path / "study", limb=THIGH, socket=True, sites=["05"], mapping=cubic_law)
+    assert truth["limb"]["kind"] == THIGH
+    assert "tibia" not in json.dumps(truth)
+    assert "transfemoral residuum" in (tmp_path / "study" / "study.toml").read_text()
+    study = load_study(tmp_path / "study")
+    assert study.socket.side == "right"
+    anatomy = true_anatomy(thigh(0), 8.0)
+    names = set(regions_of(study, anatomy))
+    assert {"anterior proximal", "medial distal", "lateral middle"} <= names
+    assert not {name for name in names if "tibia" in name or "patella" in name}
+    socket, _ = make_socket(anatomy, outer_surface(thigh(0), LINER_MM, 8.0), THIGH)
+    force, moment, point = load_of(study, study.socket.loads[0], anatomy, socket)
+    assert force == pytest.approx(800.0 * anatomy.cut_normal)
+    assert not moment.any()
+    assert point == pytest.approx(socket.points[socket.brim].mean(axis=0), abs=5.0)
+
+
+@pytest.mark.slow
+def test_a_thigh_is_identified_from_its_folder_to_its_report(tmp_path: Path) -> None:
+    truth = make_phantom(tmp_path / "study", limb=THIGH)
+    assert [site["name"] for site in truth["sites"]] == sorted(DETAIL_SITES["coarse"])
+    study = load_study(tmp_path / "study")
+    run_study(study)
+    rows = json.loads((study.results / "predict" / "predict.json").read_text())["sites"]
+    assert [row["site"] for row in rows] == [site["name"] for site in truth["sites"]]
+    assert "tibia" not in (study.results / "report" / "report.html").read_text().lower()
