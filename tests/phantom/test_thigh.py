@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,10 @@ def test_a_thigh_is_identified_from_its_folder_to_its_report(tmp_path: Path) -> 
     assert [site["name"] for site in truth["sites"]] == sorted(DETAIL_SITES["coarse"])
     study = load_study(tmp_path / "study")
     run_study(study)
-    rows = json.loads((study.results / "predict" / "predict.json").read_text())["sites"]
-    assert [row["site"] for row in rows] == [site["name"] for site in truth["sites"]]
-    assert "tibia" not in (study.results / "report" / "report.html").read_text().lower()
+    predicted = json.loads((study.results / "predict" / "predict.json").read_text())
+    assert [row["site"] for row in predicted["sites"]] == [site["name"] for site in truth["sites"]]
+    assert predicted["mean_error_heldout_percent"] < 10.0
+    report = (study.results / "report" / "report.html").read_text()
+    assert not re.search(
+        r"\b(tibia|fibula|patella|knee)\b", report, re.IGNORECASE
+    )  # people's may be transtibial
