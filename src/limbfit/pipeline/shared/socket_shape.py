@@ -144,21 +144,43 @@ def load_of(
     StudyError
         Where the knee centre or the side of the limb must be known and is not.
     """
-    stated, standard = load.point, STANDARD_LOADS[load.preset] if load.preset else None
-    if stated is None and standard and standard.beside_knee and knee_centre(anatomy) is None:
-        raise StudyError(
-            f"{load.preset!r} passes beside the knee centre, which is not known: no bone is named tibia",
-            file=study.file,
-            place=f"socket.loads.{load.name}.preset",
-            remedy='state point, beside which it passes (LPS, mm), or force_N, or take "single stance"',
-        )
-    point = load_point(anatomy, socket.points[socket.brim]) if stated is None else np.array(stated)
-    if standard is None:
+    check_load(study, load, anatomy.bones)
+    brim = socket.points[socket.brim]
+    point = load_point(anatomy, brim) if load.point is None else np.array(load.point)
+    if load.preset is None:
         return np.array(load.force_N), np.array(load.moment_Nmm), point
-    weight = study.socket.body_weight_N
+    standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
     with blaming(study):
         known = directions(anatomy, study.socket.side)
         return standard.force(weight, known), standard.moment(weight, known), point
+
+
+def check_load(study: Study, load: SocketLoadTable, bones: Collection[str]) -> None:
+    """That what a preset needs is known of a limb whose bones have these names.
+
+    Raises
+    ------
+    StudyError
+        Where the knee centre or the side of the limb must be known and is not.
+    """
+    if load.preset is None:
+        return
+    standard, place = STANDARD_LOADS[load.preset], f"socket.loads.{load.name}.preset"
+    named = [any(bone in name.lower() for name in bones) for bone in ("tibia", "fibula")]
+    if standard.beside_knee and load.point is None and not named[0]:
+        raise StudyError(
+            f"{load.preset!r} passes beside the knee centre, which is not known: no bone is named tibia",
+            file=study.file,
+            place=place,
+            remedy='state point, beside which it passes (LPS, mm), or force_N, or take "single stance"',
+        )
+    if (standard.medial or standard.inside_mm) and study.socket.side is None and not all(named):
+        raise StudyError(
+            "medial and lateral are not known: no bones are named tibia and fibula",
+            file=study.file,
+            place=place,
+            remedy='state socket.side ("left" or "right")',
+        )
 
 
 def check_at_rest(study: Study) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ...study import ClampsTable, Record, Study
 from ...traces import Regularised, SurfaceMotion, Trace
 from ..shared.context import Listener, Progress, quiet
 from ..shared.limb import LimbGeometry
-from ..shared.socket_shape import check_regions, loadable_socket, regions_of
+from ..shared.socket_shape import check_load, check_regions, loadable_socket, regions_of
 from ..shared.store import Store
 from ..stages.curves import Beside, read_observed, read_record
 from ..stages.inputs import check_labels, marked_image, study_image, study_labels
@@ -43,7 +43,8 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     facts = list(study.notes)
     listener(Progress("check", 0, 2, "geometry"))
     given, notes = given_anatomy(study) if study.surfaces is not None else (None, ())
-    facts += _image_facts(study) if given is None else [*notes, *_surface_facts(study, given)]
+    told, bones = _image_facts(study) if given is None else ([*notes, *_surface_facts(study, given)], None)
+    facts += told
     for name, table in study.used_indenters.items():
         if table.file is not None:
             here = table.model_copy(update={"file": study.path(table.file)})
@@ -79,7 +80,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
             "(limbfit run --until sites, then check again)"
         )
     if "socket" in study.model_fields_set:
-        facts += _socket_facts(study, anatomy)
+        facts += _socket_facts(study, anatomy, bones)
     if study.clamps is not None:
         facts.append(_clamps_fact(study, study.clamps, limb))
     refused = refused_commands(study, limb)
@@ -139,20 +140,22 @@ def _limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
     return LimbGeometry.stored(store)
 
 
-def _image_facts(study: Study) -> list[str]:
+def _image_facts(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
+    """Facts, and the names of the bones where a label map is given."""
     volume = study_image(study)
     facts = [_sampling("image", volume), *(f"warning: image: {note}" for note in volume.notes)]
     marked = marked_image(study)
     if marked is not None:
         facts.append(_sampling("image with markers", marked))
         facts += [f"warning: image with markers: {note}" for note in marked.notes]
-    given = study_labels(study, volume)
+    given, bones = study_labels(study, volume), None
     if given is not None:
         labels, notes = given
         check_labels(study, labels)
+        bones = labels.bone_names
         facts.append("corrected labels: " + ", ".join(labels.names.values()))
         facts += [f"label map: {note}" for note in notes]
-    return facts
+    return facts, bones
 
 
 def _clamps_fact(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -> str:
@@ -166,8 +169,11 @@ def _clamps_fact(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -
     return f"{said}; {', '.join(held)} meet the skin"
 
 
-def _socket_facts(study: Study, anatomy: Anatomy | None) -> list[str]:
-    """What ``[socket]`` says; where the limb is known, the socket around its bare skin."""
+def _socket_facts(study: Study, anatomy: Anatomy | None, bones: Collection[str] | None) -> list[str]:
+    """What ``[socket]`` says; where the limb is known, the socket around its bare skin.
+
+    Loads are checked where at least the names of the ``bones`` are known.
+    """
     table = study.socket
     liner = f"a liner of {table.liner.thickness_mm:g} mm" if table.liner.thickness_mm else "no liner"
     travel = f" over {table.travel_mm:g} mm" if table.travel_mm else ""
@@ -176,6 +182,9 @@ def _socket_facts(study: Study, anatomy: Anatomy | None) -> list[str]:
         f"{', '.join(load.name for load in table.loads) or 'no load'}; limb meshed at {table.edge_mm:g} mm"
     ]
     if anatomy is None:
+        if bones is not None:
+            for load in table.loads:
+                check_load(study, load, bones)
         return [
             *facts,
             "the socket's shape is checked after limbfit run --until sites",
