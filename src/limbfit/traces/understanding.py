@@ -47,6 +47,7 @@ _DRIFT_SD = 5.0
 _WARMING = (0.05, 0.1, 0.2, 0.4, 0.8)  # of the record: times with which a warming may fade
 _BENT = 16.0  # of squared misfit in variances, by which a straight drift is worse
 _ONSET_S = 0.5
+_LASTS_S = 0.1
 _MOST_DRIFT = 0.3  # of the peak force: more is no sensor to correct
 _PRELOAD_SHARE = 0.05  # of the peak force
 _START_FORCE_SHARE = 0.25  # of the peak force, where there are too few samples for a slope
@@ -185,8 +186,12 @@ def _spikes(values: Array) -> Bools:
 
 def _without_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
     """The record without the jumps of its force: the onset is seen in it, whichever side of one is right."""
-    jumped = sum(size * (trace.time_s >= at) for at, size in steps)
-    return replace(trace, force_N=trace.force_N - jumped)
+    force = trace.force_N.copy()
+    for at, size in steps:
+        change = np.diff(np.interp([at - _LASTS_S, at + _LASTS_S], trace.time_s, trace.force_N))[0]
+        if change / size > 0.5:  # one that lasts, not a dropout
+            force -= size * (trace.time_s >= at)
+    return replace(trace, force_N=force)
 
 
 def _ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
