@@ -11,7 +11,7 @@ from blocks import boundary
 from limbfit import History, Indenter, OgdenQLV, Problem
 from limbfit.bench.blocks import SIX_TETS, boxes, upright
 from limbfit.errors import ProblemError
-from limbfit.fe import StepControl, solve
+from limbfit.fe import StepControl, System, solve
 from limbfit.indentation import clamped, clamping_pins
 from limbfit.mesh import Mesh
 from limbfit.study import ClampsTable
@@ -94,6 +94,42 @@ def test_a_test_pin_along_the_limb_has_no_ring():
     problem = site(pipe(), axis=(-0.1, 0.0, -1.0))
     with pytest.raises(ProblemError, match="points along the limb"):
         pins_of(problem)
+
+
+def clamped_pipe() -> Problem:
+    """Pins of 8 N on stiff tissue, before the test pin touches it."""
+    table = ClampsTable(force_N=8.0)
+    problem = site(pipe())
+    later = replace(problem, history=problem.history.later(table.begun_s), touch_down_s=table.begun_s)
+    return clamped(later, UP, table)
+
+
+def test_a_direction_is_taken_as_far_as_its_contact_is_foreseen():
+    """A twentieth of a pin's width, 1 mm, wherever something moves; all where no force drives a body."""
+    problem = clamped_pipe()
+    for stated, bounded in ((problem, True), (site(problem.mesh), False)):
+        system = System(stated)
+        assert system.bodies is not None
+        direction = np.zeros((system.rows, 3))
+        for row in (-2, 0):  # the last pin, and a node
+            for way, share in ((0.5, 1.0), (-4.0, 0.25), (160.0, 1.0 / 160.0)):
+                direction[row, 1] = way
+                found = system.bodies.trusted_share(direction)
+                assert found == pytest.approx(share if bounded else 1.0)
+            direction[:] = 0.0
+
+
+def test_the_bound_of_a_step_changes_no_equilibrium(monkeypatch):
+    problem = clamped_pipe()
+    control = StepControl(times=(1.0, 2.0), tolerance=1e-6, penalty=300.0, hold_penalty=True)
+    bounded = solve(problem, control, store="none")
+    monkeypatch.setattr("limbfit.fe.bodies.TRUSTED", np.inf)
+    free = solve(problem, control, store="none")
+    assert bounded.completed
+    assert free.completed
+    assert (bounded.coordinates[-1, 1:, 2] > 1.0).all()
+    np.testing.assert_allclose(bounded.coordinates[-1], free.coordinates[-1], atol=1e-5)
+    np.testing.assert_allclose(bounded.reactions[-1, 1:, 2], 8.0, rtol=1e-5)
 
 
 @pytest.mark.slow

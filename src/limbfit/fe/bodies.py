@@ -32,6 +32,8 @@ Index = NDArray[np.int32]
 HOLDING = 100.0
 # Stiffness of a coordinate whose body touches nothing, over that of the tissue against a body of its width.
 GROUNDING = 0.1
+# Move of a body that a force drives over its width, up to which a linear model foresees its contact.
+TRUSTED = 0.05
 # Gap over a body's width up to which it may touch what is beside its way.
 NEAR = 0.05
 
@@ -174,6 +176,14 @@ class Bodies:
             if len(body.free):
                 u = impose_on(body, u, value, forced)
         return u
+
+    def trusted_share(self, direction: Array) -> float:
+        """The share, up to 1, of a change ``direction (r, 3)`` of ``u`` for which the linear model of contact
+        is trusted; all of it where no force drives a body."""
+        widths = [body.start.width for body in self.all if len(body.free)]
+        if not widths:
+            return 1.0
+        return 1.0 / max(1.0, float(np.abs(direction).max()) / (TRUSTED * min(widths)))
 
     def evaluate(
         self, u: Array, drives: Drives, penalty: float, flat_from: float, grips: Sequence[Grip | None],

@@ -4,6 +4,9 @@ Where the search can use a small part of a direction only, the model that gave i
 far: the next ones are damped by the stiffness of shear (`convexity`), more after every short step and less
 after every full one, as in a trust region (Levenberg 1944, Marquardt 1963).
 
+Bodies that a force drives would follow a direction by millimetres in one step, but which points will touch is
+foreseen on flat faces and for small moves only.  So their moves are bounded, by a share of their width.
+
 A guess lies deep in the indenter, and a rounded edge that presses on it that hard makes a tangent of large
 negative eigenvalues, pressure over radius, which say nothing of the equilibrium.  So far from it the edge is
 taken as flat there (`Increment.flat_from`).
@@ -109,6 +112,8 @@ def equilibrate(
         last = norm
         if norm <= NEAR * scale:
             evaluate.exactly()
+        if system.bodies is not None:
+            direction = system.bodies.trusted_share(direction) * direction
         evaluate.foresee(u, direction)
         going_on = control.tangent or forcing > sufficient
         found = _line_search(evaluate, u, here, direction, control.max_backtracks, going_on)
