@@ -216,7 +216,7 @@ READ: dict[str, str] = {
     **{key: "study/socket.py" for key in KEYS if key.startswith("socket.liner.")},
     **dict.fromkeys(
         (
-            *("socket.friction", "socket.edge_mm", "socket.donning", "socket.travel_mm"),
+            *("socket.friction", "socket.donning", "socket.travel_mm"),
             *("socket.donning_s", "socket.hold_s", "socket.loads.duration_s", "socket.loads.hold_s"),
             "socket.liner.thickness_mm",
         ),

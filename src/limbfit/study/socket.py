@@ -88,7 +88,8 @@ class SocketTable(TomlTable):
     """A socket from a file or rectified from the limb; every key has a default.
 
     ``trim_mm`` is below the top of the tibia, or below the proximal cut by more where no bone is a tibia.
-    ``edge_mm`` is the edge length of the limb's mesh where the socket touches, ``face_edge_mm`` the socket's.
+    ``edge_mm`` is the edge length of the limb's mesh where the socket touches, by default by the size of the
+    socket; ``face_edge_mm`` the socket's.
     """
 
     file: Path | None = None
@@ -104,7 +105,7 @@ class SocketTable(TomlTable):
     distal: Literal["clearance", "bearing"] = "clearance"
     distal_clearance_mm: Annotated[float, Field(ge=0, le=40)] = 5.0
     face_edge_mm: Annotated[float, Field(ge=2, le=8)] = 4.0
-    edge_mm: Annotated[float, Field(ge=3, le=30)] = 10.0
+    edge_mm: Annotated[float, Field(ge=3, le=30)] | None = None
     liner: LinerTable = LinerTable()
     friction: Friction = 0.5
     donning: Literal["growth", "insertion"] = "growth"
@@ -138,6 +139,6 @@ class SocketTable(TomlTable):
 
     @model_validator(mode="after")
     def _mesh_is_no_finer_than_the_face(self) -> SocketTable:
-        if self.edge_mm < 0.5 * self.face_edge_mm:
+        if self.edge_mm is not None and self.edge_mm < 0.5 * self.face_edge_mm:
             raise ValueError("edge_mm is shorter than half of face_edge_mm: the face would show its facets")
         return self

@@ -42,7 +42,7 @@ from ..shared.artefacts import digest, file_digest, read_json
 from ..shared.context import Context
 from ..shared.kept import Begun, Kept, Made
 from ..shared.simulations import fibres_of
-from ..shared.socket_shape import covered_regions, load_of, regions_of
+from ..shared.socket_shape import covered_regions, load_of, mesh_edge_mm, regions_of
 from ..shared.sources import code_digest
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
 from .socket_intervals import Spread, spread_facts
@@ -98,12 +98,12 @@ class SocketLimb:
         if not is_meshed(file):
             context.tell(name, 0, 0, "a mesh of the whole limb")
             fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
-            mesh, report = mesh_limb(self.outer, self._settings, max(fine, 0.0), self.depth)
-            keep_mesh(mesh, report, self._settings, file)
+            settings = self._settings(mesh_edge_mm(self.study, brim))
+            mesh, report = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
+            keep_mesh(mesh, report, settings, file)
         return read_vtu(file), read_json(file.with_suffix(".json"))
 
-    @property
-    def _settings(self) -> MeshSettings:
+    def _settings(self, edge_mm: float) -> MeshSettings:
         table, settings = self.study.socket, mesh_settings(self.study)
         layers = settings.layers
         if table.liner.thickness_mm:
@@ -112,8 +112,8 @@ class SocketLimb:
             settings,
             element="tet10",
             layers=layers,
-            edge_near_mm=table.edge_mm,
-            edge_far_mm=max(FAR * table.edge_mm, settings.edge_far_mm),
+            edge_near_mm=edge_mm,
+            edge_far_mm=max(FAR * edge_mm, settings.edge_far_mm),
             growth=GROWTH,
             flatness=FLATNESS,
         )

@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 
 BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
 BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
+# Edges of a limb's mesh under a socket whose face is no larger than this; larger ones have as many edges.
+EDGE_MM, FACE_MM2 = 10.0, 6e4
 
 
 def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
@@ -65,6 +67,16 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
             spare_mm=table.liner.thickness_mm if outer is anatomy.skin else 0.0,
         )
         return socket
+
+
+def mesh_edge_mm(study: Study, socket: Socket) -> float:
+    """Edge length of the limb's mesh under a socket: as stated, else 10 mm, and longer under a large socket.
+
+    A factorisation costs about the fourth power of the number of edges along a limb, and a thigh has up to
+    three times the skin of a shank: so it has as many elements, not elements of the same size.
+    """
+    stated = study.socket.edge_mm
+    return EDGE_MM * max(1.0, socket.surface.area / FACE_MM2) ** 0.5 if stated is None else stated
 
 
 def recipe_of(study: Study, anatomy: Anatomy) -> Recipe:

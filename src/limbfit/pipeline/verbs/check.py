@@ -177,9 +177,10 @@ def _socket_facts(study: Study, anatomy: Anatomy | None, bones: Collection[str] 
     table = study.socket
     liner = f"a liner of {table.liner.thickness_mm:g} mm" if table.liner.thickness_mm else "no liner"
     travel = f" over {table.travel_mm:g} mm" if table.travel_mm else ""
+    meshed = f"; limb meshed at {table.edge_mm:g} mm" if table.edge_mm else ""
     facts = [
         f"socket: {liner}, friction {table.friction}, donning by {table.donning}{travel}; "
-        f"{', '.join(load.name for load in table.loads) or 'no load'}; limb meshed at {table.edge_mm:g} mm"
+        f"{', '.join(load.name for load in table.loads) or 'no load'}{meshed}"
     ]
     if anatomy is None:
         if bones is not None:
