@@ -9,15 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array
 from .fe import Problem, State, Step, System
 from .fe.history import Memory
 from .fe.kernel.laws import Laws
 from .fe.observables import contact_pressure, element_fields, nodal_average, von_mises
 from .mesh import write_pvd, write_vtu
 
-Array = NDArray[np.float64]
 KPA = 1e-3  # MPa
 
 

@@ -10,12 +10,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array
 from .errors import InputError
 from .extensions import Registry
 
-Array = NDArray[np.float64]
 Parameters = dict[str, dict[str, float]]  # by tissue and key
 
 KPA = 1e-3  # MPa

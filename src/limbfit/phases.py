@@ -19,9 +19,9 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from .arrays import Array
+
 Kind = Literal["approach", "load", "hold", "unload"]
 
 # Of the points of a record those of its holds beside the others, and the power of its number that a point's

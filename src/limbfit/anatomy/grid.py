@@ -19,9 +19,8 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..errors import ImageError, LabelError
-
-Array = NDArray[np.float64]
 
 SOFT_TISSUE = "soft tissue"
 FAT = "fat"  # under the skin, the skin included

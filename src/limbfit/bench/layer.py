@@ -12,16 +12,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..fe import History, StepControl
 from ..fe.history import Memory
 from ..fe.interpolation import interpolate
 from ..fe.motion import Drives
 from ..fe.solution.control import schedule
 from ..fe.solution.schedule import foresee
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

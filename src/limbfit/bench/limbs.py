@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.grid import Grid
 from ..anatomy.imaging import read_volume
@@ -15,11 +14,10 @@ from ..anatomy.segmentation.segmentation import segment
 from ..anatomy.segmentation.voxels import label_map
 from ..anatomy.sites.sites import indenter_axis
 from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
+from ..arrays import Array
 from ..errors import InputError
 from ..phantom.geometry import make_limb
 from ..phantom.mri import make_grid
-
-Array = NDArray[np.float64]
 
 SEEDS = (0, 1, 2)
 SLAB = 16

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..fe import Indenter, Problem, StepControl
 from ..febio import FebioLog, read_feb, read_log, to_problem
 
-Array = NDArray[np.float64]
 Tell = Callable[[int, int, str], None]  # done, of how many, what
 
 FOLDER = Path("shared") / "reference"

@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..febio import FebioLog, read_log, run_feb
 
-Array = NDArray[np.float64]
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
 NORMALS = "FEBio's contact acts along the skin's normal, limbfit's along the body's"
 STICKS = "FEBio anchors a point where the first iteration of a step puts it"

@@ -9,11 +9,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..fe import State, System
 from ..fe.kernel.laws import Laws
 from ..fe.observables import element_fields
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SHEAR_LEVELS = (0.25, 0.5, 0.75)  # of which the sheared volume is told

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..execution import count_usable_cores
 from ..fe import History, Motion, Problem, RigidBody, SmoothSurface, StepControl
@@ -15,8 +15,6 @@ from ..fe.materials import Material
 from ..fe.motion import COORDINATES
 from ..mesh import Mesh
 from ..socket import Socket
-
-Array = NDArray[np.float64]
 
 ELEMENT = "tet10p0"
 OUTER = "skin"  # the face set that the socket may touch, the liner's where there is one

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..fe import (
     Checkpoints,
     Problem,
@@ -25,7 +26,6 @@ from ..fe.kernel.laws import Laws
 from .inside import Strains
 from .model import SocketFit, socket_steps
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 WHOLE, SETTLING = "the limb", "settling"
 LITTLE = 1e-4  # of a parameter: how far it is moved where pressures are differentiated

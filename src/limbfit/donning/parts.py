@@ -7,13 +7,12 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..fe import Snapshot
 from .inside import Strains
 from .outcome import DonnedPart, Held, Patch, SocketStep
 
-Array = NDArray[np.float64]
 Facts = dict[str, Any]
 
 SOLVER = "solver."  # its arrays begin with it

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import History, Pressure, Problem, Result, Step, StepControl, solve
 from ..fe.materials import Material
 from ..mesh import Mesh
 from .model import ELEMENT, OUTER, most_threads
-
-Array = NDArray[np.float64]
 
 LEVELS = 32  # of pressure, up to the largest: what a face has is rounded to them
 COMING_ON, HELD = 6, 4  # steps

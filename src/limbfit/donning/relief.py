@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-Array = NDArray[np.float64]
+from ..arrays import Array
 
 OWN_PER_MM = 0.15  # guess: by how much a region's own depth changes the logarithm of its pressure
 LEAST_KPA = 1.0  # pressures below this count as this

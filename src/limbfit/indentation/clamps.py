@@ -12,12 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Motion, Problem, RigidBody
 from ..fe.contact.contact import ContactSurface, touching_offset
 from ..study import ClampsTable
-
-Array = NDArray[np.float64]
 
 
 def clamping_pins(

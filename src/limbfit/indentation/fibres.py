@@ -15,13 +15,13 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import ELEMENTS
 from ..fe.kernel.elements import reference_gradients
 from ..mesh import Mesh
 from ..study import Vector
 
-Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Direction = Vector | Literal["flow"]
 DISTAL_MM = 10.0  # of the bone's far end, along the limb, that fibres run to

@@ -14,11 +14,11 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Result, System, linear_solver, tangent_at_rest
 from ..mesh import Mesh
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # Of the cut, what lies this straight below the indenter is held, for deep tissue hangs on bone; the sides may

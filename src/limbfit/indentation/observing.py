@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Result
 from ..fe.interpolation import interpolate
@@ -21,7 +22,6 @@ from .sites import SiteModel, read_indenter
 from .skin_points import skin_points
 from .waves import WavePlace, as_vector, wave_places, wave_speeds
 
-Array = NDArray[np.float64]
 OFF_SKIN_MM = 5.0  # farther from the skin than that is no point of it
 RINGS_MM, DIRECTIONS = (3.0, 8.0, 15.0), 8
 MOST_ASIDE = 0.25  # of a ring's radius: where the skin ends its nearest point is elsewhere

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..arrays import Array
 from ..fe import isochoric_stretch
 from ..mesh import Mesh
-
-Array = NDArray[np.float64]
 
 
 def prestretch_field(

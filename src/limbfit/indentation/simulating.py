@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import psutil
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..execution import count_usable_cores
 from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
 from ..fields import Animation, write_fields
@@ -30,8 +30,6 @@ from .sites import (
     materials_of,
     steps_of,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

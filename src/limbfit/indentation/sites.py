@@ -15,6 +15,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
+from ..arrays import Array
 from ..errors import ProblemError, SurfaceError
 from ..extensions import load_extensions
 from ..fe import (
@@ -39,7 +40,6 @@ from .neighbourhood import held_cut, neighbourhood
 from .prestretch import prestretch_field
 from .waves import WavePlace
 
-Array = NDArray[np.float64]
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
 # Of the solver's tolerance: it is one of the reactions of all pins, of which the test pin's is a small part.
 FINELY = 0.1

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..mesh import Gauge, Mesh
 from ..mesh.cells import linear_simplex, quadratic_simplex
 from ..shapes.closest_point import build_tree, closest_point
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

@@ -23,6 +23,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Material, Result
 from ..fe.history import Memory
@@ -30,8 +31,6 @@ from ..fe.kernel.laws import Laws
 from ..fe.kernel.places import Places, elastic_at
 from ..mesh import Mesh, gauges_along, locate
 from ..study import Vector
-
-Array = NDArray[np.float64]
 
 DENSITY = 1000.0  # kg/m^3, as elastography takes it for all soft tissue
 # A speed is the mean over a disc across the beam, around its place and in the tissue alone: about what

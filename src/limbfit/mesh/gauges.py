@@ -12,11 +12,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from .cells import linear_simplex, quadratic_simplex
 from .volume import Mesh
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _ON_EDGE = 1e-9  # of a triangle's own coordinates: a line through an edge meets the faces on both sides

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from .volume import Mesh
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 NEAREST = 24  # cells that are looked at, by their middles

@@ -9,8 +9,9 @@ from typing import cast
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Problem, StepControl, System, texts_of
 from ..fe import solve as simulate
@@ -24,7 +25,6 @@ from ..identify.uncertainty.noise import estimate_curve_noise
 from ..identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 from .solution import Solution, announce_compilation, new_axes, solve
 
-Array = NDArray[np.float64]
 Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s; force (n,) N, or displacement, mm, under a force
 WIDEST = 100.0  # of default bounds, over the start
 

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SiteError
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 500.0
 AFTER_S = 0.4

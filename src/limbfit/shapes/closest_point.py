@@ -10,7 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ..arrays import Array
+
 Tree = tuple[Array, NDArray[np.int64], NDArray[np.int64]]
 LEAF = 4
 INSIDE = 0  # features of a triangle: 0 its inside, 1 + i the edge from corner i, 4 + i corner i

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ..arrays import Array
+
 Indices = NDArray[np.int64]
 
 STEEPEST_DEG = 68.0  # of a face: the skin under a punch does not reach what is steeper

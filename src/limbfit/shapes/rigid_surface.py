@@ -13,11 +13,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from .closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
 from .triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
 
-Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 # Corners (m, 3, 3); unit normals (m, 3) of faces and (m, 3, 3) of their edges and corners; directions
 # (m, 3, 3) of the straight edge that a corner lies on (zero: a true corner); trees over all and front faces.

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from .facets import Facets
 from .rigid_surface import RigidSurface
 
-Array = NDArray[np.float64]
 Distance = tuple[Array, Array, Array]
 
 # No mesh resolves the singularity of a sharp edge; this rounding over the width stands for it.

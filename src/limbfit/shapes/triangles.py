@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 
-Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 

@@ -7,13 +7,11 @@ from functools import cached_property
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 from ..errors import SurfaceError
-
-Array = NDArray[np.float64]
 
 STEEPEST_SIDE = 1.717  # slope of (1 - r^2/R^2)^3, over depth and radius, at 1/sqrt(5) of the radius
 OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some

@@ -10,10 +10,10 @@ from scipy.sparse import csr_array
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.surfaces import signed_distance
 from ..anatomy.surfaces.triangles import Surface, half_edges
+from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import LimbProfile
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CLEAR_MM = 0.5  # what is promised

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.frame import limb_frame
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 from ..errors import SurfaceError
 from .shape import measure_section, section
-
-Array = NDArray[np.float64]
 
 PLATEAU_MM = 8.0  # of the tibia's top: its mean is the knee centre
 

@@ -12,11 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from .landmarks import Directions
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

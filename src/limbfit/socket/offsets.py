@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import LimbProfile, radii, smooth
-
-Array = NDArray[np.float64]
 
 SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
 

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
@@ -21,10 +20,9 @@ from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 from ..errors import SurfaceError
 from .shape import measure_section, section
-
-Array = NDArray[np.float64]
 
 ANGLES = 180
 STEP_MM = 1.5  # between stations

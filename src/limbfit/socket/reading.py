@@ -20,13 +20,13 @@ from ..anatomy.surfaces.triangles import (
     half_edges,
     self_intersections,
 )
+from ..arrays import Array
 from ..errors import SurfaceError
 from .bones import refuse_bones
 from .clearance import cleared
 from .rays import Rays, hits_of, profile
 from .shape import Socket
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface, self_intersections
+from ..arrays import Array
 from ..errors import SurfaceError
 from .areas import Area, Zone
 from .clearance import cleared
@@ -20,7 +21,6 @@ from .rings import spaced, stitched
 from .shape import Socket
 from .trim import Trim, Trimmed, trimmed
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 FLARE_DEGREES = 60.0  # how far the brim turns outwards

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 from ..errors import SurfaceError
 from .landmarks import Directions, bone, knee_centre
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LEVELS = ("proximal", "middle", "distal")

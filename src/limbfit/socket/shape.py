@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.surfaces import signed_distance
 from ..anatomy.surfaces.triangles import Surface
+from ..arrays import Array
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

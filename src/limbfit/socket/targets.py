@@ -7,16 +7,14 @@ from dataclasses import dataclass, field
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..anatomy.surfaces.surfaces import Anatomy
+from ..arrays import Array
 from ..errors import SurfaceError
 from .areas import Zone
 from .regions import SkinRegion
 from .shape import Socket
-
-Array = NDArray[np.float64]
 
 PROMINENCES = ("tibial crest", "fibular head", "distal tibia", "distal fibula")
 REACH_MM = 18.0  # beyond a region: over what its pressure, or depth, goes over into what is beside it

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from ..anatomy.frame import Frame
+from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import LimbProfile
-
-Array = NDArray[np.float64]
 
 LEAST_MM = 30.0  # of face between the distal end and the brim, along the limb
 OFF_LIMB_MM = 30.0  # how far a point of a trimline may lie off the limb

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..anatomy.surfaces.triangles import Surface, self_intersections
+from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import hits_of
 from .shape import Socket
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BRIM_STEPS = 6  # of the half circle between the two sides

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-Array = NDArray[np.float64]
+from ..arrays import Array
+
 Bools = NDArray[np.bool_]
 
 _GAP = 10.0  # usual steps in time

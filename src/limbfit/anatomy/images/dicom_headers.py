@@ -19,13 +19,11 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.errors import InvalidDicomError
 
+from ...arrays import Array
 from ...errors import ImageError
-
-Array = NDArray[np.float64]
 
 _TAGS = [
     "SOPClassUID",

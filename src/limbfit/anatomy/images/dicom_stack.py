@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ImageError
 from .dicom_headers import SliceHeader
-
-Array = NDArray[np.float64]
 
 _VOLUMES = ("MR", "CT", "PT")
 _PLACE_TOLERANCE = 0.02  # of the slice spacing

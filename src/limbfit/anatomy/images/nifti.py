@@ -14,12 +14,10 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ...arrays import Array
 from ...errors import ImageError
-
-Array = NDArray[np.float64]
 
 _HEADER = 348  # bytes
 _CHUNK = 1 << 22

@@ -20,11 +20,11 @@ import numpy as np
 from contourpy import contour_generator
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import LabelError
 from ..grid import SOFT_TISSUE, Grid, LabelMap, Volume
 from .naming import flatten, plain_name
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 COLUMNS = ("label", "slice", "contour", "x_mm", "y_mm", "z_mm")

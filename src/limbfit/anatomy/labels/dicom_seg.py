@@ -14,12 +14,11 @@ import pydicom
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileDataset
 
+from ...arrays import Array
 from ...errors import LabelError
 from ..grid import Grid, LabelMap
 from ..images.dicom_headers import functional_group, quiet
 from .naming import flatten, plain_name
-
-Array = NDArray[np.float64]
 
 SEGMENTATION = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 _ON_SLICE = 0.01  # of the slice spacing

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
+from ...arrays import Array
 from ..ends import longest_axis
 from ..grid import SOFT_TISSUE, LabelMap
 from ..morphology import find_box
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LIMB = "limb"

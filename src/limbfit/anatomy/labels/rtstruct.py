@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pydicom
-from numpy.typing import NDArray
 from pydicom.dataset import FileDataset
 
+from ...arrays import Array
 from ...errors import LabelError
 from ..grid import LabelMap, Volume
 from ..images.dicom_headers import quiet
 from .contours import labels_of
 from .naming import plain_name
-
-Array = NDArray[np.float64]
 
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 

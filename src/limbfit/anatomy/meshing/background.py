@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ...arrays import Array
+
 Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import TET10_EDGES, Mesh
 from ...mesh.cells import quadratic_simplex
 from .curving import curved
 from .layered import bone_faces
 from .layers import LimbFields
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 ROUNDS = 4

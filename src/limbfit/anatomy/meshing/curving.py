@@ -8,10 +8,10 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import TET10_EDGES, Mesh, node_jacobians
 from .columns import Columns
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SMALLEST_JACOBIAN = 0.3  # of the straight element's, at every node

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import Mesh, boundary_faces
 from .background import BONE, LAYER
 from .columns import Columns, columns, even_steps
@@ -16,7 +17,6 @@ from .layers import Level, LimbFields
 from .projection import projected
 from .regions import interfaces, mesh_numbers, region_level, same_faces
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 RIM_LAYERS = 3.0  # depth below the cut plane, in thicknesses, over which the extrusion turns sideways

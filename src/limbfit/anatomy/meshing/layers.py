@@ -23,13 +23,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import SurfaceError
 from ..frame import Frame, limb_frame
 from ..surfaces.surfaces import Anatomy
 from ..surfaces.thickness import SLOPE, carried, sloped
 from ..surfaces.triangles import Surface, from_pyvista
 
-Array = NDArray[np.float64]
 Level = tuple[Array, Array]  # a signed function at points and its gradient there
 
 PROLONGATION_MM = 40.0

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..frame import limb_frame
 from ..surfaces.surfaces import Anatomy, capped
 from ..surfaces.thickness import carried
 from ..surfaces.triangles import Surface, bodies, from_pyvista
 from .layers import prolonged, signed_distance
 
-Array = NDArray[np.float64]
 SPACING_MM = 3.0  # of the grid on which the surface is contoured
 EDGE_MM = 4.0  # of its triangles
 

@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ..surfaces.surfaces import Anatomy
@@ -48,7 +49,6 @@ from .smoothing import polished
 from .thinbones import refined_at_bones
 from .untangling import inverted, narrowest, repaired, unrepaired, untangled
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SURFACES = (PLANE, LAYER, BONE)

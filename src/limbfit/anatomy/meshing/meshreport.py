@@ -9,6 +9,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import Mesh, MeshQuality, dihedral_angles, quality
 from ..surfaces.surfaces import Anatomy, Surface
 from .layered import inner_faces
@@ -17,7 +18,6 @@ from .regions import interfaces, region_level
 from .thinbones import bone_warnings
 from .untangling import Repair
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import dihedral_angles
 from .background import volumes
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
 

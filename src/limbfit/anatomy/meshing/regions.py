@@ -17,13 +17,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import SurfaceError
 from ...mesh import Mesh, boundary_faces
 from ..surfaces.triangles import Surface
 from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refined
 from .layers import Level, LimbFields, box_distance, box_samples, signed_distance
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there

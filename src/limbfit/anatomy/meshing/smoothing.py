@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import Mesh
 from ..surfaces.triangles import Surface
 from .background import Field
@@ -15,7 +16,6 @@ from .layers import LimbFields
 from .projection import guarded, projected
 from .regions import interfaces, region_level
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 GOOD_DEG = 9.0

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ...arrays import Array
 from ...mesh import Mesh
 from .background import LONGEST_EDGE, TetGrid, refined
 from .layered import bone_faces
 from .layers import LimbFields, signed_distance
-
-Array = NDArray[np.float64]
 
 PROBE = 1.4  # of the spacing: how far below a bone's surface the depth is measured
 FLANK = 0.4  # of that way: a lesser depth is that below the bone's far side; with PROBE, bone thinner than 2

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import Mesh, node_jacobians
 from ..frame import Frame
 from .background import volumes
@@ -19,7 +20,6 @@ from .columns import Columns
 from .layers import LimbFields, signed_distance
 from .smoothing import DIRECTIONS, held, put_back
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 

@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.ndimage import label as connected
 
+from ...arrays import Array
 from ...errors import LabelError
 from ..ends import proximal_end
 from ..grid import LabelMap
 from ..surfaces.extraction import signed_distance_to
-
-Array = NDArray[np.float64]
 
 _STEP_MM = 0.5  # of the cross-section
 _SMOOTH_MM = 1.0  # of its outline

@@ -16,7 +16,6 @@ from ..surfaces.surfaces import Anatomy, build_anatomy
 from ..surfaces.triangles import Surface
 from .amputation import amputate
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 VOXEL_MM = 1.0  # as fine as an image of a limb; build_anatomy smooths its steps away

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import cKDTree
 
+from ...arrays import Array
 from ...errors import ImageError
 from ..grid import Volume
 from ..morphology import dilate_mask, erode_mask, find_box
@@ -23,7 +24,6 @@ from ..segmentation.contrast import is_ct
 from ..surfaces.triangles import Surface, bodies, from_pyvista
 from .markers import Bump, bumps, cap_faces, near_cap
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
 

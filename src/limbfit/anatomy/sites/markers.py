@@ -15,11 +15,11 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ...arrays import Array
 from ...errors import SiteError
 from ..surfaces.search import Search
 from ..surfaces.triangles import Surface, half_edges
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 CAP_MARGIN_MM = 6.0

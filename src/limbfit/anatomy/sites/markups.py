@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import SiteError
-
-Array = NDArray[np.float64]
 
 # Slicer writes names; its older files numbers.
 _SIGNS = {

@@ -17,10 +17,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from ...arrays import Array
 from ...errors import ImageError
 from ..grid import Volume
-
-Array = NDArray[np.float64]
 
 _LEVELS_MM = (6.0, 2.5)  # of smoothing: the first reaches far, the second is exact
 _FINEST_MM = 1.0  # of voxels: finer ones are joined, as the smoothing does not show them

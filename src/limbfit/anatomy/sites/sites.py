@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import igl
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ...errors import SiteError
 from ..surfaces.surfaces import Anatomy
 from ..surfaces.triangles import Surface
-
-Array = NDArray[np.float64]
 
 FARTHEST_MM = 5.0
 SAMPLE_EDGE_MM = 1.0

@@ -20,12 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ...arrays import Array
 from ...errors import SurfaceError
 from .extraction import untangled
 from .surfaces import Anatomy, check_anatomy
 from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SMALL_MM = 10.0  # a hole that is no wider is filled

@@ -8,7 +8,8 @@ import igl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from ...arrays import Array
+
 Ints = NDArray[np.int64]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import Array
 from ...errors import LabelError, SurfaceError
 from ..ends import ProximalEnd, layer, proximal_end
 from ..grid import LabelMap
@@ -44,7 +45,6 @@ __all__ = [
     "write_surface",
 ]
 
-Array = NDArray[np.float64]
 
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut

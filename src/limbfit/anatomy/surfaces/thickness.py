@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.spatial import KDTree
 
+from ...arrays import Array
 from ...errors import LabelError, SurfaceError
 from ..grid import LabelMap
 from ..morphology import find_largest_piece, open_mask
@@ -17,7 +18,6 @@ from .extraction import extract_surface
 from .surfaces import Anatomy, signed_distance
 from .triangles import Surface, half_edges
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 FAT = "fat"

@@ -14,10 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ...arrays import Array
 from ...errors import SurfaceError
 from .search import Search
 
-Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are

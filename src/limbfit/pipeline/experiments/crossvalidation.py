@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import StudyError
 from ...identify.checks.crossvalidation import (
     Choice,
@@ -41,7 +41,6 @@ from ..shared.limb import LimbGeometry
 from ..shared.simulations import experiment_cache
 from ..stages.laboratory import Laboratory, unknowns
 
-Array = NDArray[np.float64]
 Runs = list[list[SiteResponse]]
 
 _CHECKED = 3  # fits whose optima are simulated in each of two rounds

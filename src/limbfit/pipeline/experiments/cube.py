@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ... import report
+from ...arrays import Array
 from ...errors import InputError, RunError
 from ...fe import History, Material, Problem, StepControl, Support, System, iterate
 from ...fe.kernel.laws import Laws
@@ -30,7 +30,6 @@ from ..shared.context import Context
 from ..shared.limb import LimbGeometry
 from .published import PUBLISHED
 
-Array = NDArray[np.float64]
 SIDE_MM, RAMP_S, HOLD_S = 10.0, 0.5, 1.0
 STEPS = 40  # in each ramp, and in the time held
 COMPRESSION_PERCENT = 20.0

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
+from ...arrays import Array
 from ...errors import InputError, RunError, StudyError
 from ...identify.checks.design import (
     Candidate,
@@ -31,8 +31,6 @@ from ..shared.context import Context
 from ..shared.limb import LimbGeometry
 from ..shared.simulations import curve_job, experiment_cache, model_of
 from ..stages.laboratory import unknowns
-
-Array = NDArray[np.float64]
 
 DEFAULT_SITES = 4
 DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go

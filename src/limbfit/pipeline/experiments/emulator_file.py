@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.emulator import Emulator
 from ..shared.artefacts import atomic
 
-Array = NDArray[np.float64]
 EMULATOR = "emulator.npz"
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.sites.under import tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
+from ...arrays import Array
 from ...errors import InputError, RunError
 from ...identify.checks.design import NoiseModel, compute_bounds_information
 from ...identify.checks.protocol import (
@@ -45,8 +45,6 @@ from ..shared.simulations import curve_job, experiment_cache, model_of, site_mod
 from ..stages.deviations import expected_share, is_modulus, surface_error_mm
 from ..stages.laboratory import unknowns
 from .design import DEEPEST_SHARE
-
-Array = NDArray[np.float64]
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
 READING_S = 1.0

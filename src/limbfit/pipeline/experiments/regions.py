@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...arrays import Array
 from ...errors import InputError, StudyError
 from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average_errors, fit_regions
 from ...identify.fit.objective import SiteResponse
@@ -22,7 +20,6 @@ from ..shared.simulations import SimulationCache, experiment_cache
 from ..stages.laboratory import Laboratory, groupings, unknowns
 from ..stages.records import SiteRecord, as_response, site_record
 
-Array = NDArray[np.float64]
 CHOICES = ("all", "fitted")
 
 

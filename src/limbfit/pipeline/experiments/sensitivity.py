@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...indentation import Parameters
 from ...shapes import OWN, SHAPES
@@ -32,7 +31,6 @@ from .variants import (
 )
 from .volumes import NO_VOLUME, volume_cache
 
-Array = NDArray[np.float64]
 FACTORS = (0.5, 2.0)
 KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
 

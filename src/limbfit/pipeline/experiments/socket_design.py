@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.frame import Frame, limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy, write_surface
 from ...anatomy.surfaces.triangles import Surface
+from ...arrays import Array
 from ...donning import outer_surface, press, pressed_problem
 from ...donning.model import OUTER
 from ...donning.relief import Relief, Trial
@@ -49,8 +49,6 @@ from ..shared.socket_shape import (
 )
 from ..shared.sources import code_digest
 from .socket_limb import SocketLimb, Wearing, wear_all, worn
-
-Array = NDArray[np.float64]
 
 NAME, PLACE = "socket_design", "socket.design"
 CONTROL, DESIGN, OPTIMISED = "control", "design", "optimised"

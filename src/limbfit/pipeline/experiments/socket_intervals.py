@@ -16,13 +16,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import LAWS, OGDEN, TissueLaw
 from ...study import Study
-
-Array = NDArray[np.float64]
 
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
 FRICTION = "friction"  # one that has no derivatives

@@ -14,6 +14,7 @@ from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.liner import under_liner
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...arrays import Array
 from ...donning import (
     SETTLING,
     Donned,
@@ -47,7 +48,6 @@ from ..shared.sources import code_digest
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
 from .socket_intervals import Spread, spread_facts
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LINER, MESH = "liner", "limb.vtu"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import build_space, group_by_kind
@@ -26,8 +26,6 @@ from ..stages.predict import Answer, answer_jobs
 from ..stages.records import as_response, as_searched, site_record
 from .uncertainty_record import Found, Predicted, write_results
 from .uncertainty_sources import Change, changes, variants
-
-Array = NDArray[np.float64]
 
 _NEAR = 4.0  # runs of the calibration whose error is at most this many times the least, plus 3 %, are used
 NAME = "uncertainty"

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from ...arrays import Array
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.uncertainty.estimator import FitSensitivity
@@ -31,8 +31,6 @@ from ..shared.artefacts import write_curves, write_json, write_table
 from ..stages.records import SiteRecord
 from .emulator_file import EMULATOR, write_runs
 from .uncertainty_sources import Change
-
-Array = NDArray[np.float64]
 
 _DRAWS = 1500  # written
 _SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "noise", "misfit")}

@@ -13,11 +13,11 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.meshing.meshing import MeshSettings
 from ...anatomy.sites.sites import indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import load_anatomy
+from ...arrays import Array
 from ...fe import ORDER_IN_TIME
 from ...indentation import SimulationJob, SiteModel
 from ...shapes import SHAPES
@@ -29,8 +29,6 @@ from ..stages.laboratory import error_of_own_mesh
 from ..stages.mesh import coarse_settings, mesh_settings
 from ..stages.records import SiteRecord, site_record
 from ..stages.remesh import meshed_models, scaled_edges
-
-Array = NDArray[np.float64]
 
 FINER = 0.75  # edges of the finer mesh, where the study has no coarse one to compare with
 MORE_STEPS = 2

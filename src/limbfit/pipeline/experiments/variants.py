@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
 from ...study import Indentation, Record, Site, Study
@@ -18,8 +18,6 @@ from ..shared.context import Context
 from ..shared.limb import LimbGeometry
 from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
 from ..stages.deviations import bone_distance_mm
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

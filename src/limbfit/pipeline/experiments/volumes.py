@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...fe import Result, solve
 from ...fe.kernel.laws import Laws
 from ...fe.observables import element_fields
@@ -15,7 +15,6 @@ from ...indentation import Simulation, SimulationJob, SiteModel, build_problem, 
 from ...mesh import read_vtu
 from ..shared.simulations import SimulationCache
 
-Array = NDArray[np.float64]
 NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
 ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
 

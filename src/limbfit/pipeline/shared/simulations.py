@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError, TraceError
 from ...execution import Executor
 from ...extensions import extensions_digest
@@ -34,7 +35,6 @@ from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS
 from .surface_points import ChosenPoints, chosen_points, read_motion
 
-Array = NDArray[np.float64]
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...anatomy.frame import limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...anatomy.surfaces.triangles import Surface
+from ...arrays import Array
 from ...errors import StudyError, SurfaceError
 from ...laws import FIBRED
 from ...socket import Area, Recipe, Socket, read_socket, rectified
@@ -25,8 +26,6 @@ from ...socket.trim import Trim
 from ...socket.wall import wall
 from ...study import Study
 from ...study.socket import SocketAreaTable, SocketLoadTable
-
-Array = NDArray[np.float64]
 
 BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
 BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import TraceError
 from ...indentation import OFF_SKIN_MM, as_vector, is_under, nearest_points, read_indenter
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion
 from .artefacts import read_curves, write_curves
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CURVES = "{}-surface"  # of a record

@@ -15,6 +15,7 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...identify.checks.plausibility import compute_layer_factor
 from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.noise import SiteNoise, estimate_record_noise
@@ -24,8 +25,6 @@ from ...study import Study
 from ..shared.context import Context
 from .curves import read_record
 from .records import SiteRecord
-
-Array = NDArray[np.float64]
 
 # Root mean square error of a tibia's surface near a site, over the edge of the image's voxels: 0.16 to 0.19
 # for synthetic patients (docs/uncertainty.md).

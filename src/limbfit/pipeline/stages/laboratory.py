@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.meshing.meshing import MeshSettings
+from ...arrays import Array
 from ...errors import RunError
 from ...identify.fit.calibration import calibrate, move_answer
 from ...identify.fit.correction import MeshCorrection
@@ -35,7 +35,6 @@ from .mesh import mesh_settings
 from .records import SiteRecord, all_compared, as_searched, is_moved, site_record
 from .remesh import meshed_meanwhile, meshed_where_possible, scaled_edges
 
-Array = NDArray[np.float64]
 Responses = list[SiteResponse]
 COARSER = 1.3  # times the edges: another mesh that tells the error of the study's own
 # In logarithms of parameters: another simulation's states save work as first guesses as far as NEAR, and half

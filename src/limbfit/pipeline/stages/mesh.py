@@ -9,21 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
 from ...anatomy.meshing.meshreport import MeshReport
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...anatomy.surfaces.thickness import read_thickness
+from ...arrays import Array
 from ...mesh import Mesh, write_vtu
 from ...study import Study
 from ..shared.artefacts import read_json, write_json
 from ..shared.context import Context
 from ..shared.store import COARSE
 from .files import THICKNESS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...identify.fit.objective import largest_magnitude
 from ...identify.uncertainty.noise import SiteNoise, compute_depth_slope, compute_skin_similarity
 from ...indentation import Simulation
-
-Array = NDArray[np.float64]
 
 _LEAST_DEPTH = 0.1  # of the largest: nearer to touch-down moves are not in proportion to the depth
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...identify.checks.leave_one_out import LogLinearModel
 from ...identify.checks.outliers import Exchange, approximate_response, find_outliers
 from ...identify.checks.plausibility import explain_warnings
@@ -19,8 +19,6 @@ from ..shared.context import Context
 from ..shared.simulations import SimulationCache
 from .plausible import stored_flags
 from .records import SiteRecord, as_response
-
-Array = NDArray[np.float64]
 
 
 def outlier_record(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse, largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
@@ -27,7 +27,6 @@ from .deviations import site_deviation
 from .outliers import outlier_record
 from .records import SiteRecord, all_compared, as_response, as_searched, site_record
 
-Array = NDArray[np.float64]
 _MISSING = {
     "force": "no force is predicted",
     "interval": "no 95 % interval and no check against the other sites",

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...fe import texts_of
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.uncertainty.noise import compute_depth_slope
@@ -22,8 +22,6 @@ from ..shared.simulations import recorded_model, surface_points
 from ..shared.surface_points import ChosenPoints, read_motion
 from .files import LAYERS, SMOOTHING, WAVES
 from .observed import Observed, SeenLayer, SeenSurface, SeenWave
-
-Array = NDArray[np.float64]
 
 
 def is_moved(study: Study) -> bool:

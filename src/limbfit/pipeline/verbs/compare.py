@@ -9,8 +9,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
 from ...fe import Problem, Result, System, solve
 from ...fe.solution.control import schedule
@@ -32,7 +32,6 @@ from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Listener, quiet
 from .simulate import Indentation, feb_settings, prepare_site, run_febio_site, site_problem
 
-Array = NDArray[np.float64]
 FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
 
 

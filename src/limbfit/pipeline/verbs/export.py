@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...bench.blocks import block_model, layered_block
 from ...errors import InputError
 from ...execution import SerialExecutor
@@ -32,8 +32,6 @@ from ..shared.context import Context, Listener, quiet
 from ..shared.store import Store
 from ..stages.records import site_record
 from .simulate import Indentation, feb_settings, known_parameters, prepare_site, site_problem
-
-Array = NDArray[np.float64]
 
 FITTED = "febio-optimize"
 FORMATS = ("feb", FITTED, "inp", "calculix")
