@@ -13,7 +13,7 @@ from limbfit.errors import InputError, StudyError
 from limbfit.fe import Contractile, OgdenQLV
 from limbfit.indentation import SimulationJob, build_problem, materials, simulate
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.experiments.socket_limb import SocketLimb
+from limbfit.pipeline.experiments.socket import check_socket
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import recorded_model
 from limbfit.pipeline.verbs.run import keys
@@ -85,7 +85,7 @@ def test_force_follows_the_active_stress_by_its_derivative(context):
 
 def test_a_socket_takes_no_muscle_that_contracts(context):
     with pytest.raises(InputError, match=r"study.toml: material.law: the limb in a socket is at rest"):
-        SocketLimb.of(context, "socket")
+        check_socket(context.study, None, {})
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.experiments.socket_limb import SocketLimb
+from limbfit.pipeline.experiments.socket import check_socket
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import job_digest, recorded_model
 from limbfit.pipeline.verbs.run import keys
@@ -69,7 +69,7 @@ def test_force_follows_tissue_by_its_derivatives(context):
 
 def test_a_socket_takes_none(context):
     with pytest.raises(InputError, match=r"study.toml: material.prestretch: the limb in a socket is at rest"):
-        SocketLimb.of(context, "socket")
+        check_socket(context.study, None, {})
 
 
 @pytest.mark.parametrize(

@@ -223,6 +223,10 @@ READ: dict[str, str] = {
         "pipeline/experiments/socket_limb.py",
     ),
     **{key: "pipeline/experiments/socket_design.py" for key in KEYS if key.startswith("socket.design.")},
+    **{
+        f"socket.design.{key}": "pipeline/shared/socket_shape.py"
+        for key in ("adapter_diameter_mm", "adapter_mm")
+    },
     **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},
 }
 # How else the tables above name them.

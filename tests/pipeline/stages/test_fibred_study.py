@@ -13,7 +13,7 @@ from limbfit.errors import InputError, StudyError
 from limbfit.fe import Fibred, OgdenQLV
 from limbfit.indentation import SimulationJob, build_problem, materials, simulate
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.experiments.cube import run_cube
+from limbfit.pipeline.experiments.cube import check_cube
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import fibres_of, recorded_model
 from limbfit.pipeline.stages.laboratory import groupings, unknowns
@@ -105,9 +105,9 @@ def test_what_cannot_be_is_said_in_a_line(tmp_path, fibres, law, what):
         study_of(tmp_path, fibres, law)
 
 
-def test_the_cube_takes_no_fibres(context, tmp_path):
+def test_the_cube_takes_no_fibres(context):
     with pytest.raises(InputError, match="the cube compares isotropic tissues"):
-        run_cube(context, tmp_path, compression_percent=10.0)
+        check_cube(context.study, None, {"compression_percent": 10.0})
 
 
 @pytest.mark.slow

@@ -8,14 +8,13 @@ import numpy as np
 
 from ...anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
 from ...anatomy.labels.contours import read_contours
-from ...anatomy.labels.naming import plain_name
 from ...anatomy.labels.placement import on_grid_of
 from ...anatomy.segmentation.one_limb import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study
 from ..shared.hand_labels import hand_labels
-from .files import labelled_file, naming
+from .files import labelled_file, labelled_regions, maps_fat, naming
 
 
 def study_image(study: Study) -> Volume:
@@ -73,16 +72,6 @@ def check_labels(study: Study, labels: LabelMap) -> None:
         labels.with_regions(labelled_regions(study))
         if maps_fat(study):
             check_fat(labels)
-
-
-def labelled_regions(study: Study) -> dict[str, str]:
-    """The label of each region that has one, by the region's name."""
-    return {one.name: plain_name(one.label) for one in study.geometry.regions if one.label is not None}
-
-
-def maps_fat(study: Study) -> bool:
-    """True if a layer is as thick as the fat in the label map."""
-    return any(layer.thickness == "map" for layer in study.geometry.model_layers)
 
 
 def automatic_labels(study: Study, volume: Volume) -> LabelMap:
