@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ...anatomy.labels.naming import plain_name
 from ...errors import InputError
 from ...study import Study
 from ..shared.hand_labels import hand_labels
@@ -23,16 +22,6 @@ def labelled_file(study: Study) -> Path:
     assert study.image is not None
     table = study.segmentation
     return study.path(table.labels or table.contours or hand_labels(study) or study.image.path)
-
-
-def labelled_regions(study: Study) -> dict[str, str]:
-    """The label of each region that has one, by the region's name."""
-    return {one.name: plain_name(one.label) for one in study.geometry.regions if one.label is not None}
-
-
-def maps_fat(study: Study) -> bool:
-    """True if a layer is as thick as the fat in the label map."""
-    return any(layer.thickness == "map" for layer in study.geometry.model_layers)
 
 
 @contextmanager

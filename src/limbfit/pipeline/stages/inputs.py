@@ -11,10 +11,9 @@ from ...anatomy.labels.contours import read_contours
 from ...anatomy.labels.placement import on_grid_of
 from ...anatomy.segmentation.one_limb import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
-from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study
 from ..shared.hand_labels import hand_labels
-from .files import labelled_file, labelled_regions, maps_fat, naming
+from .files import naming
 
 
 def study_image(study: Study) -> Volume:
@@ -59,19 +58,6 @@ def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | N
     path = study.path(given)
     read = read_contours if table.contours is not None else read_labels
     return cleaned(read(path, volume), path)
-
-
-def check_labels(study: Study, labels: LabelMap) -> None:
-    """Refuse a given map without a label that ``[geometry]`` needs.
-
-    Raises
-    ------
-    LabelError
-    """
-    with naming(labelled_file(study)):
-        labels.with_regions(labelled_regions(study))
-        if maps_fat(study):
-            check_fat(labels)
 
 
 def automatic_labels(study: Study, volume: Volume) -> LabelMap:

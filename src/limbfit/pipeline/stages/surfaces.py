@@ -16,7 +16,8 @@ from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, 
 from ...anatomy.surfaces.thickness import fat_depth, write_thickness
 from ...study import Study
 from ..shared.context import Context
-from .files import THICKNESS, labelled_file, labelled_regions, maps_fat, naming
+from .files import THICKNESS, labelled_file, naming
+from .needed_labels import labelled_regions, maps_fat
 
 
 def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:

@@ -17,7 +17,8 @@ from ..shared.limb import LimbGeometry
 from ..shared.socket_shape import check_load, check_regions, loadable_socket, regions_of
 from ..shared.store import Store
 from ..stages.curves import Beside, read_observed, read_record
-from ..stages.inputs import check_labels, marked_image, study_image, study_labels
+from ..stages.inputs import marked_image, study_image, study_labels
+from ..stages.needed_labels import check_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
 from ..stages.surfaces import given_anatomy

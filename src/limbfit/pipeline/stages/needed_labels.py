@@ -1,0 +1,32 @@
+"""The labels that ``[geometry]`` needs of a label map."""
+
+from __future__ import annotations
+
+from ...anatomy.imaging import LabelMap
+from ...anatomy.labels.naming import plain_name
+from ...anatomy.surfaces.thickness import check_fat
+from ...study import Study
+from .files import labelled_file, naming
+
+
+def check_labels(study: Study, labels: LabelMap) -> None:
+    """Refuse a given map without a label that ``[geometry]`` needs.
+
+    Raises
+    ------
+    LabelError
+    """
+    with naming(labelled_file(study)):
+        labels.with_regions(labelled_regions(study))
+        if maps_fat(study):
+            check_fat(labels)
+
+
+def labelled_regions(study: Study) -> dict[str, str]:
+    """The label of each region that has one, by the region's name."""
+    return {one.name: plain_name(one.label) for one in study.geometry.regions if one.label is not None}
+
+
+def maps_fat(study: Study) -> bool:
+    """True if a layer is as thick as the fat in the label map."""
+    return any(layer.thickness == "map" for layer in study.geometry.model_layers)
