@@ -15,6 +15,7 @@ from ...anatomy.sites.marked import marked_skin, without_markers
 from ...anatomy.sites.registration import limb_motion
 from ...anatomy.surfaces.surfaces import write_surface
 from ...report.drawing.sheet import draw_sheet
+from ...study import Study
 from ..shared.artefacts import file_digest, write_json
 from ..shared.context import Context
 from ..shared.hand_labels import DIGEST, LABELS
