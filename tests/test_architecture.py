@@ -33,7 +33,7 @@ INNER_FLOORS = {
     "fe": ["__init__", "solution", "", "contact", "kernel", "materials", "lanes threads"],
     "identify": ["__init__", "checks", "uncertainty", "fit"],
     "pipeline": ["__init__", "verbs", "experiments", "stages", "shared"],
-    "report": ["__init__ build html files", "sections", "drawing", "page store tables site_tables formats"],
+    "report": ["__init__ build", "sections", "drawing", "page store tables formats"],
 }
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
 

@@ -16,7 +16,7 @@ from page_outline import Outline, section_of, without_scripts
 from stored_results import SITES, write_results
 
 from limbfit.report import build_report
-from limbfit.report.formats import held
+from limbfit.report.sections.methods import describe_preload
 from limbfit.web.arrays import unpack
 
 
@@ -216,9 +216,9 @@ def test_methods_say_what_was_done_and_name_nobody(results, report):
 
 
 def test_methods_say_what_moved_the_limb_before():
-    assert held(None, {"law": "ogden", "prestretch": {}}) == ""
+    assert describe_preload(None, {"law": "ogden", "prestretch": {}}) == ""
     clamps = {"force_N": 15.0, "width_mm": 20.0, "clamping_s": 2.0, "settling_s": 5.0}
-    assert held(clamps, {"law": "ogden-active", "prestretch": {"skin": 1.1}}) == (
+    assert describe_preload(clamps, {"law": "ogden-active", "prestretch": {"skin": 1.1}}) == (
         "Before the indenter touched the limb, pins of 20.0 mm clamped it with 15.0 N each for 7.0 s and "
         "muscle contracted and tissue was pre-stretched (skin by 1.1)."
     )

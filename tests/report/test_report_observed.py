@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from stored_results import write_results
 
-from limbfit.report.drawing.observed_figures import layer_figure, surface_figure, wave_figure
-from limbfit.report.sections.sections import fit, prediction
-from limbfit.report.site_tables import observed_table
+from limbfit.report.drawing.observed_figures import draw_layer_figure, draw_skin_figure, draw_wave_figure
+from limbfit.report.sections.prediction import make_fit_section, make_observed_table, make_prediction_section
 from limbfit.report.store import load_store
 
 SURFACE = {
@@ -88,25 +87,25 @@ def _write(file: Path, columns: dict[str, np.ndarray]) -> None:
 
 def test_each_kind_is_drawn_where_it_belongs(results: Path) -> None:
     store = load_store(results)
-    surface, layer = surface_figure(store, fitted=True), layer_figure(store, fitted=False)
-    wave = wave_figure(store, fitted=False)
+    surface, layer = draw_skin_figure(store, fitted=True), draw_layer_figure(store, fitted=False)
+    wave = draw_wave_figure(store, fitted=False)
     assert surface is not None
     assert layer is not None
     assert wave is not None
     assert wave.name == "waves-held-out"
     assert "Speed (m/s)" in wave.markup
-    assert wave in prediction(store).blocks
+    assert wave in make_prediction_section(store).blocks
     assert surface.name == "surface-fitted"
     assert "PT-1: 2.2 %" in surface.markup
     assert "TI-5, muscle" in layer.markup
-    assert surface_figure(store, fitted=False) is None
-    assert layer_figure(store, fitted=True) is None
-    assert surface in fit(store).blocks
-    assert layer in prediction(store).blocks
+    assert draw_skin_figure(store, fitted=False) is None
+    assert draw_layer_figure(store, fitted=True) is None
+    assert surface in make_fit_section(store).blocks
+    assert layer in make_prediction_section(store).blocks
 
 
 def test_each_has_a_row_with_what_was_left_out(results: Path) -> None:
-    table = observed_table(load_store(results))
+    table = make_observed_table(load_store(results))
     assert table is not None
     told = [[cell.text for cell in row.cells] for row in table.rows]
     assert told[0] == [
@@ -120,5 +119,5 @@ def test_each_has_a_row_with_what_was_left_out(results: Path) -> None:
 
 def test_a_study_of_forces_alone_shows_nothing_of_it(tmp_path: Path) -> None:
     store = load_store(write_results(tmp_path / "results"))
-    assert observed_table(store) is None
-    assert surface_figure(store, fitted=True) is None
+    assert make_observed_table(store) is None
+    assert draw_skin_figure(store, fitted=True) is None

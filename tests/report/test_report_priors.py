@@ -10,8 +10,8 @@ from stored_results import NAMES, write_results
 
 from limbfit.priors import SOURCE
 from limbfit.report.page import Prose, Table
-from limbfit.report.sections.priors import constraints, prior_shares
-from limbfit.report.sections.sections import parameters
+from limbfit.report.sections.methods import describe_constraints
+from limbfit.report.sections.parameters import describe_priors, make_parameter_section
 from limbfit.report.store import load_store
 
 
@@ -36,7 +36,7 @@ def add_priors(results: Path) -> None:
 
 def test_each_interval_s_share_of_the_priors_is_shown_with_its_source(results: Path) -> None:
     add_priors(results)
-    words, table = prior_shares(load_store(results))
+    words, table = describe_priors(load_store(results))
     assert isinstance(words, Prose)
     assert SOURCE in words.text
     assert "the study" in words.text
@@ -49,7 +49,11 @@ def test_each_interval_s_share_of_the_priors_is_shown_with_its_source(results: P
 
 def test_the_section_of_parameters_has_the_table_where_there_are_priors(results: Path) -> None:
     def tables() -> list[str]:
-        return [block.name for block in parameters(load_store(results)).blocks if isinstance(block, Table)]
+        return [
+            block.name
+            for block in make_parameter_section(load_store(results)).blocks
+            if isinstance(block, Table)
+        ]
 
     assert "priors" not in tables()
     add_priors(results)
@@ -57,7 +61,9 @@ def test_the_section_of_parameters_has_the_table_where_there_are_priors(results:
 
 
 def test_the_methods_say_that_people_were_asked() -> None:
-    told = constraints({"priors": "population", "prior": {"muscle.m": {"median": 3.0, "factor": 1.25}}})
+    told = describe_constraints(
+        {"priors": "population", "prior": {"muscle.m": {"median": 3.0, "factor": 1.25}}}
+    )
     assert told == (
         "Lognormal priors of c and m were those of people; "
         "lognormal priors were put on muscle.m: median 3.0, factor 1.25."

@@ -6,7 +6,7 @@ import pytest
 
 from limbfit.cli.socket import show_socket
 from limbfit.report.page import Table
-from limbfit.report.sections.socket_beside import interval_blocks, published_blocks
+from limbfit.report.sections.socket import make_interval_table, make_published_blocks, make_published_table
 from limbfit.socket.published import FINDINGS, WHOLE, published
 
 SHARES = {"skin.c_kPa": 80.0, "muscle.tau_s": 12.4}
@@ -32,7 +32,7 @@ HELD = {
 
 
 def test_the_table_of_intervals_names_parameters_and_what_the_liner_changes():
-    (table,) = interval_blocks(HELD, "stance")
+    table = make_interval_table(HELD, "stance")
     assert isinstance(table, Table)
     assert table.head[3:] == ("muscle τ (%)", "skin c (%)", "Change, liner c 10 % larger")
     rows = [[cell.text for cell in row.cells] for row in table.rows]
@@ -44,14 +44,15 @@ def test_the_table_of_intervals_names_parameters_and_what_the_liner_changes():
 
 def test_a_simulated_change_of_friction_has_a_column_of_its_own():
     rougher = {**REGION, "change_kPa": {**REGION["change_kPa"], "friction": 1.25}}
-    (table,) = interval_blocks({"regions": [rougher]}, "stance")
+    table = make_interval_table({"regions": [rougher]}, "stance")
+    assert isinstance(table, Table)
     assert table.head[-1] == "Change, friction 10 % larger"
     assert table.rows[0].cells[-1].text == "1.2 kPa"
 
 
 def test_without_identified_tissues_there_is_no_such_table():
     unknown = {**REGION, "interval_kPa": None, "interval_from": None, "change_kPa": None}
-    assert interval_blocks({"regions": [unknown]}, "donning") == ()
+    assert make_interval_table({"regions": [unknown]}, "donning") is None
 
 
 def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
@@ -78,18 +79,17 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
 def test_every_finding_is_told_of_its_regions_with_its_source(finding):
     rows = published([*finding.regions, "another"])
     assert finding.source in {row["source"] for row in rows}
-    table, _ = published_blocks({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
+    table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
     assert any(finding.found in {cell.text for cell in row.cells} for row in table.rows)
     assert all(set(row["regions"]) <= {*finding.regions, WHOLE} for row in rows)
 
 
 def test_what_others_found_stands_beside_the_regions_own_pressures():
     """By region; what was found over the whole limb beside the whole limb's."""
-    table, _ = published_blocks(
-        {"published": published(["tibial crest"])}, HELD | {"mean_kPa": 12.0}, "stance"
-    )
+    rows = published(["tibial crest"])
+    table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
     own = {tuple(cell.text for cell in row.cells[:3]) for row in table.rows}
     assert own == {("tibial crest", "30.0", "60.0"), (WHOLE, "12.0", "60.0")}
     assert len(table.rows) == sum("tibial crest" in one.regions or WHOLE in one.regions for one in FINDINGS)
     assert "stance" in table.caption
-    assert published_blocks({"published": []}, HELD, "stance") == ()  # of a limb that nobody's study was of
+    assert make_published_blocks({"published": []}, HELD, "stance") == ()  # of a limb that nobody's study was of

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from limbfit.report.formats import duration, fixed, number
-from limbfit.report.tables import flatten
+from limbfit.report.sections.provenance import flatten_settings
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_flatten_names_sites_and_keeps_order() -> None:
         "mesh": {"element": "tet10"},
         "sites": [{"name": "A", "axis": [0, 0, 1], "fitted": True, "near": None}],
     }
-    assert flatten(settings) == {
+    assert flatten_settings(settings) == {
         "mesh.element": "tet10",
         "sites.A.name": "A",
         "sites.A.axis": "0, 0, 1",

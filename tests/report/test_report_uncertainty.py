@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from stored_results import write_results
 
-from limbfit.report.sections.uncertainty import _draw_profile, _profile_words, profile_figure
+from limbfit.report.sections.uncertainty import _describe_profile, _draw_profile, draw_profile_figure
 from limbfit.report.store import load_store
 
 PROFILE = {
@@ -42,13 +42,13 @@ def test_extrapolated_parts_of_a_profile_are_dashed():
 
 def test_the_figure_of_profiles_says_what_dashes_mean_and_what_the_solver_said(tmp_path):
     store = load_store(write_results(tmp_path))
-    figure = profile_figure(store, {"profiles": {"skin.m": PROFILE}, "checks": CHECKS})
+    figure = draw_profile_figure(store, {"profiles": {"skin.m": PROFILE}, "checks": CHECKS})
     assert "beyond the emulator's simulations" in figure.caption
     assert "0.34 (the widest, not simulated at each end)" in figure.caption
 
 
 def test_the_table_names_the_ends_that_are_extrapolated():
     row = {"profile_verdict": "determined on one side", "profile_extrapolated": [False, True]}
-    assert _profile_words(row) == "determined on one side; high end extrapolated"
-    assert _profile_words(row | {"profile_extrapolated": [False, False]}) == "determined on one side"
-    assert _profile_words({"profile_verdict": None, "profile_extrapolated": None}) == "–"
+    assert _describe_profile(row) == "determined on one side; high end extrapolated"
+    assert _describe_profile(row | {"profile_extrapolated": [False, False]}) == "determined on one side"
+    assert _describe_profile({"profile_verdict": None, "profile_extrapolated": None}) == "–"

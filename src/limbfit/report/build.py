@@ -1,16 +1,30 @@
-"""Stored results to ``report.html``."""
+"""Stored results to one HTML file, with styles and scripts inside; beside it methods, tables and figures."""
 
 from __future__ import annotations
 
+import csv
+import json
+import re
 from pathlib import Path
+from typing import Any
 
-from .files import write_files
-from .html import render
-from .sections.methods import method_markdown
-from .sections.sections import make_page
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from ..web.assets import asset, inline_script, integrity
+from .drawing.plots import make_standalone
+from .page import Cell, Figure, Page, Row, Table
+from .sections.contents import make_page
+from .sections.methods import write_method_markdown
 from .store import load_store
 
 REPORT_NAME, METHODS_NAME = "report.html", "methods.md"
+SCRIPTS = (
+    *("vendor/three.min.js", "vendor/uPlot.min.js", "arrays.js", "colours.js", "overlay.js"),
+    *("camera.js", "volume.js", "viewer.js", "chart.js"),
+)
+STYLES = ("vendor/uPlot.min.css", "web.css")
+_NUMBER = re.compile(r"[+-]?\d[\d ]*(\.\d+)?(e[+-]?\d+)?$")
 
 
 def build_report(results: Path, out: Path) -> Path:
@@ -26,13 +40,90 @@ def build_report(results: Path, out: Path) -> Path:
     InputError
         When there is no such results folder, or a stored file is not readable.
     """
-    store = load_store(Path(results))
+    store, out = load_store(Path(results)), Path(out)
     page = make_page(store)
-    file = Path(out) / REPORT_NAME
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_files(page, file.parent)
-    (file.parent / METHODS_NAME).write_text(method_markdown(store), encoding="utf-8")
+    _write_parts(page, out)
+    (out / METHODS_NAME).write_text(write_method_markdown(store), encoding="utf-8")
+    file = out / REPORT_NAME
     draft = file.with_suffix(".part")
-    draft.write_text(render(page), encoding="utf-8")
+    draft.write_text(_render(page), encoding="utf-8")
     draft.replace(file)
     return file
+
+
+def _write_parts(page: Page, folder: Path) -> None:
+    """``tables/<name>.csv`` and ``.json``, ``figures/<name>.svg``, for every table and drawing of a page.
+
+    Numbers are those of the page, as rounded there; a figure that is a photograph is left out.
+    """
+    tables, figures = folder / "tables", folder / "figures"
+    for place in (tables, figures):
+        place.mkdir(parents=True, exist_ok=True)
+    for block in (*page.summary, *(block for section in page.sections for block in section.blocks)):
+        if isinstance(block, Table):
+            _write_csv(block, tables / f"{block.name}.csv")
+            content = {
+                "name": block.name,
+                "caption": block.caption,
+                "columns": list(block.head),
+                "rows": [_to_json(row) for row in block.rows],
+                "foot": [_to_json(row) for row in block.foot],
+            }
+            text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+            (tables / f"{block.name}.json").write_text(text, encoding="utf-8")
+        elif isinstance(block, Figure) and block.markup.startswith("<svg") and "<image" not in block.markup:
+            (figures / f"{block.name}.svg").write_text(make_standalone(block.markup), encoding="utf-8")
+
+
+def _write_csv(table: Table, file: Path) -> None:
+    """The table with its head; what the page marks (fitted sites, the study's own) in a last column."""
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow([*table.head, "marked"])
+        for row in (*table.rows, *table.foot):
+            writer.writerow([*map(_to_value, row.cells), "yes" if row.marked else "no"])
+
+
+def _to_json(row: Row) -> dict[str, Any]:
+    return {"cells": [_to_value(cell) for cell in row.cells], "marked": row.marked}
+
+
+def _to_value(cell: Cell) -> str | float | int | None:
+    """A cell's number, where it holds one alone; nothing for a dash; else its text."""
+    if not cell.number:
+        return cell.text
+    text = cell.text.replace("−", "-").replace("\u202f", " ").strip()
+    if text in ("", "–"):
+        return None
+    if not _NUMBER.match(text):
+        return cell.text
+    plain = text.replace(" ", "")
+    return float(plain) if any(mark in plain for mark in ".e") else int(plain)
+
+
+def _render(page: Page) -> str:
+    """The page as HTML text: one file, no requests, every text escaped.
+
+    Its policy lets one script run, told by its digest, and lets nothing be loaded or sent.
+    """
+    loader = PackageLoader("limbfit.report", "templates")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["data"] = _embed_json
+
+    def source(name: str) -> str:
+        return loader.get_source(environment, name)[0]
+
+    moves = any(block.kind == "interactive" for section in page.sections for block in section.blocks)
+    script = f"(() => {{\n{inline_script(*SCRIPTS)}\n{source('report.js')}}})();" if moves else ""
+    style = "\n".join([source("report.css"), *(asset(name) for name in STYLES if moves)])
+    return environment.get_template("report.html.j2").render(
+        page=page, css=Markup(style), script=Markup(script), script_source=integrity(script) if moves else ""
+    )
+
+
+def _embed_json(content: Any) -> Markup:
+    """JSON that cannot end the element that holds it, whatever its texts are."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -1,23 +1,13 @@
-"""Numbers, times and vectors as cells of a table."""
+"""Numbers, times and parameters as the report writes them."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from ..laws import ACTIVE, split_key
-from .page import Cell
+from ..laws import split_key
 
 NOTHING = "–"
-_GREEK = {
-    "alpha": "α",
-    "beta": "β",
-    "gamma": "γ",
-    "delta": "δ",
-    "eta": "η",
-    "kappa": "κ",
-    "mu": "μ",
-    "tau": "τ",
-}
+_GREEK = dict(zip(["alpha", "beta", "gamma", "delta", "eta", "kappa", "mu", "tau"], "αβγδηκμτ", strict=True))
 _BELOW = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
@@ -58,6 +48,27 @@ def unit_of(key: str) -> str:
     return split_key(key)[1] or NOTHING
 
 
+def with_unit(key: str) -> str:
+    """A parameter with its unit where it has one: ``τ (s)``, ``m``."""
+    unit = split_key(key)[1]
+    return f"{symbol(key)} ({unit})" if unit else symbol(key)
+
+
+def with_value(key: str, value: Any) -> str:
+    """A parameter with its value: ``τ = 0.391 s``."""
+    return f"{symbol(key)} = {number(value)} {split_key(key)[1]}".strip()
+
+
+def limits(values: Any, digits: int = 3) -> str:
+    """An interval: ``1.2 to 3.4``."""
+    return f"{number(values[0], digits)} to {number(values[1], digits)}" if values else NOTHING
+
+
+def count(value: Any) -> str:
+    """A whole number with its thousands apart."""
+    return f"{value:,}".replace(",", " ") if isinstance(value, int) else NOTHING
+
+
 def duration(seconds: Any) -> str:
     """Seconds as a person says them."""
     if not isinstance(seconds, int | float):
@@ -70,36 +81,6 @@ def duration(seconds: Any) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def vector(values: Any) -> str:
-    return ", ".join(fixed(value) for value in values) if values else NOTHING
-
-
 def friction(value: Any) -> str:
     """How contact is, by the study's key: a word, or a coefficient."""
     return value if isinstance(value, str) else f"with friction of coefficient {number(value)}"
-
-
-def held(clamps: dict[str, Any] | None, material: dict[str, Any]) -> str:
-    """What moved the limb before the indenter touched, by the study's tables; nothing where nothing did."""
-    parts = []
-    if clamps:
-        waited = clamps["clamping_s"] + clamps["settling_s"]
-        parts.append(
-            f"pins of {clamps['width_mm']} mm clamped it with {clamps['force_N']} N each for {waited} s"
-        )
-    if material.get("law") == ACTIVE:
-        parts.append("muscle contracted")
-    taut = ", ".join(f"{tissue} by {stretch}" for tissue, stretch in material.get("prestretch", {}).items())
-    if taut:
-        parts.append(f"tissue was pre-stretched ({taut})")
-    return f"Before the indenter touched the limb, {' and '.join(parts)}." if parts else ""
-
-
-def numeric(text: str, share: float | None = None) -> Cell:
-    """A cell that holds a number."""
-    return Cell(text, number=True, share=share)
-
-
-def heading(text: str) -> Cell:
-    """The cell that a row begins with."""
-    return Cell(text, header=True)

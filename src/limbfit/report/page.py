@@ -6,7 +6,7 @@ make themselves (inline SVG in which names were already escaped).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -78,7 +78,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a header row; units stand in the headers. ``wide`` tables may scroll sideways."""
+    """A table with a header row; units stand in the headers. ``folded`` tables open on a click."""
 
     kind: ClassVar[str] = "table"
     name: str
@@ -120,3 +120,20 @@ class Page:
     summary: tuple[Block, ...]
     sections: tuple[Section, ...]
     footer: str
+
+
+def make_section(
+    name: str, title: str, *blocks: Block | Iterable[Block | None] | None, otherwise: str = ""
+) -> Section:
+    """A section of the blocks that exist; where there are none, a note says ``otherwise``."""
+    found: list[Block] = []
+    for one in blocks:
+        group = (one,) if one is None or isinstance(one, Block) else one
+        found += [block for block in group if block is not None]
+    return Section(name, title, tuple(found) or (Note(otherwise),))
+
+
+def make_bullets(sentences: Iterable[str]) -> Bullets | None:
+    """A list of the sentences; None where there are none."""
+    items = tuple(sentences)
+    return Bullets(items) if items else None

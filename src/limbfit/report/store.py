@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
+from .formats import fixed, symbol
 
-Curves = dict[str, NDArray[np.float64]]
+Curves = dict[str, Array]
 Json = dict[str, Any]
+PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Results:
     @property
     def predicted(self) -> tuple[Json, ...]:
         """A row of each record; ``record`` is its name, the site's where that states one only."""
-        return tuple({"record": row["site"], **row} for row in self.predict.get("sites", ()))
+        return tuple({**row, "record": get_record_name(row)} for row in self.predict.get("sites", ()))
 
     def records_of(self, site: str) -> tuple[str, ...]:
         """Names of the records of a site that are stored."""
@@ -70,6 +73,11 @@ class Results:
         return tuple(self.stages[-1].get("parameters", ())) if self.stages else ()
 
     @property
+    def parameters(self) -> tuple[tuple[str, str], ...]:
+        """Tissue and key of every identified parameter."""
+        return tuple((tissue, key) for tissue in self.tissues for key in self.law.keys)
+
+    @property
     def law(self) -> TissueLaw:
         """What the identification says of the tissues' law."""
         return TissueLaw.of_record(self.calibration.get("law") or {})
@@ -78,6 +86,35 @@ class Results:
     def materials(self) -> str:
         """What the model with a material for each tissue is called: ``two materials``."""
         return str(self.stages[-1].get("name")) if self.stages else "identified materials"
+
+    def mean_error(self, use: str) -> str:
+        """``4.5 ± 1.0``: mean and standard deviation of the errors at ``fitted`` or ``heldout`` sites, %."""
+        mean, sd = (self.predict.get(f"{kind}_error_{use}_percent") for kind in ("mean", "sd"))
+        return fixed(mean) if sd is None else f"{fixed(mean)} ± {fixed(sd)}"
+
+    @property
+    def uncertainty(self) -> Json:
+        """What the calibration says of its intervals."""
+        return self.calibration.get("uncertainty") or {}
+
+    def interval(self, tissue: str, name: str) -> list[float] | None:
+        """The stored 95 % interval of a parameter."""
+        limits = (self.uncertainty.get("intervals_95") or {}).get(tissue, {}).get(name)
+        return limits if limits and None not in limits else None
+
+    def describe_parameter(self, name: str) -> str:
+        """A parameter's symbol and what it is."""
+        words = {parameter.key: parameter.words for parameter in self.law.parameters}
+        return ", ".join(part for part in (symbol(name), words.get(name, "")) if part)
+
+    def describe_tissue(self, tissue: str) -> str:
+        """A tissue as the head of a row; the two of the paper as the paper names them."""
+        return PAPER_TISSUES[tissue] if self.has_paper_tissues else tissue.replace("_", " ").capitalize()
+
+    @property
+    def has_paper_tissues(self) -> bool:
+        """True for the two tissues of the paper, where fat is no tissue of its own."""
+        return self.tissues == tuple(PAPER_TISSUES)
 
     @property
     def surface_files(self) -> dict[str, Path]:
@@ -91,10 +128,30 @@ class Results:
         rows = {row["site"]: row for row in (*self.predicted, *self.sites)}
         return str(rows.get(site, {}).get("region") or "")
 
+    @property
+    def placed_sites(self) -> dict[str, Json]:
+        """The sites whose place and axis are known, by name."""
+        return {row["site"]: row for row in self.sites if row.get("position_mm") and row.get("axis")}
+
     def curves(self, stage: str, name: str) -> Curves | None:
         """The columns of ``<stage>/<name>.csv``, or None where there is no such file."""
         file = self.folder / stage / f"{name}.csv"
         return _read_csv(file) if file.is_file() else None
+
+    def record_curves(self, record: str) -> tuple[Curves | None, Curves | None, tuple[float, float]]:
+        """A record as the robot wrote it, regularised in the same time and displacement, and touch-down."""
+        raw, regular = self.curves("traces", f"{record}-raw"), self.curves("traces", record)
+        facts = self.traces.get(record, {})
+        time_s, depth_mm = facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0)
+        if regular is not None:
+            time, depth = regular["time_s"] + time_s, regular["displacement_mm"] + depth_mm
+            regular = {"time_s": time, "displacement_mm": depth, "force_N": regular["force_N"]}
+        return raw, regular, (time_s, depth_mm)
+
+    def with_curves(self, stage: str, rows: Iterable[Json]) -> list[tuple[Json, Curves]]:
+        """Rows of records with the curves that the stage stored, where it did."""
+        found = ((row, self.curves(stage, get_record_name(row))) for row in rows)
+        return [(row, curves) for row, curves in found if curves is not None]
 
     def vtu(self, stage: str, site: str) -> Path | None:
         """The mesh or fields of a site; of several records' fields the first."""
@@ -102,7 +159,12 @@ class Results:
         return next((file for file in files if file.is_file()), None)
 
 
-def compared_of(curves: Curves) -> tuple[str, str]:
+def get_record_name(row: Json) -> str:
+    """The name of a row's record; the site's where that states one only."""
+    return str(row.get("record", row["site"]))
+
+
+def find_compared_quantity(curves: Curves) -> tuple[str, str]:
     """What curves compare, and its unit: force, or displacement where a force was stated."""
     return ("displacement", "mm") if "displacement_measured_mm" in curves else ("force", "N")
 

@@ -20,7 +20,7 @@ from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.curves import run_traces
 from limbfit.pipeline.stages.deviations import site_noise
 from limbfit.pipeline.stages.records import site_record
-from limbfit.report.sections.records import record_figure, trace_table
+from limbfit.report.sections.records import draw_record_figure, make_trace_table
 from limbfit.report.store import load_store
 
 TISSUES = ("skin", "muscle")
@@ -124,7 +124,7 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     assert np.sqrt(np.diag(noise.covariance)).max() < 0.05 * peak
 
     stored = load_store(study.results)
-    figure, table = record_figure(stored, name), trace_table(stored)
+    figure, table = draw_record_figure(stored, name), make_trace_table(stored)
     assert figure is not None
     assert f"the indenter's phases are {words}" in figure.caption
     assert words in [cell.text for cell in table.rows[0].cells]

@@ -21,7 +21,7 @@ from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.curves import read_record
 from limbfit.pipeline.stages.mesh import mesh_job, mesh_settings
 from limbfit.pipeline.verbs.run import keys
-from limbfit.report.site_tables import site_table
+from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
 from limbfit.study import Record, Study, load_study
 
@@ -199,7 +199,7 @@ def test_table_2_has_a_row_of_each_record_and_means_over_sites(tmp_path: Path) -
         for site, record, error in rows
     )
     (tmp_path / "predict" / "predict.json").write_text(f'{{"sites": [{text}]}}')
-    table = site_table(load_store(tmp_path))
+    table = make_site_table(load_store(tmp_path))
     assert [row.cells[0].text for row in table.rows] == ["1", "1-fast", "2"]
     (mean,) = table.foot
     assert mean.cells[1].text == "2 sites"

@@ -25,8 +25,8 @@ from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.curves import run_traces
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.observed_figures import surface_figure
-from limbfit.report.site_tables import observed_table
+from limbfit.report.drawing.observed_figures import draw_skin_figure
+from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
 from limbfit.traces import SurfaceMotion
@@ -112,7 +112,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
     assert surface["compared"].startswith("24 points, ")
     assert surface["error_percent"] < 10.0
     results = load_store(study.results)
-    figure, shown = surface_figure(results, fitted=True), observed_table(results)
+    figure, shown = draw_skin_figure(results, fitted=True), make_observed_table(results)
     assert figure is not None
     assert "a: " in figure.markup
     assert shown is not None

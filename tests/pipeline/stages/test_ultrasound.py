@@ -21,7 +21,7 @@ from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.observed_figures import layer_figure
+from limbfit.report.drawing.observed_figures import draw_layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study
 from limbfit.traces import Layers, read_layers, thinnings
@@ -189,6 +189,6 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )
     assert (context.store["predict"] / "a+muscle.csv").is_file()
-    figure = layer_figure(load_store(study.results), fitted=True)
+    figure = draw_layer_figure(load_store(study.results), fitted=True)
     assert figure is not None
     assert "a, muscle" in figure.markup

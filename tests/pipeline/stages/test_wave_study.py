@@ -18,8 +18,8 @@ from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.curves import run_traces
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.observed_figures import wave_figure
-from limbfit.report.site_tables import observed_table
+from limbfit.report.drawing.observed_figures import draw_wave_figure
+from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
 
@@ -87,7 +87,7 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     assert muscle["error_percent"] < 10.0
     assert (context.store["predict"] / "a+muscle-waves.csv").is_file()
     results = load_store(study.results)
-    figure, shown = wave_figure(results, fitted=True), observed_table(results)
+    figure, shown = draw_wave_figure(results, fitted=True), make_observed_table(results)
     assert figure is not None
     assert "a, skin-waves" in figure.markup
     assert shown is not None

@@ -16,8 +16,8 @@ from conftest import write_trace
 from limbfit import check_study, load_study, run_study
 from limbfit.anatomy.imaging import write_labels, write_volume
 from limbfit.report.page import Bullets
-from limbfit.report.sections.doubts import doubts
-from limbfit.report.sections.sections import model
+from limbfit.report.sections.model import make_model_section
+from limbfit.report.sections.record_checks import make_record_check_section
 from limbfit.report.store import Results, load_store
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])
@@ -109,14 +109,16 @@ def test_an_image_that_says_twice_where_it_lies_is_told_by_check_stage_and_repor
     said = []
     run_study(study, until="segment", listener=lambda event: said.append(event.text))
     assert sum(text.startswith(f"warning: {words}") for text in said) == 1
-    bullets = [block for block in model(load_store(study.results)).blocks if isinstance(block, Bullets)]
+    bullets = [
+        block for block in make_model_section(load_store(study.results)).blocks if isinstance(block, Bullets)
+    ]
     assert bullets[0].items[0].startswith(words)
 
 
 def section(tmp_path, **predict):
     empty = {"run": {}, "segment": {}, "surfaces": {}, "sites": (), "traces": {}, "mesh": {}}
     more = {"calibration": {}, "simulated": (), "compared": (), "truth": {}}
-    return doubts(Results(tmp_path, **empty, **more, predict={"sites": [], **predict}))
+    return make_record_check_section(Results(tmp_path, **empty, **more, predict={"sites": [], **predict}))
 
 
 def test_the_report_says_that_nothing_is_wrong_or_what_is(five, tmp_path):

@@ -16,7 +16,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...extensions import Registry
-from ...report.sections.experiments import SECTIONS, Maker
+from ...report.sections.contents import SECTIONS, Maker
 from ...study import Study
 from ..shared.artefacts import read_json
 from ..shared.context import Context

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import read_vtu
 from ...web.arrays import pack
 from ...web.shapes import interface, read_shell, shell_of, volume_of
@@ -25,12 +26,12 @@ from .pictures import (
     FITTED,
     HELD_OUT,
     SKIN_SURFACE,
-    cut_views,
-    drawable,
-    far_side,
-    inner_colour,
-    limb_frame,
-    linear,
+    choose_inner_colour,
+    cut_behind,
+    find_placed_meshes,
+    make_cut_views,
+    read_limb_frame,
+    read_linear,
 )
 
 MOST_FACES, MOST_SAMPLES = 12_000, 300
@@ -39,22 +40,22 @@ LAYER = "#c8a13a"
 STRESS = "von_mises_kPa"
 
 
-def explorer(store: Results) -> Interactive | None:
+def make_explorer(store: Results) -> Interactive | None:
     """Surfaces, layers, bones and sites, the field at the deepest point of each site, and its curves."""
     if "skin" not in store.surface_files:
         return None
     arrays: dict[str, NDArray[Any]] = {}
-    surfaces = _surfaces(store, arrays)
-    fields = _fields(store, arrays)
+    surfaces = _read_surfaces(store, arrays)
+    fields = _cut_fields(store, arrays)
     facts = {
-        "frame": limb_frame(store).tolist(),
+        "frame": read_limb_frame(store).tolist(),
         "surfaces": surfaces,
-        "sites": [_site(store, row) for row in store.sites if row.get("position_mm") and row.get("axis")],
+        "sites": [_describe_site(store, row) for row in store.placed_sites.values()],
         "fields": fields,
     }
     content = {
         "arrays": base64.b64encode(pack(arrays, facts)).decode("ascii"),
-        "curves": {site: curves for site in store.site_names if (curves := _site_curves(store, site))},
+        "curves": {site: curves for site in store.site_names if (curves := _read_site_curves(store, site))},
     }
     caption = (
         "Skin, layers, bones and sites of the model; choose a site to see its forces and, where stored, the "
@@ -64,7 +65,7 @@ def explorer(store: Results) -> Interactive | None:
     return Interactive("explorer", "model", "The limb in three dimensions.", caption, content)
 
 
-def _surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
+def _read_surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     rows = []
     for name, file in store.surface_files.items():
         shell = read_shell(file, MOST_FACES)
@@ -74,18 +75,18 @@ def _surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
                 "name": name,
                 "title": title or name,
                 "kind": "skin" if name == "skin" else "bone",
-                "colour": SKIN_SURFACE if name == "skin" else inner_colour(name),
+                "colour": SKIN_SURFACE if name == "skin" else choose_inner_colour(name),
                 "opacity": 0.38 if kind == "skin" else 1.0,
             }
         )
         arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
-    for name, shell in _layers(store):
+    for name, shell in _read_layers(store):
         rows.append({"name": name, "title": name, "kind": "layer", "colour": LAYER, "opacity": 0.5})
         arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
     return rows
 
 
-def _layers(store: Results) -> Iterable[tuple[str, Any]]:
+def _read_layers(store: Results) -> Iterable[tuple[str, Any]]:
     """The inner face of each layer, as in the first stored mesh."""
     file = next((file for site in store.site_names if (file := store.vtu("mesh", site))), None)
     if file is None:
@@ -97,7 +98,7 @@ def _layers(store: Results) -> Iterable[tuple[str, Any]]:
         yield f"inner face of {name}", interface(volume, index)
 
 
-def _site(store: Results, row: Json) -> Json:
+def _describe_site(store: Results, row: Json) -> Json:
     fitted = bool(row.get("fitted"))
     axis = np.asarray(row["axis"], dtype=float)
     known = [one["error_percent"] for one in store.predicted if one["site"] == row["site"]]
@@ -113,12 +114,12 @@ def _site(store: Results, row: Json) -> Json:
     }
 
 
-def _fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
+def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     """The cut through each site at its deepest point, as triangles with displacements and stress."""
     stage = "predict" if store.predict else "simulate"
     found = []
-    for row, file in drawable(store, store.site_names, stage):
-        cut = _field(store, row, file)
+    for row, file in find_placed_meshes(store, store.site_names, stage):
+        cut = _cut_field(store, row, file)
         if cut is None:
             continue
         name = f"field.{row['site']}"
@@ -127,12 +128,12 @@ def _fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     return found
 
 
-def _field(store: Results, row: Json, file: Path) -> dict[str, NDArray[Any]] | None:
-    grid = linear(file)
+def _cut_field(store: Results, row: Json, file: Path) -> dict[str, NDArray[Any]] | None:
+    grid = read_linear(file)
     if STRESS not in grid.cell_data or "displacement_mm" not in grid.point_data:
         return None
-    view = cut_views(store, row, file)[1]
-    surface = far_side(grid, view, smooth=True).extract_surface(algorithm="dataset_surface").triangulate()
+    view = make_cut_views(store, row, file)[1]
+    surface = cut_behind(grid, view, smooth=True).extract_surface(algorithm="dataset_surface").triangulate()
     near = np.linalg.norm(np.asarray(surface.cell_centers().points) - view.focal, axis=1) < FIELD_RADIUS_MM
     if not near.any():
         return None
@@ -147,35 +148,25 @@ def _field(store: Results, row: Json, file: Path) -> dict[str, NDArray[Any]] | N
     }
 
 
-def _thinned(values: NDArray[np.float64], stride: int) -> list[float | None]:
+def _thin_values(values: Array, stride: int) -> list[float | None]:
     """Every so many values with five digits, and the last one."""
     chosen = np.unique(np.r_[np.arange(0, len(values), stride), len(values) - 1])
     return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values[chosen]]
 
 
-def _plain(curves: Curves, names: Sequence[str]) -> dict[str, list[float | None]]:
+def _to_lists(curves: Curves) -> dict[str, list[float | None]]:
     stride = max(1, math.ceil(len(next(iter(curves.values()))) / MOST_SAMPLES))
-    return {name: _thinned(curves[name], stride) for name in names if name in curves}
+    return {name: _thin_values(curves[name], stride) for name in _COLUMNS if name in curves}
 
 
+_KINDS = ("measured", "simulated", "one_material", "low", "high")
 _COLUMNS = (
-    "time_s",
-    "displacement_mm",
-    "force_measured_N",
-    "force_simulated_N",
-    "force_one_material_N",
-    "force_low_N",
-    "force_high_N",
-    "force_N",
-    "displacement_measured_mm",
-    "displacement_simulated_mm",
-    "displacement_one_material_mm",
-    "displacement_low_mm",
-    "displacement_high_mm",
+    *("time_s", "displacement_mm", *(f"force_{kind}_N" for kind in _KINDS), "force_N"),
+    *(f"displacement_{kind}_mm" for kind in _KINDS),
 )
 
 
-def _site_curves(store: Results, site: str) -> Json | None:
+def _read_site_curves(store: Results, site: str) -> Json | None:
     """What is known of a site's force: predicted, else simulated by itself, else as recorded.
 
     Of several records it is that of the first.
@@ -185,7 +176,7 @@ def _site_curves(store: Results, site: str) -> Json | None:
             curves = store.curves(stage, record)
             if curves is not None and len(next(iter(curves.values()))):
                 facts = {"stage": stage, "record": record, "materials": store.materials}
-                return facts | _plain(curves, _COLUMNS)
+                return facts | _to_lists(curves)
     return None
 
 
@@ -193,20 +184,13 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
     """Each record as the robot wrote it and regularised, to choose from."""
     choices = {}
     for site in sites:
-        raw, regular = store.curves("traces", f"{site}-raw"), store.curves("traces", site)
-        if raw is None or regular is None:
+        raw, smooth, start = store.record_curves(site)
+        if raw is None or smooth is None:
             continue
-        facts = store.traces.get(site, {})
-        start = (facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0))
-        smooth = {
-            "time_s": regular["time_s"] + start[0],
-            "displacement_mm": regular["displacement_mm"] + start[1],
-            "force_N": regular["force_N"],
-        }
-        phases = facts.get("phases") or []
+        phases = store.traces.get(site, {}).get("phases") or []
         choices[site] = {
-            "raw": _plain(raw, _COLUMNS),
-            "smooth": _plain(smooth, _COLUMNS),
+            "raw": _to_lists(raw),
+            "smooth": _to_lists(smooth),
             "touch": {"time_s": start[0], "displacement_mm": start[1]},
             "ends": {
                 "time_s": [one["end_s"] for one in phases],
@@ -224,23 +208,23 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
 
 def convergence_curves(store: Results) -> Interactive | None:
     """The error and each parameter over the accepted iterates of all stages."""
-    steps = [(stage, step) for stage in store.stages for step in stage.get("iterations") or ()]
+    steps = [step for stage in store.stages for step in stage.get("iterations") or ()]
     if not steps:
         return None
-    panels: list[Json] = [_errors([step for _, step in steps])]
+    make_panels = [_make_error_panel(steps)]
     for name in store.law.keys:
         series = [
-            {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for _, step in steps]}
+            {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for step in steps]}
             for tissue in store.tissues
         ]
-        panels.append({"title": symbol(name), "unit": unit_of(name), "log": False, "series": series})
+        make_panels.append({"title": symbol(name), "unit": unit_of(name), "log": False, "series": series})
     caption = "The same, to read values from; iterates are counted through all stages."
     return Interactive(
-        "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": panels}
+        "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": make_panels}
     )
 
 
-def _errors(steps: Sequence[Json]) -> Json:
+def _make_error_panel(steps: Sequence[Json]) -> Json:
     sites = sorted({site for step in steps for site in step.get("error_percent_by_site", {})})
     series = [{"label": "mean error", "y": [step.get("error_percent") for step in steps]}]
     series += [

@@ -2,105 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
-import matplotlib
-import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
 
 from ..formats import fixed
 from ..page import Figure
-from ..store import Json, Results
-from .figures import thin
-from .ink import MEASURED, SIMULATED, STYLE, legend_above, panels, svg, tissue_style
+from ..store import Curves, Json, Results
+from .colours import MEASURED, SIMULATED, choose_tissue_style
+from .figures import thin_curves
+from .plots import add_legend_above, label_outer_axes, make_figure, make_panels, plot_band, styled
 
-Curves = dict[str, NDArray[np.float64]]
 
-
-def layer_figure(store: Results, fitted: bool) -> Figure | None:
+def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
     """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    drawn = _against_time(store, fitted, "ultrasound", ("compression", "mm"), "layers")
-    if drawn is None:
-        return None
-    name, drawing, told = drawn
     caption = (
-        f"Compression of the tissues on the indenter's axis at the {_word(fitted)} "
-        "sites, as ultrasound saw it and as predicted; errors are means over the record, in percent of the "
-        "largest compression."
+        "Compression of the tissues on the indenter's axis at the {} sites, as ultrasound saw it and as "
+        "predicted; errors are means over the record, in percent of the largest compression."
     )
-    return Figure(name, svg(drawing, name, f"Measured and predicted compression: {told}"), caption)
+    words, quantity = "compression", ("compression", "mm")
+    return _draw_time_figure(store, fitted, "ultrasound", "layers", quantity, words, caption)
 
 
-def wave_figure(store: Results, fitted: bool) -> Figure | None:
+def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
     """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
-    drawn = _against_time(store, fitted, "shear waves", ("speed", "m_s"), "waves")
-    if drawn is None:
-        return None
-    name, drawing, told = drawn
     caption = (
-        f"Speed of shear waves under the indenter at the {_word(fitted)} sites, read and predicted: that "
-        "of small, sudden shear on the strain that the indenter makes; errors are means in percent of the "
-        "largest speed."
+        "Speed of shear waves under the indenter at the {} sites, read and predicted: that of small, sudden "
+        "shear on the strain that the indenter makes; errors are means in percent of the largest speed."
     )
-    return Figure(name, svg(drawing, name, f"Measured and predicted speed of shear waves: {told}"), caption)
+    words, quantity = "speed of shear waves", ("speed", "m_s")
+    return _draw_time_figure(store, fitted, "shear waves", "waves", quantity, words, caption)
 
 
-def _against_time(
-    store: Results, fitted: bool, kind: str, quantity: tuple[str, str], stem: str
-) -> tuple[str, Any, str] | None:
-    """Name, drawing and words of what was seen of a kind; ``quantity`` and unit are in the curves' heads."""
-    rows, (what, unit) = list(_seen(store, fitted, kind)), quantity
+@styled
+def _draw_time_figure(
+    store: Results, fitted: bool, kind: str, stem: str, quantity: tuple[str, str], words: str, caption: str
+) -> Figure | None:
+    """What was seen of a kind against time; ``quantity`` and its unit are in the heads of the curves."""
+    rows, (what, unit) = _read_curves(store, fitted, kind), quantity
     if not rows:
         return None
-    drawing, axes = panels(len(rows), 3, 2.1)
-    with matplotlib.rc_context(STYLE):
-        for i, (ax, (row, layer, whole)) in enumerate(zip(axes, rows, strict=True)):
-            curves = thin(whole)
-            x = curves["time_s"]
-            ax.plot(x, curves[f"{what}_measured_{unit}"], ".", ms=4, color=MEASURED, label="measured")
-            if f"{what}_simulated_{unit}" in curves:
-                ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
-            if f"{what}_low_{unit}" in curves:
-                low, high = curves[f"{what}_low_{unit}"], curves[f"{what}_high_{unit}"]
-                ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
-            ax.set_title(f"{row['record']}, {layer['what']}: {fixed(layer['error_percent'])} %")
-            if i + 3 >= len(rows):
-                ax.set_xlabel("Time (s)")
-            if i % 3 == 0:
-                ax.set_ylabel(f"{what.capitalize()} ({unit.replace('_', '/')})")
-        legend_above(drawing, axes[0])
-    told = ", ".join(f"{row['record']} {layer['what']}" for row, layer, _ in rows)
-    return f"{stem}-{_word(fitted)}", drawing, told
+    drawing, axes = make_panels(len(rows), 3, 2.1)
+    label_outer_axes(axes, 3, "Time (s)", f"{what.capitalize()} ({unit.replace('_', '/')})")
+    for ax, (row, layer, whole) in zip(axes, rows, strict=True):
+        curves = thin_curves(whole)
+        x = curves["time_s"]
+        ax.plot(x, curves[f"{what}_measured_{unit}"], ".", ms=4, color=MEASURED, label="measured")
+        if f"{what}_simulated_{unit}" in curves:
+            ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
+        if f"{what}_low_{unit}" in curves:
+            plot_band(ax, x, curves[f"{what}_low_{unit}"], curves[f"{what}_high_{unit}"])
+        ax.set_title(f"{row['record']}, {layer['what']}: {fixed(layer['error_percent'])} %")
+    add_legend_above(drawing, axes[0])
+    use = "fitted" if fitted else "held-out"
+    records = ", ".join(f"{row['record']} {layer['what']}" for row, layer, _ in rows)
+    alt = f"Measured and predicted {words}: {records}"
+    return make_figure(drawing, f"{stem}-{use}", alt, caption.format(use))
 
 
-def surface_figure(store: Results, fitted: bool) -> Figure | None:
+@styled
+def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
     """Predicted against measured displacement of the skin at the fitted or held-out sites; None where the
     skin was not seen."""
-    rows = [one for one in _seen(store, fitted, "surface") if "displacement_simulated_mm" in one[2]]
+    rows = [one for one in _read_curves(store, fitted, "surface") if "displacement_simulated_mm" in one[2]]
     if not rows:
         return None
-    drawing, axes = panels(len(rows), 3, 2.6)
-    with matplotlib.rc_context(STYLE):
-        for i, (ax, (row, seen, curves)) in enumerate(zip(axes, rows, strict=True)):
-            _draw_pairs(ax, curves, seen["components"])
-            ax.set_title(f"{row['record']}: {fixed(seen['error_percent'])} %")
-            if i + 3 >= len(rows):
-                ax.set_xlabel("Measured (mm)")
-            if i % 3 == 0:
-                ax.set_ylabel("Predicted (mm)")
-        legend_above(drawing, axes[0])
-    name = "surface-fitted" if fitted else "surface-held-out"
-    told = ", ".join(str(row["record"]) for row, _, _ in rows)
+    drawing, axes = make_panels(len(rows), 3, 2.6)
+    label_outer_axes(axes, 3, "Measured (mm)", "Predicted (mm)")
+    for ax, (row, seen, curves) in zip(axes, rows, strict=True):
+        _draw_pairs(ax, curves, seen["components"])
+        ax.set_title(f"{row['record']}: {fixed(seen['error_percent'])} %")
+    add_legend_above(drawing, axes[0])
+    use = "fitted" if fitted else "held-out"
+    records = ", ".join(str(row["record"]) for row, _, _ in rows)
     caption = (
-        f"Displacement of the skin around the indenter at the {_word(fitted)} sites: predicted against "
+        f"Displacement of the skin around the indenter at the {use} sites: predicted against "
         "measured, for every point, component and span of time that is compared, with its 95 % interval. On "
         "the line both agree; errors are means in percent of the largest displacement."
     )
-    return Figure(name, svg(drawing, name, f"Measured and predicted displacement of skin: {told}"), caption)
+    alt = f"Measured and predicted displacement of skin: {records}"
+    return make_figure(drawing, f"surface-{use}", alt, caption)
 
 
-def _draw_pairs(ax: matplotlib.axes.Axes, curves: Curves, components: list[str]) -> None:
+def _draw_pairs(ax: Axes, curves: Curves, components: list[str]) -> None:
     x, y = curves["displacement_measured_mm"], curves["displacement_simulated_mm"]
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     ax.plot(ends, ends, color=MEASURED, lw=0.8)
@@ -109,20 +91,17 @@ def _draw_pairs(ax: matplotlib.axes.Axes, curves: Curves, components: list[str])
         ax.vlines(x, low, high, color=SIMULATED, alpha=0.15, lw=0.8)
     for number, word in enumerate(components):
         chosen = curves["component"] == number
-        style = tissue_style(number) | {"ls": "", "ms": 2.5}
+        style = choose_tissue_style(number) | {"ls": "", "ms": 2.5}
         if chosen.any():
             ax.plot(x[chosen], y[chosen], **style, label=word)
 
 
-def _seen(store: Results, fitted: bool, kind: str) -> Iterator[tuple[Json, Json, Curves]]:
+def _read_curves(store: Results, fitted: bool, kind: str) -> list[tuple[Json, Json, Curves]]:
     """Rows of records, what was seen beside each in one way, and its stored curves."""
-    for row in store.predicted:
-        if bool(row.get("fitted")) == fitted:
-            for one in row.get("observed") or ():
-                curves = store.curves("predict", one["name"])
-                if one["kind"] == kind and curves is not None:
-                    yield row, one, curves
-
-
-def _word(fitted: bool) -> str:
-    return "fitted" if fitted else "held-out"
+    return [
+        (row, one, curves)
+        for row in store.predicted
+        if bool(row.get("fitted")) == fitted
+        for one in row.get("observed") or ()
+        if one["kind"] == kind and (curves := store.curves("predict", one["name"])) is not None
+    ]

@@ -24,13 +24,12 @@ from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..formats import number
 
 PAPER, INK = "#f6f5f1", "#222222"
 FIELD_MAP = "viridis"
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,39 +71,41 @@ class Mark:
 Shot = tuple[Array, View, list[Mark]]
 
 
-def _png(pixels: Array) -> str:
-    buffer = io.BytesIO()
-    matplotlib.image.imsave(buffer, pixels, format="png")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+def embed_png(data: bytes) -> str:
+    """A picture as the address of an image."""
+    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
 
 
 _GAP, _TITLE = 14, 46
 
 
-def strip(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
+def picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
     """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
     width = sum(view.size[0] for _, view, _ in shots) + _GAP * (len(shots) - 1)
     height = max(view.size[1] for _, view, _ in shots) + _TITLE
     parts, x = [], 0
     for (pixels, view, marks), title in zip(shots, titles, strict=True):
-        parts.append(f'<g transform="translate({x} 0)">{_panel(pixels, view, marks, title)}</g>')
+        parts.append(f'<g transform="translate({x} 0)">{_draw_svg_panel(pixels, view, marks, title)}</g>')
         x += view.size[0] + _GAP
     head = f'<svg class="picture" viewBox="0 0 {width} {height}" role="img"><title>{escape(alt)}</title>'
     return head + "".join(parts) + "</svg>"
 
 
-def _panel(pixels: Array, view: View, marks: list[Mark], title: str) -> str:
+def _draw_svg_panel(pixels: Array, view: View, marks: list[Mark], title: str) -> str:
     w, h = view.size
-    image = f'<image href="{_png(pixels)}" width="{w}" height="{h}"/>'
+    buffer = io.BytesIO()
+    matplotlib.image.imsave(buffer, pixels, format="png")
+    image = f'<image href="{embed_png(buffer.getvalue())}" width="{w}" height="{h}"/>'
     text = f'<text class="panel-title" x="2" y="{_TITLE - 12}">{escape(title)}</text>'
-    return f'{text}<g transform="translate(0 {_TITLE})">{image}{_labels(view, marks)}{_scale_bar(view)}</g>'
+    over = _draw_labels(view, marks) + _draw_scale_bar(view)
+    return f'{text}<g transform="translate(0 {_TITLE})">{image}{over}</g>'
 
 
-def _labels(view: View, marks: list[Mark]) -> str:
+def _draw_labels(view: View, marks: list[Mark]) -> str:
     """Dots, arrows and names; names stand right of their dot and give way to each other downwards."""
-    parts = [_arrow(view, mark) for mark in marks if mark.axis is not None]
+    parts = [_draw_arrow(view, mark) for mark in marks if mark.axis is not None]
     dots = [mark for mark in marks if mark.axis is None]
-    for mark, name_y in zip(*_label_places(view, dots), strict=True):
+    for mark, name_y in zip(*_place_labels(view, dots), strict=True):
         x, y = (float(v) for v in view.project(mark.position)[0])
         fill = mark.color if mark.filled else PAPER
         parts.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="9" fill="{fill}" stroke="{mark.color}"/>')
@@ -112,7 +113,7 @@ def _labels(view: View, marks: list[Mark]) -> str:
     return "".join(parts)
 
 
-def _arrow(view: View, mark: Mark) -> str:
+def _draw_arrow(view: View, mark: Mark) -> str:
     assert mark.axis is not None
     tip = view.project(mark.position)[0]
     step = view.project(mark.position + mark.axis)[0] - tip
@@ -125,12 +126,12 @@ def _arrow(view: View, mark: Mark) -> str:
     return f'{line}<polygon points="{head}" fill="{mark.color}"/>'
 
 
-def _scale_mm(view: View) -> int:
+def _choose_scale_mm(view: View) -> int:
     return next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * view.size[0])
 
 
-def _scale_bar(view: View) -> str:
-    length = _scale_mm(view)
+def _draw_scale_bar(view: View) -> str:
+    length = _choose_scale_mm(view)
     w, (right, bottom) = length * view.pixels_per_mm, (view.size[0] - 14, view.size[1] - 14)
     line = f'<line x1="{right - w:.1f}" y1="{bottom}" x2="{right}" y2="{bottom}" class="scale"/>'
     return f'{line}<text class="scale-text" x="{right}" y="{bottom - 10}">{length} mm</text>'
@@ -144,7 +145,7 @@ def legend(entries: Iterable[tuple[str, str]]) -> str:
     return f'<div class="legend">{items}</div>'
 
 
-def colour_bar(limits: tuple[float, float], title: str, colours: str = FIELD_MAP) -> str:
+def make_colour_bar(limits: tuple[float, float], title: str, colours: str = FIELD_MAP) -> str:
     stops = ", ".join(
         "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[colours](t)[:3])
         for t in np.linspace(0, 1, 9)
@@ -156,7 +157,7 @@ def colour_bar(limits: tuple[float, float], title: str, colours: str = FIELD_MAP
 
 # ---- pictures as PNG ------------------------------------------------------------------------------------
 
-_DPI, _PANEL_IN = 110, 4.6  # height of a row of panels
+_DPI, _PANEL_IN = 110, 4.6  # height of a row of make_panels
 _AXIS_MM = 14.0
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
 _SIDES = (("L", "R"), ("P", "A"), ("S", "I"))  # towards which an axis of patient space points, and from which
@@ -171,17 +172,16 @@ class PictureRow:
     bar: tuple[tuple[float, float], str] | None = None
 
 
-@dataclass(frozen=True)
-class Key:
+def make_key(text: str, color: str, dot: bool = False, filled: bool = True) -> Patch | Line2D:
     """An entry of a legend: a patch, or a dot (``filled`` or open) where ``dot``."""
-
-    text: str
-    color: str
-    dot: bool = False
-    filled: bool = True
+    if not dot:
+        return Patch(facecolor=color, edgecolor=INK, linewidth=0.4, label=text)
+    return Line2D([], [], ls="", marker="o", mfc=color if filled else "white", mec=color, ms=8, label=text)
 
 
-def sheet(title: str, rows: Sequence[PictureRow], keys: Sequence[Key] = (), spare_in: float = 0.0) -> Drawing:
+def figure_sheet(
+    title: str, rows: Sequence[PictureRow], keys: Sequence[Patch | Line2D], spare_in: float = 0.0
+) -> Drawing:
     """Rows of pictures on one sheet with a title and a legend; every picture has a scale and its sides.
 
     ``spare_in`` inches above the legend are left free.
@@ -193,29 +193,26 @@ def sheet(title: str, rows: Sequence[PictureRow], keys: Sequence[Key] = (), spar
     drawing = Drawing(figsize=(width, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(drawing)
     drawing.suptitle(title, x=0.01, y=1 - 0.1 / height, ha="left", va="top", fontsize=13)
-    grid = drawing.add_gridspec(
-        len(rows),
-        1,
-        left=0.01,
-        right=1 - margin,
-        top=1 - 0.55 / height,
-        bottom=(0.4 + spare_in) / height,
-        hspace=0.07,
-    )
-    for number_of_row, row in enumerate(rows):
+    inside = {
+        "left": 0.01,
+        "right": 1 - margin,
+        "top": 1 - 0.55 / height,
+        "bottom": (0.4 + spare_in) / height,
+    }
+    grid = drawing.add_gridspec(len(rows), 1, hspace=0.07, **inside)
+    for at, row in enumerate(rows):
         shares = [view.size[0] / view.size[1] for _, view, _ in row.shots]
-        inner = grid[number_of_row].subgridspec(1, len(shares), width_ratios=shares, wspace=0.03)
+        inner = grid[at].subgridspec(1, len(shares), width_ratios=shares, wspace=0.03)
         axes = [drawing.add_subplot(inner[0, column]) for column in range(len(shares))]
         for ax, (pixels, view, marks), name in zip(axes, row.shots, row.titles, strict=True):
             _draw_panel(ax, pixels, view, marks, name)
         if row.bar is not None:
             shades = ScalarMappable(Normalize(*row.bar[0]), FIELD_MAP)
             box = axes[-1].get_position()
-            inside = (1 - margin + 0.006, box.y0 + 0.1 * box.height, 0.011, 0.8 * box.height)
-            drawing.colorbar(shades, cax=drawing.add_axes(inside), label=row.bar[1])
+            place = (1 - margin + 0.006, box.y0 + 0.1 * box.height, 0.011, 0.8 * box.height)
+            drawing.colorbar(shades, cax=drawing.add_axes(place), label=row.bar[1])
     if keys:
-        handles = [_handle(key) for key in keys]
-        drawing.legend(handles=handles, loc="lower left", ncols=len(keys), frameon=False, fontsize=10)
+        drawing.legend(handles=list(keys), loc="lower left", ncols=len(keys), frameon=False, fontsize=10)
     return drawing
 
 
@@ -226,13 +223,6 @@ def write_png(drawing: Drawing, file: Path) -> None:
     draft.replace(file)
 
 
-def _handle(key: Key) -> Patch | Line2D:
-    if not key.dot:
-        return Patch(facecolor=key.color, edgecolor=INK, linewidth=0.4, label=key.text)
-    face = key.color if key.filled else "white"
-    return Line2D([], [], ls="", marker="o", mfc=face, mec=key.color, ms=8, label=key.text)
-
-
 def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: str) -> None:
     w, h = view.size
     ax.imshow(pixels, extent=(0, w, h, 0), interpolation="antialiased")
@@ -240,7 +230,7 @@ def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: s
     ax.set_title(title, fontsize=10, loc="left", pad=3)
     for spine in ax.spines.values():
         spine.set_visible(False)
-    for mark, name_y in zip(*_label_places(view, marks), strict=True):
+    for mark, name_y in zip(*_place_labels(view, marks), strict=True):
         x, y = view.project(mark.position)[0]
         face = mark.color if mark.filled else PAPER
         ax.plot(x, y, "o", ms=6, mfc=face, mec=mark.color, mew=1.4)
@@ -254,14 +244,14 @@ def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: s
     for (dx, dy), direction in zip(((1, 0), (0, 1)), right, strict=True):
         for sign in (1, -1):
             x, y = (0.5 + sign * dx * 0.475) * w, (0.5 + sign * dy * 0.478) * h
-            ax.text(x, y, _side(sign * direction), fontsize=9, ha="center", va="center", color="#5a5a5a")
-    length = _scale_mm(view)
+            ax.text(x, y, _name_side(sign * direction), fontsize=9, ha="center", va="center", color="#5a5a5a")
+    length = _choose_scale_mm(view)
     end, base = 0.97 * w, 0.965 * h
     ax.plot([end - length * view.pixels_per_mm, end], [base, base], color=INK, lw=2)
     ax.text(end, base - 0.012 * h, f"{length} mm", fontsize=9, ha="right", va="bottom", color=INK)
 
 
-def _label_places(view: View, marks: Sequence[Mark]) -> tuple[list[Mark], list[float]]:
+def _place_labels(view: View, marks: Sequence[Mark]) -> tuple[list[Mark], list[float]]:
     """Marks from top to bottom, and the heights (pixels) at which their names do not touch."""
     ordered = sorted(marks, key=lambda m: float(view.project(m.position)[0, 1]))
     placed: list[tuple[float, float]] = []
@@ -274,7 +264,7 @@ def _label_places(view: View, marks: Sequence[Mark]) -> tuple[list[Mark], list[f
     return ordered, [y for _, y in placed]
 
 
-def _side(direction: Array) -> str:
+def _name_side(direction: Array) -> str:
     """The letter of the side of the body to which a direction (LPS) points."""
     axis = int(np.abs(direction).argmax())
     return _SIDES[axis][0 if direction[axis] > 0 else 1]

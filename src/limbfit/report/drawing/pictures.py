@@ -4,8 +4,9 @@ and 6) and the deformed cut at the peak.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ import pyvista as pv
 from numpy.typing import NDArray
 from vtkmodules.vtkCommonCore import vtkLogger
 
+from ...arrays import Array
 from ...web.shapes import patient_frame
 from ..page import Figure
 from ..store import Json, Results
-from .panels import FIELD_MAP, PAPER, Mark, Shot, View, colour_bar, legend, strip
+from .panels import FIELD_MAP, PAPER, Mark, Shot, View, embed_png, legend, make_colour_bar, picture_row
 
 SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
 BETWEEN = ("#7d6a2e", "#f7efce", "#4a6472")  # layers between the outermost and the core
@@ -31,7 +33,6 @@ FIELDS = (
     ("displacement_mm", "displacement (mm)"),
     ("J", "volume ratio J (–)"),
 )
-Array = NDArray[np.float64]
 Grid = Any  # a pyvista data set; what its stubs promise differs between its releases
 
 
@@ -40,7 +41,7 @@ def unit(values: Iterable[float]) -> Array:
     return v / np.linalg.norm(v)
 
 
-def limb_frame(store: Results) -> Array:
+def read_limb_frame(store: Results) -> Array:
     """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
     return patient_frame(store.surfaces.get("cut_normal"))
 
@@ -56,7 +57,7 @@ def without_display_warning() -> Iterator[None]:
         vtkLogger.SetStderrVerbosity(before)
 
 
-def shoot(plotter: Any, view: View) -> Array:
+def render_view(plotter: Any, view: View) -> Array:
     """The picture (rows, columns, 3) of what the plotter holds, seen by a view."""
     camera = plotter.camera
     camera.parallel_projection = True
@@ -70,76 +71,100 @@ def shoot(plotter: Any, view: View) -> Array:
     return np.asarray(plotter.screenshot(return_img=True))
 
 
-def new_plotter() -> Any:
+def make_plotter() -> Any:
     plotter: Any = pv.Plotter(off_screen=True, lighting="light kit")
     plotter.set_background(PAPER)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
 
 
-@without_display_warning()
-def surface_figure(store: Results) -> Figure | None:
-    """The limb from four sides: skin translucent, bones and regions inside, sites named where they show."""
-    files = store.surface_files
-    if "skin" not in files:
-        return None
-    plotter = new_plotter()
-    skin = pv.read(files["skin"])
+def make_limb_plotter(store: Results, skin: Any) -> Any:
+    """The translucent skin with what is inside: bones, and regions of soft tissue in another colour."""
+    plotter = make_plotter()
     plotter.enable_depth_peeling(8)
     plotter.add_mesh(skin, color=SKIN_SURFACE, opacity=0.36, smooth_shading=True, **MATT)
-    add_inner(plotter, files)
-    views = four_sides(store, skin)
-    shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
+    for name, file in store.surface_files.items():
+        if name != "skin":
+            plotter.add_mesh(pv.read(file), color=choose_inner_colour(name), **MATT)
+    return plotter
+
+
+def choose_inner_colour(name: str) -> str:
+    """The colour of a surface inside the skin, by the name of its file."""
+    return BONE if name.startswith("bone-") else BETWEEN[0]
+
+
+def render_views(
+    plotter: Any, views: Sequence[View], marks: Callable[[View], list[Mark]] = lambda view: []
+) -> list[Shot]:
+    """The pictures of what the plotter holds, each with its marks; the plotter is closed."""
+    shots = [(render_view(plotter, view), view, marks(view)) for view in views]
     plotter.close()
+    return shots
+
+
+def make_field_plotter(
+    mesh: Any, values: Any, limits: tuple[float, float], colours: str = FIELD_MAP, **surface: Any
+) -> Any:
+    """A surface coloured by values or a stored field, without shading, so that colours can be read off."""
+    plotter = make_plotter()
+    style = surface or {"lighting": False}
+    plotter.add_mesh(mesh, scalars=values, clim=limits, cmap=colours, show_scalar_bar=False, **style)
+    return plotter
+
+
+@without_display_warning()
+def draw_surface_figure(store: Results) -> Figure | None:
+    """The limb from four sides: skin translucent, bones and regions inside, sites named where they show."""
+    if "skin" not in store.surface_files:
+        return None
+    skin = pv.read(store.surface_files["skin"])
+    views = make_four_views(store, skin)
+    shots = render_views(make_limb_plotter(store, skin), views, lambda view: _mark_facing_sites(store, view))
     alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
     caption = (
         "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
         "Filled: sites that were fitted; open: held out."
     )
-    return Figure("model", strip(shots, SIDES, alt), caption)
-
-
-def add_inner(plotter: Any, files: Mapping[str, Path]) -> None:
-    """The surfaces inside the skin: bones, and regions of soft tissue in a colour of their own."""
-    for name, file in files.items():
-        if name != "skin":
-            plotter.add_mesh(pv.read(file), color=inner_colour(name), **MATT)
-
-
-def inner_colour(name: str) -> str:
-    """The colour of a surface inside the skin, by the name of its file."""
-    return BONE if name.startswith("bone-") else BETWEEN[0]
+    return Figure("model", picture_row(shots, SIDES, alt), caption)
 
 
 @without_display_warning()
-def marker_figure(store: Results) -> Figure | None:
+def draw_marker_figure(store: Results) -> Figure | None:
     """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
     marked_file, plain_file = store.folder / "segment" / "skin-markers.stl", store.surface_files.get("skin")
     if plain_file is None or not marked_file.is_file():
         return None
     plain = pv.read(plain_file)
     marked = pv.read(marked_file).compute_implicit_distance(plain)
-    plotter = new_plotter()
     limits = (0.0, float(np.ceil(MARKER_COLOUR_MM)))
-    plotter.add_mesh(
-        marked, scalars="implicit_distance", clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, **MATT
-    )
-    views = four_sides(store, plain)
-    shots = [(shoot(plotter, view), view, _facing(store, view)) for view in views]
-    plotter.close()
+    plotter = make_field_plotter(marked, "implicit_distance", limits, **MATT)
+    shots = render_views(plotter, make_four_views(store, plain), lambda view: _mark_facing_sites(store, view))
     alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
     caption = (
         "Figure 1 of the paper for this study: skin with markers, coloured by its distance from the skin "
-        "without: each site of the "
-        "study was matched to one of the bumps."
+        "without: each site of the study was matched to one of the bumps."
     )
-    bar = colour_bar(limits, "distance (mm)")
-    return Figure("markers", strip(shots, SIDES, alt) + bar, caption)
+    bar = make_colour_bar(limits, "distance (mm)")
+    return Figure("markers", picture_row(shots, SIDES, alt) + bar, caption)
 
 
-def four_sides(store: Results, skin: Any) -> list[View]:
+def draw_slices_figure(store: Results) -> Figure | None:
+    """The stored picture of outlines over slices, and what its slices to look at are."""
+    file = store.folder / "segment" / "quality.png"
+    if not file.is_file():
+        return None
+    caption = (
+        "Outlines of the limb and of its labels over slices from end to end; enlarged below: slices in which "
+        "an area or a centroid does not fit its neighbours."
+    )
+    markup = f'<img src="{embed_png(file.read_bytes())}" alt="{escape(caption)}" style="width:100%">'
+    return Figure("slices", markup, caption)
+
+
+def make_four_views(store: Results, skin: Any) -> list[View]:
     """Views of the whole limb, in the order of ``SIDES``."""
-    left, back, up = limb_frame(store)
+    left, back, up = read_limb_frame(store)
     points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
     half = np.abs(points).max(axis=0) * 1.06 + 4
     width = 2 * max(half[0], half[1]) + 8
@@ -147,41 +172,37 @@ def four_sides(store: Results, skin: Any) -> list[View]:
     return [View(np.array(skin.center), side, up, half[2], size) for side in (back, -left, -back, left)]
 
 
-def _facing(store: Results, view: View) -> list[Mark]:
+def _mark_facing_sites(store: Results, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
-    marks = []
-    for row in store.sites:
-        if row.get("position_mm") and row.get("axis") and unit(row["axis"]) @ view.direction > 0.5:
-            marks.append(site_mark(row))
-    return marks
+    return [
+        _mark_site(row) for row in store.placed_sites.values() if unit(row["axis"]) @ view.direction > 0.5
+    ]
 
 
-def site_mark(row: Json, axis: bool = False) -> Mark:
-    fitted = bool(row.get("fitted"))
-    color = FITTED if fitted else HELD_OUT
+def _mark_site(row: Json, axis: bool = False) -> Mark:
+    color = FITTED if row.get("fitted") else HELD_OUT
     position, direction = np.array(row["position_mm"]), unit(row["axis"]) if axis else None
-    return Mark(str(row["site"]), position, color, fitted, direction)
+    return Mark(str(row["site"]), position, color, bool(row.get("fitted")), direction)
 
 
 @without_display_warning()
-def mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
+def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
-    rows = drawable(store, sites, "mesh")
-    if not rows:
-        return None
     whole: list[Shot] = []
     near: list[Shot] = []
     colours: dict[str, str] = {}
-    for row, file in rows:
-        view, close = cut_views(store, row, file)
-        plotter = new_plotter()
-        grid = linear(file)
-        colours |= region_colours(grid)
-        add_regions(plotter, far_side(grid, view))
-        whole.append((shoot(plotter, view), view, [site_mark(row, axis=True)]))
-        near.append((shoot(plotter, close), close, []))
-        plotter.close()
-    names = [row["site"] for row, _ in rows]
+    names: list[str] = []
+    for row, file in find_placed_meshes(store, sites, "mesh"):
+        grid, views = read_linear(file), make_cut_views(store, row, file)
+        plotter = make_plotter()
+        add_regions(plotter, cut_behind(grid, views[0]))
+        (picture, view, _), close = render_views(plotter, views)
+        whole.append((picture, view, [_mark_site(row, axis=True)]))
+        near.append(close)
+        colours |= choose_region_colours(grid)
+        names.append(row["site"])
+    if not names:
+        return None
     alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
     paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
@@ -192,53 +213,43 @@ def mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
         "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
     )
     titles = [f"site {name}" for name in names]
-    markup = strip(whole, titles, alt) + strip(near, [f"{t}, near" for t in titles], alt) + key
+    markup = picture_row(whole, titles, alt) + picture_row(near, [f"{t}, near" for t in titles], alt) + key
     return Figure("mesh-cut", markup, caption)
 
 
 @without_display_warning()
-def field_figure(store: Results, sites: Sequence[str], stage: str, name: str) -> Figure | None:
+def draw_field_figure(store: Results, sites: Sequence[str], stage: str, name: str) -> Figure | None:
     """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
-    rows = drawable(store, sites, stage)
-    grids = [(row, file, linear(file)) for row, file in rows]
+    grids = [(row, file, read_linear(file)) for row, file in find_placed_meshes(store, sites, stage)]
     stored = {name for _, _, grid in grids for name in grid.array_names}
     field = next(((name, title) for name, title in FIELDS if name in stored), None)
-    if not grids or field is None or "displacement_mm" not in stored:
+    if field is None or "displacement_mm" not in stored:
         return None
-    views = [cut_views(store, row, file)[1] for row, file, _ in grids]
-    cuts = [far_side(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
-    limits = _limits(cuts, views, field[0])
-    shots: list[Shot] = [
-        (shoot_field(cut, view, field[0], limits), view, []) for view, cut in zip(views, cuts, strict=True)
-    ]
+    views = [make_cut_views(store, row, file)[1] for row, file, _ in grids]
+    cuts = [cut_behind(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
+    limits = _find_colour_limits(cuts, views, field[0])
+    shots = [render_field(cut, view, field[0], limits) for view, cut in zip(views, cuts, strict=True)]
     names = [row["site"] for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
     caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
-    return Figure(
-        name, strip(shots, [f"site {name}" for name in names], alt) + colour_bar(limits, field[1]), caption
-    )
+    markup = picture_row(shots, [f"site {name}" for name in names], alt) + make_colour_bar(limits, field[1])
+    return Figure(name, markup, caption)
 
 
-def shoot_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Array:
-    """A deformed cut, coloured by a field without shading, so that colours can be read off the bar."""
-    plotter = new_plotter()
+def render_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Shot:
+    """A deformed cut, coloured by a field."""
     surface = cut.warp_by_vector("displacement_mm").extract_surface(algorithm="dataset_surface")
-    plotter.add_mesh(
-        surface, scalars=field, clim=limits, cmap=FIELD_MAP, show_scalar_bar=False, lighting=False
-    )
-    pixels = shoot(plotter, view)
-    plotter.close()
-    return pixels
+    return render_views(make_field_plotter(surface, field, limits), [view])[0]
 
 
-def drawable(store: Results, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
+def find_placed_meshes(store: Results, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
     """Sites with a place and a stored mesh."""
-    rows = {row["site"]: row for row in store.sites if row.get("position_mm") and row.get("axis")}
+    rows = store.placed_sites
     found = [(rows[name], store.vtu(stage, name)) for name in sites if name in rows]
     return [(row, file) for row, file in found if file is not None]
 
 
-def linear(file: Path) -> Grid:
+def read_linear(file: Path) -> Grid:
     """The stored mesh with straight-edged tetrahedra, which draw much faster.
 
     Made by hand: VTK's linear copy keeps the mid-edge nodes in the connectivity, and cutting it crashes.
@@ -255,11 +266,11 @@ def linear(file: Path) -> Grid:
     return plain
 
 
-def cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
+def make_cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
     """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
-    up = limb_frame(store)[2]
+    up = read_limb_frame(store)[2]
     axis = unit(row["axis"])
-    normal = unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else limb_frame(store)[0]
+    normal = unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else read_limb_frame(store)[0]
     points = np.asarray(pv.read(file).points)
     height = points @ up
     middle = points.mean(axis=0)
@@ -271,7 +282,7 @@ def cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
     return whole, close
 
 
-def far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
+def cut_behind(grid: Grid, view: View, smooth: bool = False) -> Grid:
     """What lies behind the plane through the middle of the view: whole cells, or cut through."""
     if smooth:
         return grid.clip(normal=tuple(view.direction), origin=tuple(view.focal), invert=False)
@@ -281,23 +292,26 @@ def far_side(grid: Grid, view: View, smooth: bool = False) -> Grid:
 
 def add_regions(plotter: Any, grid: Grid) -> None:
     regions = np.asarray(grid.cell_data["region"])
-    for index, colour in enumerate(region_colours(grid).values()):
+    for index, colour in enumerate(choose_region_colours(grid).values()):
         part = grid.extract_cells(np.flatnonzero(regions == index))
         if part.n_cells:
             surface = part.extract_surface(algorithm="dataset_surface")
-            bone = _on_bone(surface)
+            bone = _find_bone_wall(surface)
             for chosen, color in ((~bone, colour), (bone, BONE)):
-                _add_faces(plotter, surface.extract_cells(np.flatnonzero(chosen)), color)
+                faces = surface.extract_cells(np.flatnonzero(chosen))
+                if faces.n_cells:
+                    edges = {"show_edges": True, "edge_color": "#4a2f2f", "line_width": 1.5}
+                    plotter.add_mesh(faces, color=color, **edges, **MATT)
 
 
-def region_colours(grid: Grid) -> dict[str, str]:
+def choose_region_colours(grid: Grid) -> dict[str, str]:
     """The colour of each region: layers, outermost first, what is inside the core, and the core."""
     names = [str(name) for name in grid.field_data["region_names"]]
     between = [BETWEEN[i % len(BETWEEN)] for i in range(len(names) - 2)]
     return dict(zip(names, [SKIN, *between, MUSCLE], strict=False))
 
 
-def _on_bone(surface: Grid) -> NDArray[np.bool_]:
+def _find_bone_wall(surface: Grid) -> NDArray[np.bool_]:
     """Which triangles of a region's surface are the wall of a bone void."""
     if "in fixed_bone" not in surface.point_data:
         return np.zeros(surface.n_cells, dtype=bool)
@@ -305,12 +319,7 @@ def _on_bone(surface: Grid) -> NDArray[np.bool_]:
     return np.asarray(surface.point_data["in fixed_bone"])[triangles].all(axis=1)
 
 
-def _add_faces(plotter: Any, faces: Grid, color: str) -> None:
-    if faces.n_cells:
-        plotter.add_mesh(faces, color=color, show_edges=True, edge_color="#4a2f2f", line_width=1.5, **MATT)
-
-
-def _limits(cuts: Sequence[Grid], views: Sequence[View], field: str) -> tuple[float, float]:
+def _find_colour_limits(cuts: Sequence[Grid], views: Sequence[View], field: str) -> tuple[float, float]:
     """Colour limits shared by all pictures: percentiles of what they show, so that a corner does not rule."""
     shown = []
     for cut, view in zip(cuts, views, strict=True):

@@ -29,15 +29,15 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Labe
     """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
     order = [*(n for n in range(3) if n != quality.axis), quality.axis]
     image, turned = volume.turned(order), labels.turned(order)
-    window = _window(turned.limb)
+    window = _find_window(turned.limb)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE
     }
-    colours = _colours(list(masks))
-    shown = _evenly(turned.limb)
-    odd = _worst(quality)
+    colours = _choose_colours(list(masks))
+    shown = _choose_slices(turned.limb)
+    odd = _choose_suspects(quality)
     large_rows = -(-len(odd) // _LARGE)
-    ratio = _ratio(window, turned)
+    ratio = _compute_ratio(window, turned)
     small, large = 12 / _COLUMNS / ratio + 0.25, 12 / _LARGE / ratio + 0.3
     rows = -(-len(shown) // _COLUMNS)
     figure = Figure(figsize=(12, 0.9 + rows * small + large_rows * large), facecolor="white")
@@ -63,7 +63,7 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Labe
     figure.savefig(path, dpi=100, metadata={"Software": "limbfit"})
 
 
-def _window(limb: Mask) -> tuple[slice, slice]:
+def _find_window(limb: Mask) -> tuple[slice, slice]:
     """Rows and columns of the limb with a margin."""
     found = []
     for axes in ((0, 2), (0, 1)):
@@ -72,20 +72,20 @@ def _window(limb: Mask) -> tuple[slice, slice]:
     return found[0], found[1]
 
 
-def _ratio(window: tuple[slice, slice], labels: LabelMap) -> float:
+def _compute_ratio(window: tuple[slice, slice], labels: LabelMap) -> float:
     """Width over height of the window, as it is drawn."""
     rows, columns = (part.stop - part.start for part in window)
     return float(columns * labels.spacing[0] / (rows * labels.spacing[1]))
 
 
-def _evenly(limb: Mask) -> list[int]:
+def _choose_slices(limb: Mask) -> list[int]:
     """Slices from the limb's first to its last."""
     filled = np.flatnonzero(limb.any(axis=(1, 2)))
     count = min(_COLUMNS * _ROWS, len(filled))
     return [int(filled[n]) for n in np.unique(np.linspace(0, len(filled) - 1, count).round().astype(int))]
 
 
-def _worst(quality: LabelQuality) -> list[tuple[int, str]]:
+def _choose_suspects(quality: LabelQuality) -> list[tuple[int, str]]:
     """Slices to look at with what is odd there, at most six, evenly taken from all."""
     said: dict[int, list[str]] = {}
     for suspect in quality.suspects:
@@ -96,7 +96,7 @@ def _worst(quality: LabelQuality) -> list[tuple[int, str]]:
     return [(k, "; ".join(said[k][:2])) for k in slices]
 
 
-def _colours(names: list[str]) -> dict[str, str]:
+def _choose_colours(names: list[str]) -> dict[str, str]:
     others = iter(_OTHERS * (len(names) // len(_OTHERS) + 1))
     return {name: COLOURS.get(name) or next(others) for name in names}
 

@@ -5,30 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..page import Figure
 from ..store import Json, Results
-from .ink import MUTED, SIMULATED, STYLE, THIRD, legend_above, panels, svg
-from .panels import FIELD_MAP, Mark, Shot, View, colour_bar, strip
+from .colours import MUTED, SIMULATED, THIRD
+from .panels import FIELD_MAP, Mark, Shot, View, make_colour_bar, picture_row
 from .pictures import (
     SIDES,
     Grid,
-    far_side,
-    four_sides,
-    limb_frame,
-    linear,
-    new_plotter,
-    shoot,
-    shoot_field,
+    cut_behind,
+    make_field_plotter,
+    make_four_views,
+    read_limb_frame,
+    read_linear,
+    render_field,
+    render_views,
     unit,
     without_display_warning,
 )
+from .plots import add_legend_above, make_figure, make_panels, styled
 
-Array = NDArray[np.float64]
 FIELDS = (("pressure_kPa", "pressure (kPa)"), ("shear_kPa", "shear (kPa)"))
 OUTER = "face_set:skin"
 SHEAR, MARKED = "shear_strain", "#d62728"
@@ -36,15 +35,24 @@ OFFSET, OFFSET_MAP = "offset_mm", "RdBu_r"
 
 
 @without_display_warning()
-def pressure_figures(store: Results, files: Mapping[str, Path], name: str = "socket") -> tuple[Figure, ...]:
+def draw_pressure_figures(store: Results, files: Mapping[str, Path], name: str) -> tuple[Figure, ...]:
     """Pressure and shear on four sides, one colour scale for all the stored fields, by their titles."""
-    surfaces = {title: _surface(file) for title, file in files.items() if file.is_file()}
+    surfaces = {title: _read_surface(file) for title, file in files.items() if file.is_file()}
     if not surfaces:
         return ()
-    return tuple(_figure(store, surfaces, field, words, name) for field, words in FIELDS)
+    figures = []
+    for field, words in FIELDS:
+        top = max(float(np.max(surface.point_data[field])) for surface in surfaces.values())
+        alt = f"The limb coloured by {words}"
+        markup = _render_surfaces(store, surfaces, field, (0.0, max(top, 1e-6)), FIELD_MAP, alt, words)
+        caption = (
+            f"What the socket does to the limb when it has been held: {words}, one colour scale for all."
+        )
+        figures.append(Figure(f"{name}-{field.removesuffix('_kPa')}", markup, caption))
+    return tuple(figures)
 
 
-def _surface(file: Path) -> Grid:
+def _read_surface(file: Path) -> Grid:
     """The deformed outer surface with straight-edged triangles, and what is stored at its nodes."""
     grid = pv.read(file)
     faces = np.asarray(grid.field_data[OUTER])[:, :3]
@@ -57,39 +65,27 @@ def _surface(file: Path) -> Grid:
     return surface
 
 
-def _figure(store: Results, surfaces: Mapping[str, Grid], field: str, words: str, name: str) -> Figure:
-    top = max(float(np.max(surface.point_data[field])) for surface in surfaces.values())
-    limits = (0.0, max(top, 1e-6))
-    kind = field.removesuffix("_kPa")
-    markup = _strips(store, surfaces, field, limits, FIELD_MAP, f"The limb coloured by {words}")
-    caption = f"What the socket does to the limb when it has been held: {words}, one colour scale for all."
-    return Figure(f"{name}-{kind}", markup + colour_bar(limits, words), caption)
-
-
-def _strips(
+def _render_surfaces(
     store: Results,
     surfaces: Mapping[str, Grid],
     field: str,
     limits: tuple[float, float],
     colours: str,
     alt: str,
+    words: str,
 ) -> str:
-    """A row of four sides for every surface, by its title."""
-    views = four_sides(store, next(iter(surfaces.values())))
+    """A row of four sides for every surface, by its title, and the bar of their colours."""
+    views = make_four_views(store, next(iter(surfaces.values())))
     markup = ""
     for title, surface in surfaces.items():
-        plotter = new_plotter()
-        plotter.add_mesh(
-            surface, scalars=field, clim=limits, cmap=colours, show_scalar_bar=False, lighting=False
-        )
-        shots: list[Shot] = [(shoot(plotter, view), view, []) for view in views]
-        plotter.close()
-        markup += strip(shots, [f"{title}, {side}" for side in SIDES], f"{alt}, {title}, from four sides")
-    return markup
+        shots = render_views(make_field_plotter(surface, field, limits, colours), views)
+        titles = [f"{title}, {side}" for side in SIDES]
+        markup += picture_row(shots, titles, f"{alt}, {title}, from four sides")
+    return markup + make_colour_bar(limits, words, colours)
 
 
 @without_display_warning()
-def offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
+def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
     """Faces of sockets by their titles, coloured by how far outside the unloaded limb they are."""
     faces = {title: pv.read(file) for title, file in files.items() if file.is_file()}
     if not faces:
@@ -97,39 +93,41 @@ def offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
     most = max(float(np.percentile(np.abs(face.point_data[OFFSET]), 99)) for face in faces.values())
     limits = (-max(most, 0.1), max(most, 0.1))
     words = "offset from the unloaded limb (mm)"
-    markup = _strips(store, faces, OFFSET, limits, OFFSET_MAP, f"Face of the socket coloured by {words}")
+    alt = f"Face of the socket coloured by {words}"
+    markup = _render_surfaces(store, faces, OFFSET, limits, OFFSET_MAP, alt, words)
     caption = (
         "Faces of the sockets: offset from the unloaded limb under its liner, negative where pressed in."
     )
-    return Figure("socket-design-offset", markup + colour_bar(limits, words, OFFSET_MAP), caption)
+    return Figure("socket-design-offset", markup, caption)
 
 
 @without_display_warning()
-def inside_figure(store: Results, title: str, inside: Sequence[Json], file: Path) -> tuple[Figure, ...]:
+def draw_inside_figure(store: Results, title: str, inside: Sequence[Json], file: Path) -> tuple[Figure, ...]:
     """Cuts along and across the limb through the place of the largest shear, coloured by it."""
     if not file.is_file():
         return ()
-    grid, worst = linear(file), max(inside, key=lambda found: found["shear"])
+    grid, worst = read_linear(file), max(inside, key=lambda found: found["shear"])
     place = np.asarray(worst["place_mm"], dtype=float)
     shear, words = np.asarray(grid.cell_data[SHEAR]), "shear strain"
     limits = (0.0, max(float(np.percentile(shear, 99.5)), 1e-6))
+    nearest = np.argmin(np.linalg.norm(np.asarray(grid.points) - place, axis=1))
+    mark = Mark("largest", place + np.asarray(grid.point_data["displacement_mm"])[nearest], MARKED)
     shots: list[Shot] = []
-    for view in _cuts(store, grid, place):
-        pixels = shoot_field(far_side(grid, view, smooth=True), view, SHEAR, limits)
-        moved = place + _moved(grid, place)
-        shots.append((pixels, view, [Mark("largest", moved, MARKED)]))
+    for view in _make_cut_views(store, grid, place):
+        pixels = render_field(cut_behind(grid, view, smooth=True), view, SHEAR, limits)[0]
+        shots.append((pixels, view, [mark]))
     near = f", near {worst['near']}" if worst["near"] else ""
     caption = (
         f"Inside the limb, {title}: cuts along and across it through the largest shear "
         f"({worst['tissue']}{near}), deformed; colour: largest shear strain of each element."
     )
-    markup = strip(shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}")
-    return (Figure("socket-inside", markup + colour_bar(limits, words), caption),)
+    markup = picture_row(shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}")
+    return (Figure("socket-inside", markup + make_colour_bar(limits, words), caption),)
 
 
-def _cuts(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
+def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
     """The whole limb, cut along it through its middle and a place, and across it there."""
-    _, back, up = limb_frame(store)
+    _, back, up = read_limb_frame(store)
     points = np.asarray(grid.points)
     middle = points.mean(axis=0)
     outwards = (place - middle) - (place - middle) @ up * up
@@ -147,30 +145,24 @@ def _cuts(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
     )
 
 
-def _moved(grid: Grid, place: Array) -> Array:
-    """Displacement (3,) mm of the node nearest to a place at rest."""
-    nearest = np.argmin(np.linalg.norm(np.asarray(grid.points) - place, axis=1))
-    return np.asarray(grid.point_data["displacement_mm"])[nearest]
-
-
-def settling_figure(content: Json) -> Figure:
+@styled
+def draw_settling_figure(content: Json) -> Figure:
     """Force on the socket and its move along the limb, largest and mean pressure, over time."""
-    drawing, axes = panels(3, 3, 2.5)
+    drawing, axes = make_panels(3, 3, 2.5)
     steps = content["steps"]
     time = np.array([row["time_s"] for row in steps])
     force = np.linalg.norm([row["force_N"] for row in steps], axis=1)
-    with matplotlib.rc_context(STYLE):
-        axes[0].plot(time, force, color=SIMULATED)
-        axes[1].plot(time, [row["move_mm"][2] for row in steps], color=SIMULATED)
-        axes[2].plot(time, [row["peak_kPa"] for row in steps], color=SIMULATED, label="largest")
-        axes[2].plot(time, [row["mean_kPa"] for row in steps], "--", color=THIRD, label="mean")
-        labels = ("Force on the socket (N)", "Move towards the body (mm)", "Pressure (kPa)")
-        for ax, label in zip(axes, labels, strict=True):
-            ax.set(xlabel="Time (s)", ylabel=label)
-            for end in [content["donning"]["time_s"], *(load["time_s"] for load in content["loads"])]:
-                ax.axvline(end, color=MUTED, lw=0.6)
-            ax.margins(x=0.01)
-        legend_above(drawing, axes[2])
+    axes[0].plot(time, force, color=SIMULATED)
+    axes[1].plot(time, [row["move_mm"][2] for row in steps], color=SIMULATED)
+    axes[2].plot(time, [row["peak_kPa"] for row in steps], color=SIMULATED, label="largest")
+    axes[2].plot(time, [row["mean_kPa"] for row in steps], "--", color=THIRD, label="mean")
+    labels = ("Force on the socket (N)", "Move towards the body (mm)", "Pressure (kPa)")
+    for ax, label in zip(axes, labels, strict=True):
+        ax.set(xlabel="Time (s)", ylabel=label)
+        for end in [content["donning"]["time_s"], *(load["time_s"] for load in content["loads"])]:
+            ax.axvline(end, color=MUTED, lw=0.6)
+        ax.margins(x=0.01)
+    add_legend_above(drawing, axes[2])
     alt = "Force on the socket, its move and the pressure over time, from donning to the last load"
     caption = "The socket over time; lines: the end of donning and of each load, held."
-    return Figure("socket-time", svg(drawing, "socket-time", alt), caption)
+    return make_figure(drawing, "socket-time", alt, caption)

@@ -1,1 +1,1 @@
-"""The sections of the report, in the order of a paper."""
+"""The sections of the report, each made from the store; what is not stored is said in a sentence."""

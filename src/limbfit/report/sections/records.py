@@ -2,61 +2,69 @@
 
 from __future__ import annotations
 
-import matplotlib
+from collections.abc import Sequence
+
 from matplotlib.axes import Axes
 
-from ..drawing.figures import thin
-from ..drawing.ink import GRID, INK, MUTED, SIMULATED, STYLE, legend_above, panels, svg
-from ..formats import fixed, heading, numeric
-from ..page import Cell, Figure, Row, Table
+from ..drawing.colours import GRID, INK, MUTED, SIMULATED
+from ..drawing.figures import thin_curves
+from ..drawing.interactive import record_curves
+from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..formats import fixed
+from ..page import Figure, Section, Table, make_section
 from ..store import Curves, Json, Results
-from ..tables import NOTHING
+from ..tables import make_table
 
-MOST_NAMED = 6  # phases whose names have room in a panel
+MAX_NAMED_PHASES = 6  # whose names have room in a panel
 
 
-def record_figure(store: Results, site: str) -> Figure | None:
+def make_record_section(store: Results) -> Section:
+    """Indentation records."""
+    fitted = [name for site in store.fitted for name in store.records_of(site)]
+    chosen = [name for name in (*fitted, *store.traces) if store.curves("traces", name)]
+    return make_section(
+        "records",
+        "Indentation records",
+        draw_record_figure(store, chosen[0]) if chosen else None,
+        record_curves(store, tuple(dict.fromkeys(chosen))),
+        make_trace_table(store) if store.traces else None,
+        otherwise="No indentation records are stored yet.",
+    )
+
+
+@styled
+def draw_record_figure(store: Results, site: str) -> Figure | None:
     """Figure 3: one site's record as the robot wrote it, and regularised from touch-down on."""
-    raw, regular = store.curves("traces", f"{site}-raw"), store.curves("traces", site)
+    raw, regular, touch_down = store.record_curves(site)
     if raw is None or regular is None:
         return None
     facts = store.traces.get(site, {})
-    start = (facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0))
-    drawing, axes = panels(3, 3, 2.5)
-    with matplotlib.rc_context(STYLE):
-        _draw_record(axes, thin(raw), regular, start)
-        for ax in axes[:2]:
-            _mark_phases(ax, facts.get("phases") or [])
-        legend_above(drawing, axes[0])
+    drawing, axes = make_panels(3, 3, 2.5)
+    _draw_record(axes, thin_curves(raw), regular, touch_down)
+    for ax in axes[:2]:
+        _mark_phases(ax, facts.get("phases") or [])
+    add_legend_above(drawing, axes[0])
     peak, depth = fixed(facts.get("peak_force_N"), 2), fixed(facts.get("depth_mm"), 2)
+    words = facts.get("phases_in_words")
+    phases = f"the indenter's phases are {words} (holds are shaded); " if words else ""
     alt = f"Record of site {site}: displacement and force against time, and force against displacement"
     caption = (
         f"Figure 3 of the paper for this study: record of site {site}, raw and regularised. The dashed "
-        f"line is the touch-down that was found; {_told(facts)}every phase is regularised by itself and the "
+        f"line is the touch-down that was found; {phases}every phase is regularised by itself and the "
         f"peak is kept ({peak} N at {depth} mm)."
     )
-    return Figure("record", svg(drawing, "record", alt), caption)
+    return make_figure(drawing, "record", alt, caption)
 
 
-def _draw_record(axes: list[Axes], raw: Curves, regular: Curves, start: tuple[float, float]) -> None:
-    time, depth = regular["time_s"] + start[0], regular["displacement_mm"] + start[1]
-    pairs = [
-        (("time_s", "displacement_mm"), (time, depth), ("Time (s)", "Displacement (mm)")),
-        (("time_s", "force_N"), (time, regular["force_N"]), ("Time (s)", "Force (N)")),
-        (("displacement_mm", "force_N"), (depth, regular["force_N"]), ("Displacement (mm)", "Force (N)")),
-    ]
-    for ax, (columns, curve, labels) in zip(axes, pairs, strict=True):
-        ax.plot(raw[columns[0]], raw[columns[1]], color=MUTED, lw=0.9, label="as recorded")
-        ax.plot(*curve, color=SIMULATED, lw=1.8, label="regularised")
-        at = start[1] if columns[0] == "displacement_mm" else start[0]
+def _draw_record(axes: Sequence[Axes], raw: Curves, regular: Curves, touch_down: tuple[float, float]) -> None:
+    labels = {"time_s": "Time (s)", "displacement_mm": "Displacement (mm)", "force_N": "Force (N)"}
+    pairs = (("time_s", "displacement_mm"), ("time_s", "force_N"), ("displacement_mm", "force_N"))
+    for ax, (x, y) in zip(axes, pairs, strict=True):
+        ax.plot(raw[x], raw[y], color=MUTED, lw=0.9, label="as recorded")
+        ax.plot(regular[x], regular[y], color=SIMULATED, lw=1.8, label="regularised")
+        at = touch_down[x == "displacement_mm"]
         ax.axvline(at, color=INK, lw=0.8, ls="--", label="touch-down")
-        ax.set_xlabel(labels[0])
-        ax.set_ylabel(labels[1])
-
-
-def _told(facts: Json) -> str:
-    words = facts.get("phases_in_words")
-    return f"the indenter's phases are {words} (holds are shaded); " if words else ""
+        ax.set(xlabel=labels[x], ylabel=labels[y])
 
 
 def _mark_phases(ax: Axes, phases: list[Json]) -> None:
@@ -66,47 +74,25 @@ def _mark_phases(ax: Axes, phases: list[Json]) -> None:
         if phase["kind"] == "hold":
             ax.axvspan(start, end, facecolor=GRID, alpha=0.6, lw=0, zorder=0)
         ax.axvline(end, color=GRID, lw=0.8, zorder=0)
-        if len(phases) <= MOST_NAMED:
-            at, over = (start + end) / 2, ax.get_xaxis_transform()
-            ax.text(
-                at, 0.02, phase["kind"], color=MUTED, fontsize=6,
-                transform=over, ha="center", va="bottom", rotation=90,
-            )  # fmt: skip
+        if len(phases) <= MAX_NAMED_PHASES:
+            text = ax.text((start + end) / 2, 0.02, phase["kind"], transform=ax.get_xaxis_transform())
+            text.set(color=MUTED, fontsize=6, ha="center", va="bottom", rotation=90)
 
 
-def trace_table(store: Results) -> Table:
+def make_trace_table(store: Results) -> Table:
     """Touch-down, peak, noise and phases of every record."""
-    head = (
-        "Site",
-        "Touch-down (s)",
-        "Touch-down (mm)",
-        "± (mm)",
-        "Depth (mm)",
-        "Largest force (N)",
-        "Noise (N)",
-        "Loading (mm/s)",
-        "Unloading (mm/s)",
-        "Phases",
+    columns = (
+        ("Site", "record"),
+        ("Touch-down (s)", "touch_down_s", 3),
+        ("Touch-down (mm)", "touch_down_mm", 3),
+        ("± (mm)", "touch_down_uncertainty_mm", 3),
+        ("Depth (mm)", "depth_mm", 2),
+        ("Largest force (N)", "peak_force_N", 2),
+        ("Noise (N)", "noise_N", 3),
+        ("Loading (mm/s)", "speed_load_mm_s", 3),
+        ("Unloading (mm/s)", "speed_unload_mm_s", 3),
+        ("Phases", "phases_in_words"),
     )
-    keys = (
-        ("touch_down_s", 3),
-        ("touch_down_mm", 3),
-        ("touch_down_uncertainty_mm", 3),
-        ("depth_mm", 2),
-        ("peak_force_N", 2),
-        ("noise_N", 3),
-        ("speed_load_mm_s", 3),
-        ("speed_unload_mm_s", 3),
-    )
-    rows = tuple(
-        Row(
-            (
-                heading(site),
-                *(numeric(fixed(facts.get(key), digits)) for key, digits in keys),
-                Cell(facts.get("phases_in_words") or NOTHING),
-            ),
-            facts.get("site", site) in store.fitted,
-        )
-        for site, facts in store.traces.items()
-    )
-    return Table("trace-facts", "What was found in each indentation record.", head, rows)
+    rows = [{"site": name, **facts, "record": name} for name, facts in store.traces.items()]
+    caption = "What was found in each indentation record."
+    return make_table("trace-facts", caption, columns, rows, marked=lambda row: row["site"] in store.fitted)

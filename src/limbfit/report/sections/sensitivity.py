@@ -5,63 +5,54 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import matplotlib
 from matplotlib.axes import Axes
 
-from ..drawing.ink import (
-    GRID,
-    INK,
-    MUTED,
-    ONE_MATERIAL,
-    SIMULATED,
-    STYLE,
-    THIRD,
-    TRUTH,
-    legend_above,
-    panels,
-    svg,
-    tissue_style,
-)
-from ..formats import fixed, friction, heading, number, numeric
-from ..page import Block, Bullets, Cell, Figure, Prose, Row, Section, Table
+from ..drawing.colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, choose_tissue_style
+from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..formats import fixed, friction, number
+from ..page import Block, Bullets, Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import NOTHING
+from ..tables import Column, make_table
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")
 _STYLES = tuple(zip(_COLOURS, _LINES, strict=True))
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
-_CHANGES = (
+_CHANGES: tuple[Column, ...] = (
     ("Largest force (N)", "peak_force_N", 3),
     ("Its change (%)", "peak_change_percent", 2),
     ("Mean change (% of it)", "mean_change_percent", 2),
 )
-_EFFORT = (("Steps", "steps", 0), ("Cut", "cuts", 0), ("Newton iterations", "newton_iterations", 0))
+_EFFORT: tuple[Column, ...] = (
+    ("Steps", "steps", 0),
+    ("Cut", "cuts", 0),
+    ("Newton iterations", "newton_iterations", 0),
+)
 
 
-def stiffness_section(store: Results, content: Json) -> Section:
+def make_stiffness_section(store: Results, content: Json) -> Section:
     """Force against c of each tissue at equal m, at thin and thick sites, and its derivatives everywhere."""
     name = "sensitivity-c"
     words = Prose(
         "Force with c of one tissue at a time halved and doubled, all tissues with the same m "
         f"({number(content['equal_m'])}, the geometric mean of those identified), as in the paper's "
-        "analysis; "
-        f"everything else as identified. {_thin_and_thick(content)}"
+        f"analysis; everything else as identified. {_describe_thickness(content)}"
     )
-    more = _finding(content)
-    blocks = (
+    more = _find_leading_tissue(content)
+    return make_section(
+        name,
+        "Sensitivity to the stiffness of the tissues",
         words,
-        *([Prose(more)] if more else []),
-        _stiffness_figure(store, content),
-        _table(name, "Changes of the force with c of one tissue, at equal m.", content, _CHANGES),
-        _derivative_table(content),
-        *_partial(content),
+        Prose(more) if more else None,
+        _draw_stiffness_figure(store, content),
+        _make_run_table(name, "Changes of the force with c of one tissue, at equal m.", content, _CHANGES),
+        _make_derivative_table(content),
+        _list_warnings(content),
     )
-    return Section(name, "Sensitivity to the stiffness of the tissues", blocks)
 
 
-def _thin_and_thick(content: Json) -> str:
-    return _sentence(
+def _describe_thickness(content: Json) -> str:
+    return _join_clauses(
         f"site {row['site']}{_role(row, ' ({})')}: {fixed(row['tissue_mm'])} mm of tissue to the nearest "
         f"bone, indented by {fixed(row['indentation_mm'])} mm"
         for row in content["sites"]
@@ -72,13 +63,13 @@ def _role(row: Json, form: str) -> str:
     return form.format(row["role"]) if row["role"] else ""
 
 
-def _sentence(parts: Iterable[str]) -> str:
+def _join_clauses(parts: Iterable[str]) -> str:
     """Clauses as a sentence; nothing where there are none."""
     text = "; ".join(parts)
     return text[:1].upper() + text[1:] + "." if text else ""
 
 
-def _finding(content: Json) -> str:
+def _find_leading_tissue(content: Json) -> str:
     """Which tissue a thin and a thick site feel more: the paper's claim, for this study."""
     found = []
     for site in content["sites"]:
@@ -92,27 +83,25 @@ def _finding(content: Json) -> str:
             numbers = ", ".join(f"{tissue} {fixed(value)} %" for tissue, value in changes.items())
             words = f"at site {site['site']} the force follows the {most} most (largest change: {numbers})"
             found.append(words)
-    return _sentence(found)
+    return _join_clauses(found)
 
 
-def _stiffness_figure(store: Results, content: Json) -> Figure:
+@styled
+def _draw_stiffness_figure(store: Results, content: Json) -> Figure:
     sites = content["sites"][:2]
-    drawing, axes = panels(len(sites) + 1, len(sites) + 1, 2.9)
+    drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.9)
     tissues = list(content["parameters"])
-    with matplotlib.rc_context(STYLE):
-        for ax, site in zip(axes, sites, strict=False):
-            _draw_curves(ax, store, "sensitivity-c", site, content)
-        _draw_derivatives(axes[-1], content, tissues)
-        axes[0].set_ylabel("Force (N)")
-        legend_above(drawing, axes[0], columns=5)
+    for ax, site in zip(axes, sites, strict=False):
+        _draw_curves(ax, store, "sensitivity-c", site, content)
+    _draw_derivatives(axes[-1], content, tissues)
+    axes[0].set_ylabel("Force (N)")
+    add_legend_above(drawing, axes[0], columns=5)
     caption = (
-        "Left: force at the chosen sites with c of one tissue halved and doubled, at equal m. Right: "
-        "change of "
-        "the largest force for one percent more c of a tissue, at every recorded site, from the exact "
-        "derivatives "
-        "at the identified parameters."
+        "Left: force at the chosen sites with c of one tissue halved and doubled, at equal m. Right: change "
+        "of the largest force for one percent more c of a tissue, at every recorded site, from the exact "
+        "derivatives at the identified parameters."
     )
-    return Figure("sensitivity-c", svg(drawing, "sensitivity-c", "Force against c of each tissue"), caption)
+    return make_figure(drawing, "sensitivity-c", "Force against c of each tissue", caption)
 
 
 def _draw_curves(ax: Axes, store: Results, name: str, site: Json, content: Json) -> None:
@@ -122,8 +111,7 @@ def _draw_curves(ax: Axes, store: Results, name: str, site: Json, content: Json)
     heads = [head for head in curves if head.endswith("_N")]
     for i, (row, head) in enumerate(zip(rows, heads, strict=False)):
         color, line = (INK, "-") if row["base"] else _STYLES[i % len(_STYLES)]
-        label = row["label"].replace(" x ", " × ")
-        ax.plot(curves["time_s"], curves[head], color=color, ls=line, label=label)
+        ax.plot(curves["time_s"], curves[head], color=color, ls=line, label=_name_model(row))
     ax.set_title(f"site {site['site']}{_role(site, ', {}')}: {fixed(site['tissue_mm'])} mm of tissue")
     ax.set_xlabel("Time (s)")
     ax.margins(x=0.01)
@@ -134,7 +122,7 @@ def _draw_derivatives(ax: Axes, content: Json, tissues: Sequence[str]) -> None:
         rows = [row for row in content["local"] if row["peak_percent_per_percent"][tissue] is not None]
         depth = [row["tissue_mm"] for row in rows]
         slope = [row["peak_percent_per_percent"][tissue] for row in rows]
-        style = tissue_style(i)
+        style = choose_tissue_style(i)
         ax.plot(depth, slope, ls="", marker=style["marker"], color=style["color"], label=tissue)
     ax.set_title("% of force for 1 % of c")
     ax.set_xlabel("Tissue to the nearest bone (mm)")
@@ -142,25 +130,18 @@ def _draw_derivatives(ax: Axes, content: Json, tissues: Sequence[str]) -> None:
     ax.legend(fontsize=8)
 
 
-def _derivative_table(content: Json) -> Table:
-    tissues = list(content["parameters"])
-    head = ("Site", "Region", "Tissue over bone (mm)", *(f"{tissue} (%)" for tissue in tissues))
-    rows = tuple(
-        Row(
-            (
-                heading(row["site"]),
-                Cell(row["region"] or NOTHING),
-                numeric(fixed(row["tissue_mm"])),
-                *(numeric(fixed(row["peak_percent_per_percent"][tissue], 3)) for tissue in tissues),
-            )
-        )
-        for row in content["local"]
+def _make_derivative_table(content: Json) -> Table:
+    columns: tuple[Column, ...] = (
+        ("Site", "site"),
+        ("Region", "region"),
+        ("Tissue over bone (mm)", "tissue_mm", 1),
+        *((f"{tissue} (%)", ("peak_percent_per_percent", tissue), 3) for tissue in content["parameters"]),
     )
     caption = "Change of the largest force in percent for one percent more c, from exact derivatives."
-    return Table("sensitivity-c-local", caption, head, rows)
+    return make_table("sensitivity-c-local", caption, columns, content["local"])
 
 
-def kappa_section(store: Results, content: Json) -> Section:
+def make_kappa_section(store: Results, content: Json) -> Section:
     """The ratio of bulk modulus to c, and the change of volume that it allows."""
     name = "sensitivity-kappa"
     columns = (
@@ -176,14 +157,15 @@ def kappa_section(store: Results, content: Json) -> Section:
         "enough to keep the ratio of volumes J within 1 % of one in its models. J is the mean of an element "
         "at the deepest point, over the elements within one width of the indenter. Elements that lock "
         f"stiffen with it; those of this study are {store.calibration.get('element') or 'not named'}. "
-        f"{_within(content)}"
+        f"{_describe_volume_ratio(content)}"
     )
     caption = "Force and ratio of volumes against the ratio of bulk modulus and c."
-    blocks = (words, _kappa_figure(content), _table(name, caption, content, columns), *_partial(content))
-    return Section(name, "Sensitivity to the bulk modulus", blocks)
+    table = _make_run_table(name, caption, content, columns)
+    title = "Sensitivity to the bulk modulus"
+    return make_section(name, title, words, _draw_kappa_figure(content), table, _list_warnings(content))
 
 
-def _within(content: Json) -> str:
+def _describe_volume_ratio(content: Json) -> str:
     """How far J goes with the study's ratio."""
     rows = [row for row in content["runs"] if row["base"] and row["J_min"] is not None]
     parts = [
@@ -194,66 +176,63 @@ def _within(content: Json) -> str:
     return f"Here it goes {'; '.join(parts)}." if parts else ""
 
 
-def _kappa_figure(content: Json) -> Figure:
-    drawing, axes = panels(2, 2, 2.7)
-    with matplotlib.rc_context(STYLE):
-        for i, site in enumerate(content["sites"]):
-            color, line = _STYLES[i % len(_STYLES)]
-            rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
-            ratio = [row["kappa_ratio"] for row in rows]
-            known = {key: [row[key] for row in rows] for key in ("peak_force_N", *_RANGE)}
-            style: dict[str, Any] = {"color": color, "ls": line, "marker": "o", "ms": 4}
-            label = f"site {site['site']}{_role(site, ', {}')}"
-            axes[0].plot(ratio, known["peak_force_N"], label=label, **style)
-            axes[1].fill_between(ratio, known["J_min"], known["J_max"], color=color, alpha=0.15, lw=0)
-            axes[1].plot(ratio, known["J_low"], ratio, known["J_high"], **style)
-        axes[1].axhspan(0.99, 1.01, color=GRID, zorder=0)
-        axes[0].set_title("Largest force (N)")
-        axes[1].set_title("Ratio of volumes J (–)")
-        for ax in axes:
-            ax.set_xscale("log")
-            ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-            ax.set_xlabel("κ over c (–)")
-            ax.axvline(content["kappa_ratio"], color=MUTED, lw=0.8, ls="--")
-        legend_above(drawing, axes[0])
+@styled
+def _draw_kappa_figure(content: Json) -> Figure:
+    drawing, axes = make_panels(2, 2, 2.7)
+    for i, site in enumerate(content["sites"]):
+        color, line = _STYLES[i % len(_STYLES)]
+        rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
+        ratio = [row["kappa_ratio"] for row in rows]
+        known = {key: [row[key] for row in rows] for key in ("peak_force_N", *_RANGE)}
+        style: dict[str, Any] = {"color": color, "ls": line, "marker": "o", "ms": 4}
+        label = f"site {site['site']}{_role(site, ', {}')}"
+        axes[0].plot(ratio, known["peak_force_N"], label=label, **style)
+        axes[1].fill_between(ratio, known["J_min"], known["J_max"], color=color, alpha=0.15, lw=0)
+        axes[1].plot(ratio, known["J_low"], ratio, known["J_high"], **style)
+    axes[1].axhspan(0.99, 1.01, color=GRID, zorder=0)
+    axes[0].set_title("Largest force (N)")
+    axes[1].set_title("Ratio of volumes J (–)")
+    for ax in axes:
+        ax.set_xscale("log")
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        ax.set_xlabel("κ over c (–)")
+        ax.axvline(content["kappa_ratio"], color=MUTED, lw=0.8, ls="--")
+    add_legend_above(drawing, axes[0])
     caption = (
-        "Largest force and ratio of volumes against κ over c; dashed: the study's. Right: all elements "
-        "near the "
-        "indenter (shaded), the middle 98 % of their volume (lines), and the band of 1 % (grey)."
+        "Largest force and ratio of volumes against κ over c; dashed: the study's. Right: all elements near "
+        "the indenter (shaded), the middle 98 % of their volume (lines), and the band of 1 % (grey)."
     )
     name = "sensitivity-kappa"
-    return Figure(name, svg(drawing, name, "Force and ratio of volumes against the bulk modulus"), caption)
+    return make_figure(drawing, name, "Force and ratio of volumes against the bulk modulus", caption)
 
 
-def contact_section(store: Results, content: Json) -> Section:
+def make_contact_section(store: Results, content: Json) -> Section:
     """Sticky against frictionless contact."""
     words = Prose(
-        f"The skin under the indenter slips freely in this study's model ({content['friction']}), or "
-        "sticks to it "
-        "where it has touched: the two ends of what friction can do. The paper found no significant change "
-        "of "
-        f"the largest force. {_peaks(content)}"
+        f"The skin under the indenter slips freely in this study's model ({content['friction']}), or sticks "
+        "to it where it has touched: the two ends of what friction can do. The paper found no significant "
+        f"change of the largest force. {_describe_changes(content)}"
         if content["friction"] == "frictionless"
-        else f"Contact in this study's model is {friction(content['friction'])}. {_peaks(content)}"
+        else f"Contact in this study's model is {friction(content['friction'])}. {_describe_changes(content)}"
     )
-    return _simple(store, "sensitivity-contact", "Sensitivity to friction", words, content, _EFFORT)
+    return _compare_models(store, "sensitivity-contact", "Sensitivity to friction", words, content, _EFFORT)
 
 
-def indenter_section(store: Results, content: Json) -> Section:
+def make_indenter_section(store: Results, content: Json) -> Section:
     """The square against a sphere and others."""
     words = Prose(
         "The same displacement and width with other indenters. The paper expects of a sphere that "
-        "simulations "
-        "converge more easily than at the edges of its square: compare the effort. Forces differ since "
-        "another "
-        f"indenter touches another area. {_peaks(content)}"
+        "simulations converge more easily than at the edges of its square: compare the effort. Forces differ "
+        f"since another indenter touches another area. {_describe_changes(content)}"
     )
     effort = (*_EFFORT, ("Penetration (mm)", "penetration_mm", 3))
-    return _simple(store, "sensitivity-indenter", "Sensitivity to the indenter", words, content, effort)
+    return _compare_models(
+        store, "sensitivity-indenter", "Sensitivity to the indenter", words, content, effort
+    )
 
 
-def _peaks(content: Json) -> str:
-    return _sentence(
+def _describe_changes(content: Json) -> str:
+    return _join_clauses(
         f"{row['label']}: the largest force at site {row['site']} changes by "
         f"{fixed(row['peak_change_percent'])} %"
         for row in content["runs"]
@@ -261,129 +240,106 @@ def _peaks(content: Json) -> str:
     )
 
 
-def mesh_section(store: Results, content: Json) -> Section:
+def make_mesh_section(store: Results, content: Json) -> Section:
     """Mesh independence."""
     name = "sensitivity-mesh"
     words = Prose(
         "The sites meshed anew with other edge lengths, everything else the same. Where element and forces "
-        "allow it, "
-        f"they are extrapolated to an edge of zero (Richardson). {_limits(content)}"
+        f"allow it, they are extrapolated to an edge of zero (Richardson). {_describe_limits(content)}"
     )
     columns = (
-        ("Edge near the indenter (mm)", "edge_near_mm", 2), ("Nodes", "nodes", 0), *_CHANGES,
-        ("Newton iterations", "newton_iterations", 0),
-    )  # fmt: skip
-    caption = "Force on coarser and finer meshes; changes are from the study's own."
-    blocks = (
-        words,
-        _mesh_figure(store, content),
-        _table(name, caption, content, columns),
-        *_partial(content),
+        ("Edge near the indenter (mm)", "edge_near_mm", 2),
+        ("Nodes", "nodes", 0),
+        *_CHANGES,
+        _EFFORT[2],
     )
-    return Section(name, "Mesh independence", blocks)
+    caption = "Force on coarser and finer meshes; changes are from the study's own."
+    table = _make_run_table(name, caption, content, columns)
+    figure = _draw_mesh_figure(store, content)
+    return make_section(name, "Mesh independence", words, figure, table, _list_warnings(content))
 
 
-def _limits(content: Json) -> str:
-    parts = []
-    for row in content["sites"]:
-        if row["limit_N"] is None:
-            parts.append(
-                f"at site {row['site']} the forces do not tend to a value yet: finer meshes are needed"
-            )
-            continue
-        if row["order"] is None:
-            parts.append(
-                f"at site {row['site']} the study's mesh is {fixed(row['error_percent'], 2)} % off the "
-                f"finest, whose largest force is {fixed(row['limit_N'], 3)} N; with this element forces do "
-                "not change in one direction, so nothing is extrapolated"
-            )
-            continue
-        order = f"order {number(row['order'], 2)}" + ("" if row["order_measured"] else ", assumed")
-        parts.append(
-            f"at site {row['site']} the largest force tends to {fixed(row['limit_N'], 3)} N ({order}), and "
-            "the "
-            f"study's mesh is {fixed(row['error_percent'], 2)} % off"
+def _describe_limits(content: Json) -> str:
+    return _join_clauses(f"at site {row['site']} {_describe_limit(row)}" for row in content["sites"])
+
+
+def _describe_limit(row: Json) -> str:
+    if row["limit_N"] is None:
+        return "the forces do not tend to a value yet: finer meshes are needed"
+    error, limit = fixed(row["error_percent"], 2), fixed(row["limit_N"], 3)
+    if row["order"] is None:
+        return (
+            f"the study's mesh is {error} % off the finest, whose largest force is {limit} N; with this "
+            "element forces do not change in one direction, so nothing is extrapolated"
         )
-    return _sentence(parts)
+    order = f"order {number(row['order'], 2)}" + ("" if row["order_measured"] else ", assumed")
+    return f"the largest force tends to {limit} N ({order}), and the study's mesh is {error} % off"
 
 
-def _mesh_figure(store: Results, content: Json) -> Figure:
+@styled
+def _draw_mesh_figure(store: Results, content: Json) -> Figure:
     sites = content["sites"][:2]
-    drawing, axes = panels(len(sites) + 1, len(sites) + 1, 2.7)
-    with matplotlib.rc_context(STYLE):
-        for ax, site in zip(axes, sites, strict=False):
-            _draw_curves(ax, store, "sensitivity-mesh", site, content)
-        for i, site in enumerate(content["sites"]):
-            rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
-            color, line = _STYLES[i % len(_STYLES)]
-            edge, peak = ([row[key] for row in rows] for key in ("edge_near_mm", "peak_force_N"))
-            axes[-1].plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site['site']}")
-            if site["order"] is not None:
-                axes[-1].plot(0.0, site["limit_N"], color=color, marker="x", ls="", mew=1.8)
-        axes[0].set_ylabel("Force (N)")
-        axes[-1].set_title("Largest force (N)")
-        axes[-1].set_xlabel("Edge near the indenter (mm)")
-        axes[-1].set_xlim(left=-0.2)
-        axes[-1].legend(fontsize=8)
-        legend_above(drawing, axes[0])
+    drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.7)
+    for ax, site in zip(axes, sites, strict=False):
+        _draw_curves(ax, store, "sensitivity-mesh", site, content)
+    for i, site in enumerate(content["sites"]):
+        rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
+        color, line = _STYLES[i % len(_STYLES)]
+        edge, peak = ([row[key] for row in rows] for key in ("edge_near_mm", "peak_force_N"))
+        axes[-1].plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site['site']}")
+        if site["order"] is not None:
+            axes[-1].plot(0.0, site["limit_N"], color=color, marker="x", ls="", mew=1.8)
+    axes[0].set_ylabel("Force (N)")
+    axes[-1].set_title("Largest force (N)")
+    axes[-1].set_xlabel("Edge near the indenter (mm)")
+    axes[-1].set_xlim(left=-0.2)
+    axes[-1].legend(fontsize=8)
+    add_legend_above(drawing, axes[0])
     caption = (
         "Force against time on each mesh, and the largest force against the edge; crosses: extrapolated."
     )
     name = "sensitivity-mesh"
-    return Figure(name, svg(drawing, name, "Force on coarser and finer meshes"), caption)
+    return make_figure(drawing, name, "Force on coarser and finer meshes", caption)
 
 
-def _simple(
-    store: Results, name: str, title: str, words: Block, content: Json, more: Iterable[tuple[str, str, int]]
+@styled
+def _compare_models(
+    store: Results, name: str, title: str, words: Block, content: Json, more: Iterable[Column]
 ) -> Section:
     """Curves of every site, and the table of its runs."""
-    drawing, axes = panels(len(content["sites"]), 2, 2.7)
-    with matplotlib.rc_context(STYLE):
-        for ax, site in zip(axes, content["sites"], strict=True):
-            _draw_curves(ax, store, name, site, content)
-            ax.set_ylabel("Force (N)")
-        legend_above(drawing, axes[0])
-    figure = Figure(
-        name, svg(drawing, name, f"{title}: force against time"), "Force against time at each site."
-    )
-    table = _table(name, f"{title}: forces and effort.", content, (*_CHANGES, *more))
-    return Section(name, title, (words, figure, table, *_partial(content)))
+    drawing, axes = make_panels(len(content["sites"]), 2, 2.7)
+    for ax, site in zip(axes, content["sites"], strict=True):
+        _draw_curves(ax, store, name, site, content)
+        ax.set_ylabel("Force (N)")
+    add_legend_above(drawing, axes[0])
+    alt = f"{title}: force against time"
+    figure = make_figure(drawing, name, alt, "Force against time at each site.")
+    table = _make_run_table(name, f"{title}: forces and effort.", content, (*_CHANGES, *more))
+    return make_section(name, title, words, figure, table, _list_warnings(content))
 
 
-def _table(name: str, caption: str, content: Json, columns: Iterable[tuple[str, str, int]]) -> Table:
-    chosen = tuple(columns)
-    rows = tuple(
-        Row(
-            (
-                heading(row["site"]),
-                Cell(row["label"].replace(" x ", " × ")),
-                *(numeric(fixed(row[key], digits)) for _, key, digits in chosen),
-            ),
-            marked=row["base"],
-        )
-        for row in content["runs"]
-    )
-    head = ("Site", "Model", *(words for words, _, _ in chosen))
-    return Table(name, f"{caption} Marked: as in the study.", head, rows)
+def _make_run_table(name: str, caption: str, content: Json, columns: Iterable[Column]) -> Table:
+    first = (("Site", "site"), ("Model", _name_model))
+    caption = f"{caption} Marked: as in the study."
+    return make_table(name, caption, (*first, *columns), content["runs"], marked="base")
 
 
-def _partial(content: Json) -> tuple[Block, ...]:
+def _name_model(row: Json) -> str:
+    return str(row["label"].replace(" x ", " × "))
+
+
+def _list_warnings(content: Json) -> Bullets | None:
     """Simulations that did not reach their end, and what is doubtful about others."""
-    texts = [
-        f"Site {row['site']}, {row['label']}: stopped early: {row['reason']}"
-        for row in content["runs"]
-        if not row["completed"]
-    ]
-    texts += [
-        f"Site {row['site']}, {row['label']}: {text}" for row in content["runs"] for text in row["warnings"]
-    ]
-    return (Bullets(tuple(texts)),) if texts else ()
+    runs = content["runs"]
+    texts = [(row, f"stopped early: {row['reason']}") for row in runs if not row["completed"]]
+    texts += [(row, text) for row in runs for text in row["warnings"]]
+    return make_bullets(f"Site {row['site']}, {row['label']}: {text}" for row, text in texts)
 
 
 SENSITIVITIES: dict[str, Callable[[Results, Json], Section]] = {
-    "sensitivity-c": stiffness_section,
-    "sensitivity-kappa": kappa_section,
-    "sensitivity-contact": contact_section,
-    "sensitivity-indenter": indenter_section,
-    "sensitivity-mesh": mesh_section,
+    "sensitivity-c": make_stiffness_section,
+    "sensitivity-kappa": make_kappa_section,
+    "sensitivity-contact": make_contact_section,
+    "sensitivity-indenter": make_indenter_section,
+    "sensitivity-mesh": make_mesh_section,
 }

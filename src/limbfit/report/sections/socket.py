@@ -1,16 +1,26 @@
-"""What a socket does to the limb: pressure and shear by region, settling, balance."""
+"""What a socket does to the limb: pressure and shear by region and their causes, settling, balance."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..drawing.socket_pictures import inside_figure, pressure_figures, settling_figure
-from ..formats import NOTHING, fixed, friction, heading, numeric
-from ..page import Block, Note, Prose, Row, Section, Table
+from ..drawing.socket_pictures import draw_inside_figure, draw_pressure_figures, draw_settling_figure
+from ..formats import NOTHING, fixed, friction, label, symbol
+from ..page import Block, Note, Prose, Row, Section, Table, make_section
 from ..store import Json, Results
-from .socket_beside import interval_blocks, mostly, published_blocks
+from ..tables import Column, make_row, make_table, numeric
 
+# What counts as known, and how its change is headed.
+KNOWN = {
+    "liner.c_kPa": f"Change, liner {symbol('c')} 10 % larger",
+    "friction": "Change, friction 10 % larger",
+}
+PAPERS = (
+    "Measured pressures depend on sensor, socket and activity: see the cited papers, the review by Al-Fakih "
+    "et al. (Sensors 2016, 16:1119), and for thresholds of pain by region Lee et al. (Arch Phys Med Rehabil "
+    "2005, 86:641)."
+)
 ORIGINS = {
     "identified": "identified from this limb's records",
     "literature": "those of people (medians), not of this limb",
@@ -18,27 +28,31 @@ ORIGINS = {
 }
 
 
-def socket_section(store: Results, content: Json) -> Section:
+def make_socket_section(store: Results, content: Json) -> Section:
     """What the experiment ``socket`` found."""
     loads = content["loads"]
     folder = store.folder / "socket"
     names = ["donning", *(load["name"] for load in loads)]
     held = [content["donning"], *loads]
-    blocks: list[Block] = [
+    return make_section(
+        "socket",
+        "The limb in its socket",
         Note(
             "A simulation for research, not a medical device: it says what a rigid socket does to this model "
             "of the limb."
         ),
-        Prose(_shape(content)),
-        *(Note(f"The socket's file: {text}.") for text in content["socket"]["notes"]),
-        Prose(_loads(loads)),
-        *pressure_figures(store, {name: folder / f"held-{i}.vtu" for i, name in enumerate(names)}),
-        settling_figure(content),
-        _regions(names, held, (content.get("samples") or {}).get("simulated", 0)),
-        *interval_blocks(held[-1], names[-1]),
-        *published_blocks(content, held[-1], names[-1]),
-        *inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
-        _inside(names, held),
+        Prose(_describe_shape(content)),
+        (Note(f"The socket's file: {text}.") for text in content["socket"]["notes"]),
+        Prose(_describe_loads(loads)),
+        draw_pressure_figures(
+            store, {name: folder / f"held-{i}.vtu" for i, name in enumerate(names)}, "socket"
+        ),
+        draw_settling_figure(content),
+        _make_region_table(names, held, (content.get("samples") or {}).get("simulated", 0)),
+        make_interval_table(held[-1], names[-1]),
+        make_published_blocks(content, held[-1], names[-1]),
+        draw_inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
+        _make_strain_table(names, held),
         Prose(
             f"Sum of contact forces and moments against the stated load: within "
             f"{content['balance_percent']:.2g} % at every step. Pressures are those of contact, on the "
@@ -46,12 +60,11 @@ def socket_section(store: Results, content: Json) -> Section:
             "largest mean over one face of the mesh, which grows as faces get smaller. The limb is at most "
             f"{content['penetration_mm']:.2f} mm in the wall."
         ),
-        *(Note(text) for text in content["warnings"]),
-    ]
-    return Section("socket", "The limb in its socket", tuple(blocks))
+        map(Note, content["warnings"]),
+    )
 
 
-def _shape(content: Json) -> str:
+def _describe_shape(content: Json) -> str:
     shape, liner = content["socket"], content["socket"]["liner"]
     made = (
         f"rectified from the limb, {shape['reduction_percent']:g} % less in circumference"
@@ -68,71 +81,137 @@ def _shape(content: Json) -> str:
     )
 
 
-def _loads(loads: list[Json]) -> str:
+def _describe_loads(loads: list[Json]) -> str:
     if not loads:
         return "No load was stated: the socket is donned and held."
     words = []
     for load in loads:
         size = sum(value**2 for value in load["force_N"]) ** 0.5
         known = load["settling_interval_mm"]
-        limits = "" if known is None else f" (95 %: {fixed(known[0])} to {fixed(known[1])})"
+        limits = "" if known is None else f" (95 %: {_format_interval(known)})"
         words.append(
             f"{load['name']}, {size:.0f} N: the limb settles by {load['settling_mm']:.1f} mm{limits}"
         )
     return "; ".join(words) + "."
 
 
-def _regions(names: list[str], held: list[Mapping[str, Any]], draws: int) -> Table:
-    head = (
-        "Region",
-        "Mean pressure (kPa)",
-        "95 % (kPa)",
-        "Mostly from",
-        "Peak (kPa)",
-        "Mean shear (kPa)",
-        "Peak shear (kPa)",
+def _make_region_table(names: list[str], held: list[Mapping[str, Any]], draws: int) -> Table:
+    columns = (
+        ("Region", "region"),
+        ("Mean pressure (kPa)", "mean_kPa", 1),
+        ("95 % (kPa)", lambda row: numeric(_format_interval(row["interval_kPa"]))),
+        ("Mostly from", lambda row: numeric(_name_main_source(row["interval_from"]))),
+        ("Peak (kPa)", "peak_kPa", 1),
+        ("Mean shear (kPa)", "shear_kPa", 1),
+        ("Peak shear (kPa)", "shear_peak_kPa", 1),
     )
-    rows = []
-    for name, one in zip(names, held, strict=True):
-        rows.append(Row((heading(name), *(numeric("") for _ in head[1:])), marked=True))
-        for region in one["regions"]:
-            known = region["interval_kPa"]
-            interval = NOTHING if known is None else f"{fixed(known[0])} to {fixed(known[1])}"
-            cells = [fixed(region["mean_kPa"]), interval, mostly(region["interval_from"])]
-            cells += [fixed(region[key]) for key in ("peak_kPa", "shear_kPa", "shear_peak_kPa")]
-            rows.append(Row((heading(region["region"]), *map(numeric, cells))))
     order = f"by derivatives and {draws} simulated draws" if draws else "to first order"
     caption = (
         "Pressure and shear by region of the limb, when donning and each load have been held. 95 %: from the "
         f"identified parameters' covariance, {order}; liner and friction count as known."
     )
-    return Table("socket-regions", caption, head, tuple(rows))
+    return _make_load_table("socket-regions", caption, columns, names, [one["regions"] for one in held])
 
 
-def _inside(names: list[str], held: list[Mapping[str, Any]]) -> Table:
+def _format_interval(interval: list[float] | None) -> str:
+    return NOTHING if interval is None else f"{fixed(interval[0])} to {fixed(interval[1])}"
+
+
+def _name_main_source(shares: Mapping[str, float] | None) -> str:
+    """The parameter that most of an interval comes from: ``muscle c 84 %``."""
+    if not shares:
+        return NOTHING
+    name, percent = next(iter(shares.items()))
+    return f"{label(name)} {fixed(percent, 0)} %"
+
+
+def _make_load_table(
+    name: str, caption: str, columns: Sequence[Column], loads: list[str], rows: list[list[Json]]
+) -> Table:
+    """A table in which the rows of each load stand below a marked row with its name."""
+    body: list[Row] = []
+    for load, own in zip(loads, rows, strict=True):
+        body.append(make_row(load, *(numeric("") for _ in columns[1:]), marked=True))
+        body += make_table(name, caption, columns, own).rows
+    return Table(name, caption, tuple(column[0] for column in columns), tuple(body))
+
+
+def _make_strain_table(names: list[str], held: list[Mapping[str, Any]]) -> Table:
     levels = list(held[0]["inside"][0]["sheared_mm3"])
-    head = (
-        "Tissue",
-        "Shear: largest",
-        "exceeded in 1 %",
-        "Compression: largest",
-        "exceeded in 1 %",
-        *(f"Sheared over {level} (cm3)" for level in levels),
-        "Largest shear near",
+    columns: tuple[Column, ...] = (
+        ("Tissue", "tissue"),
+        ("Shear: largest", "shear", 2),
+        ("exceeded in 1 %", "shear_rare", 2),
+        ("Compression: largest", "compression", 2),
+        ("exceeded in 1 %", "compression_rare", 2),
+        *((f"Sheared over {level} (cm3)", ("sheared_cm3", level), 2) for level in levels),
+        ("Largest shear near", lambda row: numeric(row["near"] or NOTHING)),
     )
-    rows = []
-    for name, one in zip(names, held, strict=True):
-        rows.append(Row((heading(name), *(numeric("") for _ in head[1:])), marked=True))
-        for found in one["inside"]:
-            strains = ("shear", "shear_rare", "compression", "compression_rare")
-            cells = [fixed(found[key], 2) for key in strains]
-            cells += [fixed(found["sheared_mm3"][level] / 1000.0, 2) for level in levels]
-            row = (heading(found["tissue"]), *map(numeric, cells), numeric(found["near"] or NOTHING))
-            rows.append(Row(row))
+    rows = [[row | {"sheared_cm3": _to_cm3(row["sheared_mm3"])} for row in one["inside"]] for one in held]
     caption = (
         "Strain inside the limb, when donning and each load have been held. Shear: half the difference of "
         "the largest and the least principal Green-Lagrange strain, compression: the least with its sign "
         "turned, both of a whole element, and what 1 % of the tissue's volume exceeds. The largest grow as "
         "elements get smaller. No limit of harm is implied."
     )
-    return Table("socket-inside", caption, head, tuple(rows))
+    return _make_load_table("socket-inside", caption, columns, names, rows)
+
+
+def _to_cm3(volumes_mm3: Mapping[str, float]) -> dict[str, float]:
+    return {level: volume / 1000.0 for level, volume in volumes_mm3.items()}
+
+
+def make_interval_table(held: Mapping[str, Any], title: str) -> Table | None:
+    """How much of each interval goes with every identified parameter; what liner and friction change."""
+    rows = [(row["region"], "kPa", "", row["mean_kPa"], row) for row in held["regions"]]
+    if "settling_mm" in held:
+        rows.append(("settling", "mm", "settling_", held["settling_mm"], held))
+    if rows[0][-1]["interval_from"] is None:
+        return None
+    names = sorted(rows[0][-1]["interval_from"])
+    known = [name for name in KNOWN if name in rows[0][-1]["change_kPa"]]
+    heads = [*(f"{label(name)} (%)" for name in names), *(KNOWN[name] for name in known)]
+    lines = []
+    for name, unit, begin, value, row in rows:
+        low, high = row[f"{begin}interval_{unit}"]
+        cells = [f"{fixed(value)} {unit}", f"{fixed(max(value - low, high - value), 2)} {unit}"]
+        cells += [fixed(row[f"{begin}interval_from"][one], 0) for one in names]
+        changes = row[f"{begin}change_{unit}"]
+        cells += [f"{fixed(changes[one], 2 if unit == 'mm' else 1)} {unit}" for one in known]
+        lines.append(make_row(name, *map(numeric, cells)))
+    caption = (
+        f"What the intervals of means and settling come from, {title}: the share of the variance that would "
+        "go if a parameter were known, to first order. Parameters are correlated, so that shares do not add "
+        "up to 100 %. Liner and friction count as known; the last columns say what they change (friction "
+        "with --samples)."
+    )
+    return Table("socket-intervals", caption, ("", "Value", "95 %, half", *heads), tuple(lines))
+
+
+def make_published_blocks(content: Json, held: Mapping[str, Any], title: str) -> tuple[Block, ...]:
+    """What others found over this limb's regions, if they studied such limbs, and the papers to read."""
+    return (make_published_table(content, held, title), Prose(PAPERS)) if content["published"] else ()
+
+
+def make_published_table(content: Json, held: Mapping[str, Any], title: str) -> Table:
+    """What others found over the regions of this result, beside its pressures when a part has been held."""
+    here = {row["region"]: row for row in held["regions"]}
+    columns = (
+        ("Region", "region"),
+        ("Here: mean (kPa)", "mean_kPa", 1),
+        ("Here: peak (kPa)", "peak_kPa", 1),
+        ("Found by others", "found"),
+        ("How", "method"),
+        ("Source", "source"),
+    )
+    rows = [
+        {**held, **here.get(name, {}), **one, "region": name}
+        for name in dict.fromkeys(name for one in content["published"] for name in one["regions"])
+        for one in content["published"]
+        if name in one["regions"]
+    ]
+    caption = (
+        f"Pressures of this simulation, {title}, and what others found over these regions. No limit and no "
+        "verdict is implied."
+    )
+    return make_table("socket-published", caption, columns, rows)

@@ -4,41 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ..drawing.socket_pictures import offset_figure, pressure_figures
-from ..formats import NOTHING, fixed, heading, numeric
-from ..page import Block, Note, Prose, Row, Section, Table
+from ..drawing.socket_pictures import draw_offset_figure, draw_pressure_figures
+from ..formats import fixed
+from ..page import Note, Prose, Section, Table, make_section
 from ..store import Json, Results
+from ..tables import Column, make_table
 from .socket import ORIGINS
 
 
-def socket_design_section(store: Results, content: Json) -> Section:
+def make_socket_design_section(store: Results, content: Json) -> Section:
     """What the experiment ``socket_design`` found."""
     folder, designs = store.folder / "socket_design", content["designs"]
     names = [one["name"] for one in designs]
     last = len(designs[0]["simulation"]["loads"])  # donning is the first
-    optimisation = content["optimisation"]
-    offset = offset_figure(store, {name: folder / f"{name}-face.vtp" for name in names})
-    blocks: list[Block] = [
+    held = {name: folder / f"{name}-{last}.vtu" for name in names}
+    optimisation = content["optimisation"] or {}
+    trials = optimisation.get("trials", ())
+    return make_section(
+        "socket_design",
+        "The design of a socket",
         Note("A simulation for research, not a medical device: no socket here has been worn."),
-        Prose(_made(content)),
-        *([] if offset is None else [offset]),
-        Prose(_loaded(designs)),
-        *pressure_figures(store, {name: folder / f"{name}-{last}.vtu" for name in names}, "socket-design"),
-        _regions(designs, (optimisation or {}).get("limits_kPa", {})),
-    ]
-    if optimisation is not None:
-        blocks += [Prose(_gained(optimisation)), _trials(optimisation)]
-        blocks += [
+        Prose(_describe_design(content)),
+        draw_offset_figure(store, {name: folder / f"{name}-face.vtp" for name in names}),
+        Prose(_describe_loads(designs)),
+        draw_pressure_figures(store, held, "socket-design"),
+        _make_region_table(designs, optimisation.get("limits_kPa", {})),
+        Prose(_describe_gains(optimisation)) if optimisation else None,
+        _make_trial_table(optimisation) if optimisation else None,
+        (
             Note(f"Simulation {number} was not made: {trial['reason']}")
-            for number, trial in enumerate(optimisation["trials"])
+            for number, trial in enumerate(trials)
             if trial["reason"]
-        ]
-    blocks.append(Prose(_printed(content)))
-    blocks += [Note(f"{one['name']}: {text}") for one in designs for text in one["simulation"]["warnings"]]
-    return Section("socket_design", "The design of a socket", tuple(blocks))
+        ),
+        Prose(_describe_print(content)),
+        (Note(f"{one['name']}: {text}") for one in designs for text in one["simulation"]["warnings"]),
+    )
 
 
-def _made(content: Json) -> str:
+def _describe_design(content: Json) -> str:
     target, control = content["target"], content["designs"][0]
     own = ", ".join(f"{name} {value:g} kPa" for name, value in target["regions"].items())
     origin = ORIGINS.get(content["parameters_from"], content["parameters_from"])
@@ -51,7 +54,7 @@ def _made(content: Json) -> str:
     )
 
 
-def _loaded(designs: Sequence[Json]) -> str:
+def _describe_loads(designs: Sequence[Json]) -> str:
     words = []
     for one in designs:
         loads = one["simulation"]["loads"] or [one["simulation"]["donning"]]
@@ -60,23 +63,23 @@ def _loaded(designs: Sequence[Json]) -> str:
     return "; ".join(words) + "."
 
 
-def _regions(designs: Sequence[Json], limits: Mapping[str, float]) -> Table:
-    head = ["Region", *(f"{one['name'].capitalize()}, peak (kPa)" for one in designs)]
-    if limits:
-        head.append("Limit (kPa)")
-    rows = []
-    for name in designs[0]["peaks_kPa"]:
-        cells = [one["peaks_kPa"].get(name) for one in designs]
-        cells += [limits.get(name)] if limits else []
-        rows.append(Row((heading(name), *(numeric(NOTHING if c is None else fixed(c)) for c in cells))))
+def _make_region_table(designs: Sequence[Json], limits: Mapping[str, float]) -> Table:
+    peaks = [(f"{one['name'].capitalize()}, peak (kPa)", one["peaks_kPa"]) for one in designs]
+    peaks += [("Limit (kPa)", limits)] if limits else []
+    columns: tuple[Column, ...] = (
+        ("Region", "region"),
+        *((head, head, 1) for head, _ in peaks),
+    )
+    regions = designs[0]["peaks_kPa"]
+    rows = [{"region": name, **{head: peak.get(name) for head, peak in peaks}} for name in regions]
     caption = (
         "Largest pressure over one face of the mesh in each region, over all loads, held. Means and shear: "
         "results/socket_design/regions.csv."
     )
-    return Table("socket-design-regions", caption, tuple(head), tuple(rows))
+    return make_table("socket-design-regions", caption, columns, rows)
 
 
-def _gained(optimisation: Json) -> str:
+def _describe_gains(optimisation: Json) -> str:
     words = [
         f"{one['region']}: {one['control_kPa']:.0f} kPa in the control, {one['design_kPa']:.0f} designed, "
         f"{one['optimised_kPa']:.0f} optimised ({one['change_percent']:+.0f} % against the control)"
@@ -91,24 +94,20 @@ def _gained(optimisation: Json) -> str:
     )
 
 
-def _trials(optimisation: Json) -> Table:
+def _make_trial_table(optimisation: Json) -> Table:
     names = optimisation["regions"]
-    head = (
-        "Simulation",
-        *(f"{name}, depth (mm)" for name in names),
-        *(f"{name}, peak (kPa)" for name in names),
+    columns: tuple[Column, ...] = (
+        ("Simulation", "name"),
+        *((f"{name}, depth (mm)", ("depths_mm", name), 2) for name in names),
+        *((f"{name}, peak (kPa)", ("peaks_kPa", name), 1) for name in names),
     )
-    rows = []
-    for number, trial in enumerate(optimisation["trials"]):
-        peaks = trial["peaks_kPa"] or {}
-        depths = [fixed(trial["depths_mm"][name], 2) for name in names]
-        cells = [*depths, *(fixed(peaks.get(name)) for name in names)]
-        rows.append(Row((heading(str(number) if number else "the design"), *map(numeric, cells))))
+    trials = enumerate(optimisation["trials"])
+    rows = [trial | {"name": number or "the design"} for number, trial in trials]
     caption = "Simulated designs: depth over each named region beside the design's, positive into the limb."
-    return Table("socket-design-trials", caption, head, tuple(rows))
+    return make_table("socket-design-trials", caption, columns, rows)
 
 
-def _printed(content: Json) -> str:
+def _describe_print(content: Json) -> str:
     measured = content["wall"]
     return (
         f"For printing: results/socket_design/socket.stl, the {measured['of']} with brim and adapter face, a "

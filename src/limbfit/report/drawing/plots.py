@@ -1,0 +1,141 @@
+"""Matplotlib drawings as inline SVG that follows the page's light or dark theme."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure as Drawing
+
+from ...arrays import Array
+from ..page import Figure
+from .colours import GRID, INK, MUTED, SIMULATED, VARIABLES
+
+PANEL_WIDTH_IN = 9.6
+POINT_PX = 1.5  # a drawing of 9.6 in fills the page; smaller ones keep the same size of letters
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "limbfit",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "text.parse_math": False,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.unicode_minus": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "path.simplify": True,
+    "path.simplify_threshold": 0.3,
+}
+styled = matplotlib.rc_context(_STYLE)  # decorates whatever draws
+
+
+def make_panels(count: int, columns: int, height_in: float) -> tuple[Drawing, list[Axes]]:
+    """A drawing of ``count`` make_panels in rows of ``columns``."""
+    columns = min(columns, count)
+    rows = math.ceil(count / columns)
+    width = PANEL_WIDTH_IN if columns > 1 else PANEL_WIDTH_IN / 1.6
+    drawing = Drawing(figsize=(width, rows * height_in + 0.4), layout="constrained")
+    axes = [drawing.add_subplot(rows, columns, i + 1) for i in range(count)]
+    for patch in (drawing.patch, *(ax.patch for ax in axes)):
+        patch.set_alpha(0)
+    return drawing, axes
+
+
+def add_legend_above(drawing: Drawing, *axes: Axes, columns: int | None = None) -> None:
+    """The legend of some make_panels over all of them."""
+    handles = [handle for ax in axes for handle in ax.get_legend_handles_labels()[0]]
+    labels = [str(handle.get_label()) for handle in handles]
+    drawing.legend(handles, labels, loc="outside upper left", ncols=columns or len(labels), labelcolor=INK)
+
+
+def label_outer_axes(axes: Sequence[Axes], columns: int, x: str, y: str) -> None:
+    """Name the axes at the outer make_panels of rows of ``columns``: x at the bottom, y at the left."""
+    for i, ax in enumerate(axes):
+        if i + columns >= len(axes):
+            ax.set_xlabel(x)
+        if i % columns == 0:
+            ax.set_ylabel(y)
+
+
+def set_log_scale(ax: Axes, minor: bool = False) -> None:
+    """A logarithmic x axis with plain numbers; with ``minor`` at 2 and 5 too."""
+    ax.set_xscale("log")
+    format_log_axis(ax.xaxis, minor)
+
+
+def format_log_axis(axis: Axis, minor: bool) -> None:
+    """Plain numbers at the ticks of a logarithmic axis; with ``minor`` at 2 and 5 too."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    named = "25" if minor else ""
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in named else "")
+
+
+def set_rows(ax: Axes, names: Sequence[str]) -> None:
+    """Rows by their names, the first one at the top."""
+    ax.set_yticks(range(len(names)), names)
+    ax.invert_yaxis()
+    ax.grid(visible=False, axis="y")
+
+
+def plot_band(ax: Axes, x: Array, low: Array, high: Array) -> None:
+    """A 95 % interval over x."""
+    ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
+
+
+def make_figure(drawing: Drawing, name: str, alt: str, caption: str) -> Figure:
+    """The drawing as a figure of the page: inline ``<svg>`` whose identifiers are unique to ``name``."""
+    buffer = io.StringIO()
+    FigureCanvasSVG(drawing).print_svg(buffer, metadata={"Date": None, "Creator": None})
+    return Figure(name, _make_inline(buffer.getvalue(), name, alt), caption)
+
+
+def _make_inline(text: str, name: str, alt: str) -> str:
+    """Strip what a standalone SVG needs and an inline one does not; make colours and names the page's."""
+    body = text[text.index("<svg") :]
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    body = re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL)
+    body = body.replace("xlink:href", "href")
+    body = re.sub(r'(\sid="|url\(#|href="#)', rf"\g<1>{name}-", body)
+    for sentinel, (variable, _) in VARIABLES.items():
+        body = body.replace(sentinel, variable)
+    body = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", body)
+    box = re.search(r'viewBox="([^"]*)"', body[: body.index(">")])
+    inside = body[body.index(">") + 1 :]
+    view = box.group(1) if box else "0 0 100 100"
+    width = float(view.split()[2]) * POINT_PX
+    head = f'<svg viewBox="{view}" style="max-width:{width:.0f}px" role="img"><title>{escape(alt)}</title>'
+    return head + inside.strip()
+
+
+def make_standalone(markup: str) -> str:
+    """An inline drawing as the text of an SVG file: on white, with its own colours and letters."""
+    for variable, colour in VARIABLES.values():
+        markup = markup.replace(variable, colour)
+    left, top, width, height = markup[markup.index('viewBox="') + 9 :].split('"', 1)[0].split()
+    size = f'width="{float(width):g}pt" height="{float(height):g}pt" font-family="DejaVu Sans, sans-serif"'
+    names = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+    start = markup.index(">") + 1
+    page = f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="#ffffff"/>'
+    head = re.sub(r' style="[^"]*"', "", markup[:start].replace("<svg ", f"<svg {names} {size} ", 1))
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{head}{page}{markup[start:]}\n'

@@ -1,0 +1,132 @@
+"""Fitted and held-out sites: forces, table 2 of the paper, and what was seen beside the force."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from ..drawing import figures
+from ..drawing.observed_figures import draw_layer_figure, draw_skin_figure, draw_wave_figure
+from ..drawing.pictures import draw_field_figure
+from ..formats import NOTHING, fixed
+from ..page import Note, Row, Section, Table, make_section
+from ..store import Json, Results
+from ..tables import make_row, make_table, numeric
+
+
+def make_fit_section(store: Results) -> Section:
+    """Force against time at the fitted sites."""
+    rows = [row for row in store.predicted if row.get("fitted")]
+    return make_section(
+        "fit",
+        "Fitted sites",
+        figures.draw_force_figure(store, rows, "time_s", "forces-fitted", 2),
+        draw_layer_figure(store, fitted=True),
+        draw_wave_figure(store, fitted=True),
+        draw_skin_figure(store, fitted=True),
+        draw_field_figure(store, store.fitted[:4], "predict", "field"),
+        otherwise="No simulated forces of fitted sites are stored yet.",
+    )
+
+
+def make_prediction_section(store: Results) -> Section:
+    """Everything about the sites that were not used, and table 2."""
+    rows = [row for row in store.predicted if not row.get("fitted")]
+    unseen = "Every site was fitted, so nothing tests the model on unseen data."
+    return make_section(
+        "prediction",
+        "All sites, held-out sites",
+        make_site_table(store) if store.predicted else None,
+        figures.draw_error_figure(store),
+        figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
+        figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
+        draw_layer_figure(store, fitted=False),
+        draw_wave_figure(store, fitted=False),
+        draw_skin_figure(store, fitted=False),
+        make_observed_table(store),
+        Note(unseen) if store.predicted and not rows else None,
+        otherwise="No predictions are stored yet.",
+    )
+
+
+def make_site_table(store: Results) -> Table:
+    """Table 2: largest force and errors of each site, fitted sites marked."""
+    several = len({row["site"] for row in store.predicted}) < len(store.predicted)
+    records = " A row is a record, named site-record; means are over sites, of the means of their records."
+    caption = (
+        "Table 2. Force error at every site: the mean absolute error over the trace divided by the "
+        f"largest measured force. Sites that the identification used are marked.{records if several else ''}"
+    )
+    columns = (
+        ("Site", "record"),
+        ("Region", "region"),
+        ("Use", _name_use),
+        ("Largest force (N)", "peak_force_N", 2),
+        ("Depth (mm)", lambda row: numeric(fixed(store.traces.get(row["record"], {}).get("depth_mm"), 2))),
+        (
+            "Error, one material (%)",
+            lambda row: _error(row, "error_one_material_percent", "one_material"),
+        ),
+        (f"Error, {store.materials} (%)", lambda row: _error(row, "error_percent", "force")),
+    )
+    foot = _make_mean_rows(store)
+    return make_table("sites", caption, columns, store.predicted, marked="fitted", foot=foot)
+
+
+def _name_use(row: Json) -> str:
+    return "fitted" if row.get("fitted") else "held out"
+
+
+def _error(row: Json, key: str, what: str) -> object:
+    return numeric("not predicted" if what in row.get("not_predicted", ()) else fixed(row.get(key)))
+
+
+def _make_mean_rows(store: Results) -> Iterable[Row]:
+    for use, key in (("fitted", "fitted"), ("held out", "heldout")):
+        chosen = [row for row in store.predicted if _name_use(row) == use]
+        one = _average_by_site(chosen, "error_one_material_percent")
+        if chosen:
+            mean = numeric(fixed(sum(one) / len(one)) if one else NOTHING)
+            cells = (_count_sites(chosen), use, numeric(""), numeric(""), mean)
+            yield make_row(f"Mean, {use}", *cells, numeric(store.mean_error(key)))
+
+
+def _average_by_site(rows: list[Json], key: str) -> list[float]:
+    """A value of each site: the mean over its records that have one."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if row.get(key) is not None:
+            found.setdefault(row["site"], []).append(float(row[key]))
+    return [sum(values) / len(values) for values in found.values()]
+
+
+def _count_sites(rows: list[Json]) -> str:
+    """How many sites, and how many of them the mean lacks."""
+    sites = len({row["site"] for row in rows})
+    lacking = sites - len(_average_by_site(rows, "error_percent"))
+    return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
+
+
+def make_observed_table(store: Results) -> Table | None:
+    """What was seen beside the force of each record, and how far its prediction is off; None: nothing."""
+    caption = (
+        "What was seen beside the force: compression of tissues by ultrasound through the indenter (mm), "
+        "displacement of the skin around it (mm), speeds of shear waves under it (m/s). Errors are mean "
+        "absolute ones in percent of the largest value."
+    )
+    columns = (
+        ("Record", "record"),
+        ("Seen", "what"),
+        ("Use", _name_use),
+        ("Compared", "compared"),
+        ("Left out", lambda row: ", ".join(f"{n} {why}" for why, n in row["left_out"].items()) or NOTHING),
+        ("Largest", "largest", 2),
+        ("Noise", "noise", 3),
+        ("Unit", "unit"),
+        ("Error (%)", "error_percent", 1),
+    )
+    rows = [
+        {**one, "left_out": one.get("left_out") or {}, "record": row["record"], "fitted": row.get("fitted")}
+        for row in store.predicted
+        for one in row.get("observed") or ()
+    ]
+    return make_table("observed", caption, columns, rows, marked="fitted") if rows else None

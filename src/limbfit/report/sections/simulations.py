@@ -1,0 +1,141 @@
+"""What simulations say about themselves: single ones, those by FEBio too, and those of every site."""
+
+from __future__ import annotations
+
+from ..drawing.colours import MEASURED, SIMULATED, TRUTH
+from ..drawing.figures import draw_simulated_figure
+from ..drawing.pictures import draw_field_figure
+from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..formats import count
+from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets, make_section
+from ..store import Json, Results
+from ..tables import make_table, numeric
+from .provenance import make_pair_table
+
+
+def make_simulated_section(store: Results) -> Section:
+    """Indentations that were simulated one by one."""
+    sites = [str(row["site"]) for row in store.simulated]
+    columns = (
+        ("Site", "site"),
+        ("Depth (mm)", "depth_mm", 2),
+        ("Largest force (N)", "peak_force_N", 2),
+        ("Largest penetration (mm)", "penetration_mm", 3),
+        ("Parameters", "parameters_from"),
+        ("Completed", _describe_end),
+    )
+    return make_section(
+        "simulated",
+        "Simulated indentations",
+        _list_warnings(store.simulated),
+        draw_simulated_figure(store),
+        draw_field_figure(store, sites[:4], "simulate", "field-simulated"),
+        make_table("simulated", "Indentations simulated one by one.", columns, store.simulated),
+    )
+
+
+def _describe_end(row: Json) -> str:
+    return "yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"
+
+
+def _list_warnings(rows: tuple[Json, ...]) -> Bullets | None:
+    """The solver's warnings about the simulations of the sites; None where there are none."""
+    return make_bullets(f"Site {row['site']}: {text}" for row in rows for text in row.get("warnings") or ())
+
+
+def make_comparison_section(store: Results) -> Section:
+    """Curves and differences of the sites that ``limbfit compare`` solved."""
+    words = Prose(
+        "The same mesh, materials and history by FEBio and by limbfit: once with limbfit's own contact, "
+        "which keeps the penetration below 1 % of the depth, and once with FEBio's penalty and steps; what "
+        "lies between the two is how far the indenter sinks in. Differences are in percent of FEBio's "
+        "largest force."
+    )
+    columns = (
+        ("Site", "site"),
+        ("FEBio (N)", ("febio", "peak_force_N"), 3),
+        ("limbfit (N)", ("limbfit", "peak_force_N"), 3),
+        ("Largest difference (%)", ("limbfit", "difference", "max_percent"), 2),
+        ("With FEBio's penalty (%)", ("limbfit_matched", "difference", "max_percent"), 2),
+        ("FEBio", _describe_febio_end),
+    )
+    table = make_table("compared", "Largest forces and differences.", columns, store.compared)
+    return make_section("comparison", "Comparison with FEBio", words, draw_compared_figure(store), table)
+
+
+def _describe_febio_end(row: Json) -> str:
+    febio = row.get("febio", {})
+    end = "completed" if febio.get("completed") else febio.get("reason")
+    return f"{febio.get('version') or 'FEBio'}, {end}"
+
+
+@styled
+def draw_compared_figure(store: Results) -> Figure | None:
+    """Force by FEBio and by limbfit, a panel for each site where both were run."""
+    found = store.with_curves("compare", store.compared)
+    if not found:
+        return None
+    drawing, axes = make_panels(len(found), 3, 2.5)
+    for ax, (row, curves) in zip(axes, found, strict=True):
+        at = curves["time_s"]
+        ax.plot(at, curves["febio_N"], "o", ms=3, mfc="none", color=MEASURED, label="FEBio")
+        ax.plot(at, curves["limbfit_N"], color=SIMULATED, label="limbfit")
+        ax.plot(at, curves["limbfit_matched_N"], "--", color=TRUTH, label="with FEBio's contact penalty")
+        ax.set(title=f"Site {row['site']}", xlabel="Time (s)", ylabel="Force (N)")
+    add_legend_above(drawing, axes[0])
+    alt = f"Force by FEBio and by limbfit against time, sites {', '.join(row['site'] for row, _ in found)}"
+    return make_figure(drawing, "compared", alt, "Force of the same indentation by FEBio and by limbfit.")
+
+
+def make_solver_section(store: Results) -> Section:
+    """What the simulations say about themselves."""
+    found = store.calibration
+    facts = {
+        "Objective": found.get("objective"),
+        "Forward simulations of the identification": found.get("forward_runs"),
+        "Of them with derivatives": found.get("forward_runs_with_sensitivities"),
+        "Corrections of the search by the whole meshes": _corrections(found.get("corrections") or []),
+        "Starts": (found.get("multistart") or {}).get("summary"),
+        "Linear solver": found.get("linear_solver"),
+        "Element": found.get("element"),
+    }
+    known = {key: value for key, value in facts.items() if value is not None}
+    failed = ", ".join(str(row["record"]) for row in store.predicted if not row.get("completed"))
+    return make_section(
+        "solver",
+        "Solver",
+        Note(f"The simulation did not reach the end of the record at: {failed}.") if failed else None,
+        _list_warnings(store.predicted),
+        make_solver_table(store) if store.predicted else None,
+        make_pair_table("solver-facts", "The identification's solver.", ("Fact", "Value"), known),
+        otherwise="No simulations are stored yet.",
+    )
+
+
+def _corrections(rounds: list[Json]) -> str | None:
+    """How many, and what the last one changed."""
+    if not rounds:
+        return None
+    last = rounds[-1]
+    if last["reason"]:
+        return f"{len(rounds)}; the last failed: {last['reason']}"
+    left = max(last["change_percent_by_site"].values())
+    return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
+
+
+def make_solver_table(store: Results) -> Table:
+    """How each prediction went: steps, penetration, and the reason where one stopped early."""
+    columns = (
+        ("Site", "record"),
+        ("Element", "element"),
+        ("Steps", lambda row: numeric(count(row.get("steps")))),
+        ("Largest penetration (mm)", "penetration_mm", 3),
+        ("Completed", _describe_end),
+        ("Not predicted", _list_not_predicted),
+    )
+    caption = "The simulation of each site with the identified parameters."
+    return make_table("solver", caption, columns, store.predicted, marked="fitted")
+
+
+def _list_not_predicted(row: Json) -> str:
+    return "; ".join(f"{what.replace('_', ' ')}: {why}" for what, why in row.get("not_predicted", {}).items())
