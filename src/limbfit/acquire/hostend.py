@@ -21,7 +21,6 @@ from .messages import (
     Identity,
     OutOfReach,
     Report,
-    SetLimits,
     Tripped,
     command_body,
     parse_report,
@@ -131,13 +130,6 @@ class HostEnd:
             self._pending[fresh] = _Pending(waiting.command, now + self._patience_s, waiting.attempts + 1)
             lines += line
         return lines, reason
-
-
-def limits_command(
-    pin: int, force_mN: int, clamp_mN: int, stroke_um: int, speed_um_s: int, watchdog_ms: float
-) -> SetLimits:
-    """The device's share of a session's limits."""
-    return SetLimits(pin, force_mN, clamp_mN, stroke_um, speed_um_s, max(round(watchdog_ms), 1))
 
 
 def _check(identity: Identity) -> None:

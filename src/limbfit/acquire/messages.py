@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import ClassVar
 
 from .events import PINS, Fence, Hold, Move, Sample, Stop
 from .wire import VERSION
@@ -20,6 +21,18 @@ _SAMPLE = re.compile(
     rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
 )
 MAX_MICRO = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
+
+
+class Message:
+    """A verb and its words: the fields in their order."""
+
+    __slots__ = ()
+    verb: ClassVar[str]
+
+    @property
+    def body(self) -> str:
+        words = (str(getattr(self, name)) for name in self.__match_args__)  # type: ignore[attr-defined]
+        return " ".join((self.verb, *words))
 
 
 # -- from limbfit to the device
@@ -38,22 +51,16 @@ class Hello:
 
 
 @dataclass(frozen=True, slots=True)
-class SetLimits:
+class SetLimits(Message):
     """The device's own limits for this session: it takes the lower of these and those built in."""
 
+    verb: ClassVar[str] = "LIMITS"
     pin: int
     force_mN: int
     clamp_mN: int
     position_um: int
     speed_um_s: int
     watchdog_ms: int
-
-    @property
-    def body(self) -> str:
-        return (
-            f"LIMITS {self.pin} {self.force_mN} {self.clamp_mN} {self.position_um} {self.speed_um_s} "
-            f"{self.watchdog_ms}"
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,14 +76,11 @@ class NoteCommand:
 
 
 @dataclass(frozen=True, slots=True)
-class Beat:
+class Beat(Message):
     """limbfit lives, and has dealt with the sample of this number."""
 
+    verb: ClassVar[str] = "BEAT"
     number: int
-
-    @property
-    def body(self) -> str:
-        return f"BEAT {self.number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,49 +176,37 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
+class Accepted(Message):
     """The command of this number is being done."""
 
+    verb: ClassVar[str] = "OK"
     number: int
-
-    @property
-    def body(self) -> str:
-        return f"OK {self.number}"
 
 
 @dataclass(frozen=True, slots=True)
-class Declined:
+class Declined(Message):
     """The command of this number is not done, and why, in a word."""
 
+    verb: ClassVar[str] = "NO"
     number: int
     code: str
 
-    @property
-    def body(self) -> str:
-        return f"NO {self.number} {self.code}"
-
 
 @dataclass(frozen=True, slots=True)
-class Tripped:
+class Tripped(Message):
     """The device stopped by itself: why, in a word, and at which pin (0: none)."""
 
+    verb: ClassVar[str] = "FAULT"
     code: str
     pin: int
 
-    @property
-    def body(self) -> str:
-        return f"FAULT {self.code} {self.pin}"
-
 
 @dataclass(frozen=True, slots=True)
-class OutOfReach:
+class OutOfReach(Message):
     """After a stop these pins (a bit each) do not come home."""
 
+    verb: ClassVar[str] = "STUCK"
     pins: int
-
-    @property
-    def body(self) -> str:
-        return f"STUCK {self.pins}"
 
 
 Report = Identity | Accepted | Declined | Tripped | OutOfReach | Sample

@@ -6,7 +6,6 @@ caller has), and returns what is to be done.  Where a session can go stands in `
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from .events import (
@@ -110,7 +109,7 @@ class Protocol:
             wrong = device_violation(sample.flags) or self.guard.check(sample) or self._in_phase(sample)
             if wrong:
                 return self._stop(wrong.text, now)
-        outcome = _ENDS[self.phase](self, sample, now)
+        outcome = self._end(sample, now)
         return self._go(outcome, now) if outcome else self._late(now)
 
     def _in_phase(self, sample: Sample) -> Violation | None:
@@ -158,8 +157,7 @@ class Protocol:
     def _go(self, outcome: Outcome, now: float) -> tuple[Action, ...]:
         self.phase = TRANSITIONS[self.phase, outcome]
         self._entered = now
-        enter = _ENTERS.get(self.phase)
-        return enter(self) if enter else ()
+        return self._enter()
 
     # -- moves
 
@@ -169,46 +167,41 @@ class Protocol:
     def _home(self, pins: tuple[int, ...]) -> tuple[Action, ...]:
         return tuple(Move(pin, 0, micro(self.settings.retract_speed_mm_s)) for pin in pins)
 
-    def _enter_position(self) -> tuple[Action, ...]:
-        self._key = False
-        return self._home(tuple(range(1, len(self.guard.limits.force_mN) + 1)))
-
-    def _enter_clamp(self) -> tuple[Action, ...]:
-        self._rounds += 1
-        speed = self.settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5)
-        halt = micro(self.settings.clamp_N)
-        return tuple(Move(pin, self.device.stroke_um, micro(speed), halt) for pin in self.settings.clamps)
-
-    def _enter_approach(self) -> tuple[Action, ...]:
-        self._touching = None
-        halt = self._zero() + micro(self.settings.touch_N)
-        return self._drive(self.device.stroke_um, self.settings.approach_speed_mm_s, max(halt, 1))
-
-    def _enter_start(self) -> tuple[Action, ...]:
-        fence = Fence(self.settings.pin, self._deepest())
-        return (fence, *self._drive(self.start_um, self.settings.retract_speed_mm_s))
-
-    def _enter_search(self) -> tuple[Action, ...]:
-        self._key, self.depth_um = True, 0
-        deepest = self.touch_um + micro(self.settings.search_depth_mm)
-        halt = self._zero() + micro(self.settings.search_force_N)
-        return self._drive(min(deepest, self.device.stroke_um), self.settings.search_speed_mm_s, halt)
-
-    def _enter_load(self) -> tuple[Action, ...]:
-        self.cycle += 1
-        return self._drive(self.depth_um, self.settings.ramp_speed_mm_s)
-
-    def _enter_unload(self) -> tuple[Action, ...]:
-        return self._drive(self.start_um, self.settings.ramp_speed_mm_s)
-
-    def _enter_retract(self) -> tuple[Action, ...]:
-        return self._home((self.settings.pin,))
-
-    def _enter_release(self) -> tuple[Action, ...]:
-        return self._home(self.settings.clamps)
-
-    def _enter_stopping(self) -> tuple[Action, ...]:
-        return (Stop(self.reason),)
+    def _enter(self) -> tuple[Action, ...]:
+        """What a phase begins with."""
+        settings, stroke_um = self.settings, self.device.stroke_um
+        match self.phase:
+            case Phase.POSITION:
+                self._key = False
+                return self._home(tuple(range(1, len(self.guard.limits.force_mN) + 1)))
+            case Phase.CLAMP:
+                self._rounds += 1
+                speed = micro(settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5))
+                return tuple(Move(pin, stroke_um, speed, micro(settings.clamp_N)) for pin in settings.clamps)
+            case Phase.APPROACH:
+                self._touching = None
+                halt = self._zero() + micro(settings.touch_N)
+                return self._drive(stroke_um, settings.approach_speed_mm_s, max(halt, 1))
+            case Phase.BACK | Phase.RETURN:
+                fence = Fence(settings.pin, self._deepest())
+                return (fence, *self._drive(self.start_um, settings.retract_speed_mm_s))
+            case Phase.SEARCH:
+                self._key, self.depth_um = True, 0
+                deepest = min(self.touch_um + micro(settings.search_depth_mm), stroke_um)
+                halt = self._zero() + micro(settings.search_force_N)
+                return self._drive(deepest, settings.search_speed_mm_s, halt)
+            case Phase.LOAD:
+                self.cycle += 1
+                return self._drive(self.depth_um, settings.ramp_speed_mm_s)
+            case Phase.UNLOAD:
+                return self._drive(self.start_um, settings.ramp_speed_mm_s)
+            case Phase.RETRACT:
+                return self._home((settings.pin,))
+            case Phase.RELEASE:
+                return self._home(settings.clamps)
+            case Phase.STOPPING:
+                return (Stop(self.reason),)
+        return ()
 
     # -- how phases end
 
@@ -230,12 +223,46 @@ class Protocol:
         near = abs(sample.position_um[pin - 1] - target_um) < NEAR_UM
         return near and self._rests(sample, now, (pin,))
 
-    def _end_position(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.IN_PLACE if self._key and sample.flags & Flags.HOME else None
-
-    def _end_clamp(self, sample: Sample, now: float) -> Outcome | None:
-        pins = self.settings.clamps
-        return Outcome.FORCES_REACHED if self._rests(sample, now, pins) else None
+    def _end(self, sample: Sample, now: float) -> Outcome | None:
+        """How a sample ends the phase; None where it goes on."""
+        settings, passed_s = self.settings, now - self._entered
+        is_home = bool(sample.flags & Flags.HOME)
+        match self.phase:
+            case Phase.POSITION if self._key and is_home:
+                return Outcome.IN_PLACE
+            case Phase.CLAMP if self._rests(sample, now, settings.clamps):
+                return Outcome.FORCES_REACHED
+            case Phase.SETTLE:
+                return self._end_settle(sample, now)
+            case Phase.APPROACH:
+                return self._end_approach(sample, now)
+            case Phase.BACK | Phase.RETURN if self._arrived(sample, now, self.start_um):
+                return Outcome.AT_START
+            case Phase.SEARCH:
+                self.depth_um = max(self.depth_um, sample.position_um[settings.pin - 1])
+                if self._rests(sample, now, (settings.pin,)):
+                    enough = self.depth_um - self.touch_um >= micro(settings.min_depth_mm)
+                    return Outcome.DEPTH_FOUND if enough else Outcome.TOO_SHALLOW
+            case Phase.PAUSE if passed_s >= settings.pause_s:
+                return Outcome.RESTED
+            case Phase.LOAD if self._arrived(sample, now, self.depth_um):
+                is_held = settings.hold_s > 0.0 and self.cycle > settings.precondition
+                return Outcome.TO_HOLD if is_held else Outcome.AT_DEPTH
+            case Phase.DWELL if passed_s >= settings.hold_s:
+                return Outcome.HELD_OUT
+            case Phase.UNLOAD if self._arrived(sample, now, self.start_um):
+                if self.cycle == settings.cycles:
+                    return Outcome.CYCLES_DONE
+                return Outcome.NEXT_CYCLE if self.cycle < settings.precondition else Outcome.REST
+            case Phase.RETRACT if self._arrived(sample, now, 0):
+                return Outcome.HOME
+            case Phase.RELEASE if is_home and passed_s > QUIET_S:
+                return Outcome.HOME
+            case Phase.STOPPING if sample.flags & Flags.GIVEN_UP:
+                return self._give_up("the device cannot bring every pin home")
+            case Phase.STOPPING if sample.flags & Flags.STOPPED and is_home:
+                return Outcome.RETRACTED
+        return None
 
     def _end_settle(self, sample: Sample, now: float) -> Outcome | None:
         self._tare.append(sample.force_mN[self.settings.pin - 1])
@@ -267,48 +294,6 @@ class Protocol:
             return self._fail(f"pin {pin} feels a force where its capacitance sees no skin")
         return self._fail(f"pin {pin} met nothing up to the end of its stroke")
 
-    def _end_back(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.AT_START if self._arrived(sample, now, self.start_um) else None
-
-    def _end_search(self, sample: Sample, now: float) -> Outcome | None:
-        self.depth_um = max(self.depth_um, sample.position_um[self.settings.pin - 1])
-        if not self._rests(sample, now, (self.settings.pin,)):
-            return None
-        enough = self.depth_um - self.touch_um >= micro(self.settings.min_depth_mm)
-        return Outcome.DEPTH_FOUND if enough else Outcome.TOO_SHALLOW
-
-    def _end_pause(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.RESTED if now - self._entered >= self.settings.pause_s else None
-
-    def _end_load(self, sample: Sample, now: float) -> Outcome | None:
-        if not self._arrived(sample, now, self.depth_um):
-            return None
-        held = self.settings.hold_s > 0.0 and self.cycle > self.settings.precondition
-        return Outcome.TO_HOLD if held else Outcome.AT_DEPTH
-
-    def _end_dwell(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.HELD_OUT if now - self._entered >= self.settings.hold_s else None
-
-    def _end_unload(self, sample: Sample, now: float) -> Outcome | None:
-        if not self._arrived(sample, now, self.start_um):
-            return None
-        if self.cycle == self.settings.cycles:
-            return Outcome.CYCLES_DONE
-        return Outcome.NEXT_CYCLE if self.cycle < self.settings.precondition else Outcome.REST
-
-    def _end_retract(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.HOME if self._arrived(sample, now, 0) else None
-
-    def _end_release(self, sample: Sample, now: float) -> Outcome | None:
-        return Outcome.HOME if sample.flags & Flags.HOME and now - self._entered > QUIET_S else None
-
-    def _end_stopping(self, sample: Sample, now: float) -> Outcome | None:
-        if sample.flags & Flags.GIVEN_UP:
-            return self._give_up("the device cannot bring every pin home")
-        if sample.flags & Flags.STOPPED and sample.flags & Flags.HOME:
-            return Outcome.RETRACTED
-        return None
-
     def _give_up(self, why: str) -> Outcome:
         self.reason = f"{self.reason}; {why}; use the device's own release"
         return Outcome.OUT_OF_REACH
@@ -316,39 +301,3 @@ class Protocol:
     def _fail(self, reason: str) -> Outcome:
         self.reason = reason
         return Outcome.STOP
-
-    def _never(self, sample: Sample, now: float) -> Outcome | None:
-        """Ends by the operator, not by a sample."""
-        return None
-
-
-_ENTERS: dict[Phase, Callable[[Protocol], tuple[Action, ...]]] = {
-    Phase.POSITION: Protocol._enter_position,
-    Phase.CLAMP: Protocol._enter_clamp,
-    Phase.APPROACH: Protocol._enter_approach,
-    Phase.BACK: Protocol._enter_start,
-    Phase.SEARCH: Protocol._enter_search,
-    Phase.RETURN: Protocol._enter_start,
-    Phase.LOAD: Protocol._enter_load,
-    Phase.UNLOAD: Protocol._enter_unload,
-    Phase.RETRACT: Protocol._enter_retract,
-    Phase.RELEASE: Protocol._enter_release,
-    Phase.STOPPING: Protocol._enter_stopping,
-}
-_ENDS: dict[Phase, Callable[[Protocol, Sample, float], Outcome | None]] = {
-    Phase.POSITION: Protocol._end_position,
-    Phase.CLAMP: Protocol._end_clamp,
-    Phase.SETTLE: Protocol._end_settle,
-    Phase.APPROACH: Protocol._end_approach,
-    Phase.BACK: Protocol._end_back,
-    Phase.READY: Protocol._never,
-    Phase.SEARCH: Protocol._end_search,
-    Phase.RETURN: Protocol._end_back,
-    Phase.PAUSE: Protocol._end_pause,
-    Phase.LOAD: Protocol._end_load,
-    Phase.DWELL: Protocol._end_dwell,
-    Phase.UNLOAD: Protocol._end_unload,
-    Phase.RETRACT: Protocol._end_retract,
-    Phase.RELEASE: Protocol._end_release,
-    Phase.STOPPING: Protocol._end_stopping,
-}

@@ -11,8 +11,8 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -20,8 +20,7 @@ from typing import Any
 from ..errors import RunError
 from .device import Device
 from .events import PERIOD_US, Abort, Action, Begin, Event, Hold, LinkLost, Move, Sample, Stop, Tick
-from .hostend import limits_command
-from .messages import Beat, Bye, Declined, Identity, NoteCommand, OutOfReach, Tripped
+from .messages import Beat, Bye, Declined, Identity, NoteCommand, OutOfReach, SetLimits, Tripped
 from .phases import Phase
 from .protocol import DeviceFacts, Protocol
 from .recording import Recorder
@@ -138,14 +137,9 @@ class Session:
     def begin(self, now: float) -> None:
         """Give the device its limits and start."""
         settings, identity = self.settings, self.device.identity
-        limits = limits_command(
-            settings.pin,
-            micro(settings.force_limit_N),
-            micro(settings.clamp_limit_N),
-            identity.stroke_um,
-            micro(settings.speed_limit_mm_s),
-            settings.watchdog_ms,
-        )
+        force, clamp = micro(settings.force_limit_N), micro(settings.clamp_limit_N)
+        speed, watchdog = micro(settings.speed_limit_mm_s), max(round(settings.watchdog_ms), 1)
+        limits = SetLimits(settings.pin, force, clamp, identity.stroke_um, speed, watchdog)
         self._fresh = now + FIRST_S
         with self._wire(now):
             self.device.send(limits, now)
@@ -266,25 +260,13 @@ class Session:
                     case Stop(reason=reason):
                         self._record("stop", now, reason=reason)
 
-    def _wire(self, now: float) -> _Wire:
-        return _Wire(self, now)
-
-
-@dataclass
-class _Wire:
-    """A block in which the device may turn out to be gone."""
-
-    session: Session
-    now: float
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> bool:
-        if not isinstance(error, RunError):
-            return False
-        self.session.lost(str(error), self.now)
-        return True
+    @contextmanager
+    def _wire(self, now: float) -> Iterator[None]:
+        """A block in which the device may turn out to be gone."""
+        try:
+            yield
+        except RunError as error:
+            self.lost(str(error), now)
 
 
 def prioritise() -> str:
