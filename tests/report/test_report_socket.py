@@ -92,4 +92,4 @@ def test_what_others_found_stands_beside_the_regions_own_pressures():
     assert own == {("tibial crest", "30.0", "60.0"), (WHOLE, "12.0", "60.0")}
     assert len(table.rows) == sum("tibial crest" in one.regions or WHOLE in one.regions for one in FINDINGS)
     assert "stance" in table.caption
-    assert make_published_blocks({"published": []}, HELD, "stance") == ()  # of a limb that nobody's study was of
+    assert make_published_blocks({"published": []}, HELD, "stance") == ()
