@@ -32,7 +32,7 @@ from scipy.ndimage import minimum_filter1d
 
 from limbfit.acquire import (
     LineDevice,
-    Nobody,
+    NoOperator,
     Recorder,
     Session,
     Settings,
@@ -43,16 +43,16 @@ from limbfit.acquire import (
 from limbfit.acquire.events import PINS, Abort, Event, Flags, Sample, Stop
 from limbfit.acquire.messages import (
     Accepted,
-    Beat,
     Bye,
+    Heartbeat,
     Hello,
     Identity,
     SetLimits,
+    format_sample,
     parse_command,
-    sample_body,
 )
 from limbfit.acquire.session import prioritise
-from limbfit.acquire.wire import HOST_LINE, Decoder, Encoder, salt_of
+from limbfit.acquire.wire import HOST_LINE, Decoder, Encoder, derive_salt
 from limbfit.study.acquisition import AcquireTable
 
 SITE = "bench"
@@ -78,7 +78,7 @@ def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
     file = Path(tempfile.mkdtemp()) / "record.csv"
     device = LineDevice(connect(address))
     recorder = Recorder(file, {"site": site})
-    session = Session(settings, device, site=site, recorder=recorder, listener=Nobody(events))
+    session = Session(settings, device, site=site, recorder=recorder, listener=NoOperator(events))
     end = threading.Timer(60 * minutes, lambda: events.put(Abort("the time is over")))
     end.start()
     cpu = time.process_time()
@@ -172,12 +172,12 @@ def _trial(connection: socket.socket, random: np.random.Generator) -> float:
                         "0" * 16, PINS, 500, 60_000, 50_000, 12_500, "real", "Peer", "1", "2000-01-01"
                     )
                     connection.sendall(Encoder(first=0).encode(who.body)[1])
-                    salt = salt_of(command.nonce, who.nonce)
+                    salt = derive_salt(command.nonce, who.nonce)
                     encoder = Encoder(salt)
                     decoder.restart(salt)
                 elif isinstance(command, Bye):
                     return stopped_at - over
-                elif not isinstance(command, Beat):
+                elif not isinstance(command, Heartbeat):
                     if isinstance(command, SetLimits):
                         armed, start, shown = True, time.monotonic(), 0
                     if isinstance(command, Stop) and not stopped_at:
@@ -190,7 +190,7 @@ def _trial(connection: socket.socket, random: np.random.Generator) -> float:
                 force[0] = 40_000
             flags = int(Flags.STOPPED | Flags.HOME) if stopped_at else 0
             sample = Sample(0, shown * 2000, flags, 0, (0,) * PINS, tuple(force.tolist()), (100,) * PINS)
-            line = encoder.encode(sample_body(sample))[1]
+            line = encoder.encode(format_sample(sample))[1]
             if shown == over_at:
                 over = time.monotonic()
             connection.sendall(line)

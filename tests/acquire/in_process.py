@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from acquiring import indentation
+from limbfit.acquire.device import HostConnection
 from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp
-from limbfit.acquire.hostend import HostEnd
 from limbfit.acquire.phases import Phase
 from limbfit.acquire.session import Session
 from limbfit.acquire.settings import Settings
@@ -49,7 +49,7 @@ class Direct:
     """The device as a session sees it, with bytes handed over instead of sent."""
 
     def __init__(self, device: VirtualFitSocket) -> None:
-        self.far, self.end = device, HostEnd()
+        self.far, self.end = device, HostConnection()
         self.inbox = b""
         self.sent: list[bytes] = []
         self.identity = self.end.greet(device.feed(self.end.hello()))
@@ -62,8 +62,8 @@ class Direct:
     def send(self, command, now: float) -> None:
         self._give(self.end.send(command, now))
 
-    def again(self, now: float) -> str:
-        lines, reason = self.end.again(now)
+    def resend(self, now: float) -> str:
+        lines, reason = self.end.resend(now)
         if lines:
             self._give(lines)
         return reason

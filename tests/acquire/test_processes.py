@@ -22,7 +22,7 @@ import pytest
 from in_process import settings
 
 from acquiring import SPEED, fitsocket, start
-from limbfit.acquire import LineDevice, LiveTold, Session, connect, read_recording, run_session
+from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
 from limbfit.acquire.events import Abort, Confirm, Flags, Sample
 from limbfit.acquire.messages import SetLimits
 from limbfit.acquire.phases import Phase
@@ -210,7 +210,7 @@ def test_two_sessions_over_one_serial_port(ready) -> None:
             def listen(told, events=events) -> None:
                 if told.phase == "position":
                     events.put(Confirm())
-                elif isinstance(told, LiveTold) and told.phase == "clamp":
+                elif isinstance(told, LiveUpdate) and told.phase == "clamp":
                     events.put(Abort("enough"))
 
             session = Session(settings(), device, site="1", listener=listen)

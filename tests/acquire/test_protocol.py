@@ -8,12 +8,12 @@ from in_process import FAST, Bench, settings
 
 from limbfit.acquire.events import Abort, Confirm, KeyDown, KeyUp
 from limbfit.acquire.phases import FINAL, TRANSITIONS, Outcome, Phase
-from limbfit.acquire.session import PhaseTold
+from limbfit.acquire.session import PhaseUpdate
 from limbfit.acquire.virtual import Fault
 
 
 def phases(bench: Bench) -> list[str]:
-    return [told.phase for told in bench.told if isinstance(told, PhaseTold)]
+    return [told.phase for told in bench.told if isinstance(told, PhaseUpdate)]
 
 
 def test_every_phase_can_be_reached_left_and_stopped() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import Bench
 
-from limbfit.acquire import Recorder, follow_recording, judge, ramps, read_recording
+from limbfit.acquire import Recorder, check_record, find_ramps, follow_recording, read_recording
 from limbfit.acquire.events import PINS, Sample
 from limbfit.acquire.recording import COLUMNS
 from limbfit.errors import TraceError
@@ -156,16 +156,16 @@ def session(tmp_path, **changes):
 
 
 def checks(recording) -> dict[str, bool | None]:
-    return {check.name: check.passed for check in judge(recording).checks}
+    return {check.name: check.passed for check in check_record(recording).checks}
 
 
 def test_a_good_session_is_called_good(tmp_path) -> None:
     bench, recording = session(
         tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, pause_s=3.0, settle_s=0.5
     )
-    verdict = judge(recording)
+    verdict = check_record(recording)
     assert verdict.is_good, verdict
-    found = ramps(recording)
+    found = find_ramps(recording)
     assert [ramp.cycle for ramp in found] == [1, 2, 3]
     for ramp in found:
         protocol = bench.session.protocol
@@ -178,8 +178,8 @@ def test_a_good_session_is_called_good(tmp_path) -> None:
 
 def test_a_ramp_is_kept_with_its_hold(tmp_path) -> None:
     _, recording = session(tmp_path, ramp_speed_mm_s=1.4, hold_s=2.0, pause_s=3.0, settle_s=0.5)
-    assert judge(recording).is_good
-    (ramp,) = ramps(recording)
+    assert check_record(recording).is_good
+    (ramp,) = find_ramps(recording)
     curve = regularise(ramp.trace, find_touch_down(ramp.trace))
     assert [phase.kind for phase in curve.phases] == ["load", "hold", "unload"]
     hold = curve.phases[1]

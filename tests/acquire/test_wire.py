@@ -12,29 +12,29 @@ from in_process import Bench, Direct, device
 from limbfit.acquire.events import PINS, Fence, Hold, Move, Sample, Stop
 from limbfit.acquire.messages import (
     Accepted,
-    Beat,
     Bye,
     Declined,
+    Heartbeat,
     Hello,
     Identity,
+    LimitTripped,
     NoteCommand,
     OutOfReach,
     SetLimits,
-    Tripped,
-    command_body,
+    format_command,
+    format_sample,
     parse_command,
     parse_report,
-    sample_body,
 )
 from limbfit.acquire.phases import Phase
-from limbfit.acquire.wire import DEVICE_LINE, HOST_LINE, Decoder, Encoder, salt_of
+from limbfit.acquire.wire import DEVICE_LINE, HOST_LINE, Decoder, Encoder, derive_salt
 
 COMMANDS = [
     Hello("0123456789abcdef"),
     SetLimits(3, 25_000, 25_000, 60_000, 8000, 20),
     NoteCommand("SITE", "patella-1"),
     NoteCommand("PHASE", "clamp"),
-    Beat(123_456_789),
+    Heartbeat(123_456_789),
     Bye(),
     Move(14, 12_345, 960, 18_000),
     Hold(1),
@@ -43,12 +43,12 @@ COMMANDS = [
 ]
 WHO = Identity("f" * 16, 14, 500, 60_000, 50_000, 12_500, "real", "FitSocket-2", "SN.12", "2024-05-01")
 SAMPLE = Sample(7, 123_456, 8, 5, tuple(range(PINS)), tuple(range(-7, 7)), tuple(range(100, 114)))
-REPORTS = [WHO, Accepted(5), Declined(6, "speed"), Tripped("watchdog", 0), OutOfReach(0b101), SAMPLE]
+REPORTS = [WHO, Accepted(5), Declined(6, "speed"), LimitTripped("watchdog", 0), OutOfReach(0b101), SAMPLE]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: type(c).__name__)
 def test_commands_survive_the_wire(command) -> None:
-    number, line = Encoder(salt=9, first=41).encode(command_body(command))
+    number, line = Encoder(salt=9, first=41).encode(format_command(command))
     assert len(line) <= HOST_LINE
     (found,) = Decoder(HOST_LINE, salt=9, last=40).feed(line)
     assert found.number == number == 41
@@ -57,7 +57,7 @@ def test_commands_survive_the_wire(command) -> None:
 
 @pytest.mark.parametrize("report", REPORTS, ids=lambda r: type(r).__name__)
 def test_reports_survive_the_wire(report) -> None:
-    body = sample_body(report) if isinstance(report, Sample) else report.body
+    body = format_sample(report) if isinstance(report, Sample) else report.body
     assert parse_report(body, 7) == report
 
 
@@ -98,8 +98,8 @@ def test_what_is_no_command_is_none(body: str) -> None:
         WHO.body.replace("500", "-500"),
         WHO.body + " more",
         "S 1,2,3",
-        sample_body(SAMPLE) + ",1",
-        sample_body(SAMPLE).replace("100", "nan"),
+        format_sample(SAMPLE) + ",1",
+        format_sample(SAMPLE).replace("100", "nan"),
         *("OK", "OK x", "STUCK 99999999", "FAULT watch dog", "FAULT x 15", "NO 1 <b>"),
     ],
 )
@@ -146,7 +146,7 @@ def test_every_refusal_is_counted() -> None:
 
 def hostile(bench: Bench) -> dict[str, bytes]:
     """Lines that would move pin 1 in, were they believed."""
-    move = command_body(Move(1, 50_000, 8000))
+    move = format_command(Move(1, 50_000, 8000))
     end = bench.wire.end._encoder
     again = next(line for line in reversed(bench.wire.sent) if b"MOVE" in line)
     return {
@@ -186,7 +186,7 @@ def test_moves_beyond_the_limits_are_declined() -> None:
 
 def test_nothing_moves_without_a_session() -> None:
     far = device()
-    assert far.feed(Encoder().encode(command_body(Move(1, 20_000, 1000)))[1]) == b""
+    assert far.feed(Encoder().encode(format_command(Move(1, 20_000, 1000)))[1]) == b""
     assert not far.motors.driving.any()
     wire = Direct(far)
     wire.send(Move(1, 20_000, 1000), 0.0)
@@ -200,12 +200,12 @@ def test_the_documented_exchange_is_what_is_spoken() -> None:
     device_end, host_end = Decoder(HOST_LINE, numbered=False), Decoder(DEVICE_LINE, numbered=False)
     (greeting,), (answer,) = device_end.feed(hello), host_end.feed(who)
     greeted, identity = parse_command(greeting.body), parse_report(answer.body, answer.number)
-    salt = salt_of(greeted.nonce, identity.nonce)
+    salt = derive_salt(greeted.nonce, identity.nonce)
     device_end.restart(salt)
     host_end.restart(salt)
     assert [parse_command(line.body) for line in device_end.feed(limits + beat)] == [
         SetLimits(1, 25_000, 25_000, 60_000, 8000, 20),
-        Beat(2),
+        Heartbeat(2),
     ]
     assert [parse_report(line.body, line.number) for line in host_end.feed(accepted)] == [Accepted(1)]
     assert device_end.refused.total == host_end.refused.total == 0

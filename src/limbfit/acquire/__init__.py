@@ -11,10 +11,10 @@ Nothing here knows a study, a mesh or a solver: `limbfit.pipeline` puts them tog
 from .device import Device, LineDevice
 from .events import Event
 from .links import DEFAULT_ADDRESS, DEFAULT_PORT, connect
-from .operator import Keyboard, Nobody
-from .quality import RecordedRamp, Verdict, judge, ramps
+from .operator import Keyboard, NoOperator
+from .quality import RecordedRamp, Verdict, check_record, find_ramps
 from .recording import Recorder, Recording, follow_recording, read_recording
-from .session import Ending, Listener, LiveTold, PhaseTold, Session, Told, prioritise, run_session
+from .session import Ending, Listener, LiveUpdate, PhaseUpdate, Session, Update, prioritise, run_session
 from .settings import Settings
 
 __all__ = [
@@ -26,21 +26,21 @@ __all__ = [
     "Keyboard",
     "LineDevice",
     "Listener",
-    "LiveTold",
-    "Nobody",
-    "PhaseTold",
+    "LiveUpdate",
+    "NoOperator",
+    "PhaseUpdate",
     "RecordedRamp",
     "Recorder",
     "Recording",
     "Session",
     "Settings",
-    "Told",
+    "Update",
     "Verdict",
+    "check_record",
     "connect",
+    "find_ramps",
     "follow_recording",
-    "judge",
     "prioritise",
-    "ramps",
     "read_recording",
     "run_session",
 ]

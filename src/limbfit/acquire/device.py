@@ -1,20 +1,42 @@
-"""The device as a session sees it, and the one driver there is: the line protocol over a wire."""
+"""The device as a session sees it, and the one driver there is: the line protocol over a wire.
+
+`HostConnection` is limbfit's end of the protocol without a wire: bytes in, reports out; commands in, bytes
+out.  A command that the device does not answer is sent again under a new number; one that is replaced by a
+newer one for the same pin is not.  It reads no clock: times are given, in s.
+"""
 
 from __future__ import annotations
 
+import secrets
 import select
 import time
+from dataclasses import dataclass
 from typing import Protocol
 
 from ..errors import RunError
-from .events import Sample
-from .hostend import HostEnd
+from .events import PINS, RATE_HZ, Hold, Move, Sample, Stop
 from .links import Link
-from .messages import Command, Declined, Identity, OutOfReach, Tripped
-from .wire import Refusals
+from .messages import (
+    Accepted,
+    Bye,
+    Command,
+    Declined,
+    Heartbeat,
+    Hello,
+    Identity,
+    LimitTripped,
+    OutOfReach,
+    Report,
+    format_command,
+    parse_report,
+)
+from .wire import DEVICE_LINE, VERSION, Decoder, Encoder, Refusals, derive_salt
 
 GREETING_S = 3.0
-AGAIN_S = 0.5  # between greetings: a device on a serial port may still be coming home
+GREET_AGAIN_S = 0.5  # between greetings: a device on a serial port may still be coming home
+RESEND_S = 0.006  # a command is answered at once: after so long it is sent again
+PACED_RESEND_S = 0.5  # where the device's clock, which runs ahead of its ears, is the one that counts
+ATTEMPTS = 6
 
 
 class Device(Protocol):
@@ -29,20 +51,131 @@ class Device(Protocol):
     def send(self, command: Command, now: float) -> None:
         """Give a command; raises `RunError` where the device is gone."""
 
-    def receive(self, timeout_s: float) -> list[Sample | Declined | Tripped | OutOfReach]:
+    def receive(self, timeout_s: float) -> list[Sample | Declined | LimitTripped | OutOfReach]:
         """Wait for the device for at most so long; raises `RunError` where it is gone."""
 
-    def again(self, now: float) -> str:
+    def resend(self, now: float) -> str:
         """Repeat commands that went unanswered; a reason to stop, or nothing."""
 
     def close(self) -> None: ...
+
+
+@dataclass
+class _Pending:
+    command: Command
+    due: float
+    attempts: int = 1
+
+
+class HostConnection:
+    """Encodes, decodes, numbers, repeats; one per session."""
+
+    def __init__(self) -> None:
+        self.nonce = secrets.token_hex(8)
+        self.identity: Identity | None = None
+        self._encoder = Encoder(first=0)
+        self._decoder = Decoder(DEVICE_LINE, numbered=False)
+        self._pending: dict[int, _Pending] = {}
+        self._patience_s = RESEND_S
+
+    @property
+    def refused(self) -> Refusals:
+        return self._decoder.refused
+
+    def hello(self) -> bytes:
+        """The greeting; its answer comes out of `greet`."""
+        return self._encoder.encode(Hello(self.nonce).body)[1]
+
+    def greet(self, data: bytes) -> Identity | None:
+        """Bytes until the device has said who it is.
+
+        Raises
+        ------
+        RunError
+            Where it is another version, has other pins or another rate than limbfit knows.
+        """
+        for line in self._decoder.feed(data):
+            report = parse_report(line.body, line.number)
+            if not isinstance(report, Identity):
+                self.refused.unknown += 1
+                continue
+            _check(report)
+            salt = derive_salt(self.nonce, report.nonce)
+            self._encoder = Encoder(salt)
+            self._decoder.restart(salt)
+            self.identity = report
+            self._patience_s = PACED_RESEND_S if report.clock == "paced" else RESEND_S
+            return report
+        return None
+
+    def send(self, command: Command, now: float) -> bytes:
+        """The line of a command; one that needs an answer is remembered until it comes."""
+        number, line = self._encoder.encode(format_command(command))
+        if isinstance(command, (Heartbeat, Bye)):
+            return line
+        self._replace(command)
+        self._pending[number] = _Pending(command, now + self._patience_s)
+        return line
+
+    def _replace(self, command: Command) -> None:
+        """What a newer command makes void: the older ones for its pin; a stop, all."""
+        match command:
+            case Stop():
+                self._pending.clear()
+            case Move(pin=pin) | Hold(pin=pin):
+                for number, old in list(self._pending.items()):
+                    if isinstance(old.command, (Move, Hold)) and old.command.pin == pin:
+                        del self._pending[number]
+
+    def feed(self, data: bytes) -> list[Sample | Declined | LimitTripped | OutOfReach]:
+        """What the device says that concerns the session, in order."""
+        found: list[Sample | Declined | LimitTripped | OutOfReach] = []
+        for line in self._decoder.feed(data):
+            report: Report | None = parse_report(line.body, line.number)
+            match report:
+                case None | Identity():
+                    self.refused.unknown += 1
+                case Accepted(number=number):
+                    self._pending.pop(number, None)
+                case Declined(number=number):
+                    if self._pending.pop(number, None) is not None:
+                        found.append(report)
+                case _:
+                    found.append(report)
+        return found
+
+    def resend(self, now: float) -> tuple[bytes, str]:
+        """Lines of commands that went unanswered; and, where one did too often, what to stop for."""
+        lines, reason = b"", ""
+        for number, waiting in list(self._pending.items()):
+            if now < waiting.due:
+                continue
+            del self._pending[number]
+            if waiting.attempts >= ATTEMPTS and not isinstance(waiting.command, Stop):
+                reason = "the device does not answer commands"
+                continue
+            fresh, line = self._encoder.encode(format_command(waiting.command))
+            self._pending[fresh] = _Pending(waiting.command, now + self._patience_s, waiting.attempts + 1)
+            lines += line
+        return lines, reason
+
+
+def _check(identity: Identity) -> None:
+    if identity.version != VERSION:
+        raise RunError(
+            f"the device speaks version {identity.version} of the protocol, limbfit {VERSION}; "
+            "see docs/device-protocol.md"
+        )
+    if (identity.pins, identity.rate_hz) != (PINS, RATE_HZ):
+        found = f"{identity.pins} pins at {identity.rate_hz} Hz"
+        raise RunError(f"the device has {found}; limbfit knows {PINS} at {RATE_HZ} Hz")
 
 
 class LineDevice:
     """A device that speaks the line protocol (docs/device-protocol.md)."""
 
     def __init__(self, link: Link) -> None:
-        self._link, self._end = link, HostEnd()
+        self._link, self._end = link, HostConnection()
         self.identity = self._greet()
 
     @property
@@ -54,7 +187,7 @@ class LineDevice:
         try:
             while time.monotonic() < end:
                 self._link.write(self._end.hello())
-                select.select([self._link], [], [], AGAIN_S)
+                select.select([self._link], [], [], GREET_AGAIN_S)
                 if identity := self._end.greet(self._link.read()):
                     return identity
         except RunError as error:
@@ -70,12 +203,12 @@ class LineDevice:
     def send(self, command: Command, now: float) -> None:
         self._link.write(self._end.send(command, now))
 
-    def receive(self, timeout_s: float) -> list[Sample | Declined | Tripped | OutOfReach]:
+    def receive(self, timeout_s: float) -> list[Sample | Declined | LimitTripped | OutOfReach]:
         select.select([self._link], [], [], timeout_s)
         return self._end.feed(self._link.read())
 
-    def again(self, now: float) -> str:
-        lines, reason = self._end.again(now)
+    def resend(self, now: float) -> str:
+        lines, reason = self._end.resend(now)
         if lines:
             self._link.write(lines)
         return reason

@@ -76,7 +76,7 @@ class NoteCommand:
 
 
 @dataclass(frozen=True, slots=True)
-class Beat(Message):
+class Heartbeat(Message):
     """limbfit lives, and has dealt with the sample of this number."""
 
     verb: ClassVar[str] = "BEAT"
@@ -90,10 +90,10 @@ class Bye:
     body = "BYE"
 
 
-Command = Hello | SetLimits | NoteCommand | Beat | Bye | Move | Hold | Stop | Fence
+Command = Hello | SetLimits | NoteCommand | Heartbeat | Bye | Move | Hold | Stop | Fence
 
 
-def command_body(command: Command) -> str:
+def format_command(command: Command) -> str:
     """The body of a command; the reason of a stop becomes a word, since reasons hold what devices said."""
     match command:
         case Move(pin, target, speed, halt):
@@ -120,7 +120,7 @@ def parse_command(body: str) -> Command | None:
         return None
     match verb, numbers:
         case "BEAT", [number]:
-            return Beat(number)
+            return Heartbeat(number)
         case "MOVE", [pin, target, speed, halt] if _is_pin(pin) and target >= 0 < speed and halt >= 0:
             return Move(pin, target, speed, halt)
         case "HOLD", [pin] if _is_pin(pin):
@@ -193,7 +193,7 @@ class Declined(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Tripped(Message):
+class LimitTripped(Message):
     """The device stopped by itself: why, in a word, and at which pin (0: none)."""
 
     verb: ClassVar[str] = "FAULT"
@@ -209,10 +209,10 @@ class OutOfReach(Message):
     pins: int
 
 
-Report = Identity | Accepted | Declined | Tripped | OutOfReach | Sample
+Report = Identity | Accepted | Declined | LimitTripped | OutOfReach | Sample
 
 
-def sample_body(sample: Sample) -> str:
+def format_sample(sample: Sample) -> str:
     channels = (*sample.position_um, *sample.force_mN, *sample.capacitance_fF)
     return f"S {sample.time_us},{sample.flags},{sample.moving}," + ",".join(map(str, channels))
 
@@ -228,7 +228,7 @@ def parse_report(body: str, number: int) -> Report | None:
         return Declined(int(words[0]), words[1])
     if verb == "FAULT" and len(words) == 2 and _WORD.match(words[0]) and _INTEGER.match(words[1]):
         pin = int(words[1])
-        return Tripped(words[0], pin) if pin == 0 or _is_pin(pin) else None
+        return LimitTripped(words[0], pin) if pin == 0 or _is_pin(pin) else None
     numbers = _integers(words)
     match verb, numbers:
         case "OK", [done]:

@@ -6,12 +6,12 @@ from queue import SimpleQueue
 
 from .events import Abort, Confirm, Event, KeyDown, KeyUp
 from .phases import Phase
-from .session import PhaseTold, Told
+from .session import PhaseUpdate, Update
 
 FIRST_REPEAT_S = 0.75  # a keyboard waits before a held key repeats
 
 
-class HeldKey:
+class DeadMansKey:
     """A terminal tells of no release: a key that is held repeats, one that is released does not.
 
     The key counts as held from its second character on, so that a touch moves nothing, and as released once
@@ -44,7 +44,7 @@ class Keyboard:
     """Characters of a terminal to events: Enter confirms, the space bar is the key, anything else stops."""
 
     def __init__(self, gap_s: float) -> None:
-        self.key = HeldKey(gap_s)
+        self.key = DeadMansKey(gap_s)
 
     def typed(self, characters: bytes, now: float) -> list[Event]:
         found: list[Event] = []
@@ -63,14 +63,14 @@ class Keyboard:
         return [event] if event else []
 
 
-class Nobody:
+class NoOperator:
     """No operator: the limb counts as in place, and the key as held until the search ends by itself."""
 
     def __init__(self, events: SimpleQueue[Event]) -> None:
         self.events = events
 
-    def __call__(self, told: Told) -> None:
-        if not isinstance(told, PhaseTold):
+    def __call__(self, told: Update) -> None:
+        if not isinstance(told, PhaseUpdate):
             return
         if told.phase == Phase.POSITION:
             self.events.put(Confirm())

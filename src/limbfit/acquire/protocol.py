@@ -26,8 +26,8 @@ from .events import (
     Stop,
 )
 from .phases import CLAMPED, FINAL, TRANSITIONS, WAITS_FOR_OPERATOR, Outcome, Phase
-from .safety import ClampWatch, Guard, Violation, deaf, device_violation, session_limits
-from .settings import Settings, micro
+from .safety import ClampWatch, Guard, Violation, check_device_flags, check_sensitivity, make_session_limits
+from .settings import Settings, to_thousandths
 
 QUIET_S = 0.05  # a command is under way for less: nothing is concluded from a pin that does not move yet
 NEAR_UM = 60  # a pin that is so near to its target has arrived
@@ -59,7 +59,7 @@ class Protocol:
         self.settings, self.device = settings, device
         self.phase, self.reason = Phase.IDLE, ""
         self.touch_um = self.start_um = self.depth_um = self.cycle = 0
-        self.guard = Guard(session_limits(settings, device.stroke_um, device.range_mN, RATE_HZ))
+        self.guard = Guard(make_session_limits(settings, device.stroke_um, device.range_mN, RATE_HZ))
         self._watch = ClampWatch(settings.clamps)
         self._entered = self._heard = 0.0
         self._rounds = 0
@@ -106,7 +106,7 @@ class Protocol:
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
         if self.phase is not Phase.STOPPING:
-            wrong = device_violation(sample.flags) or self.guard.check(sample) or self._in_phase(sample)
+            wrong = check_device_flags(sample.flags) or self.guard.check(sample) or self._in_phase(sample)
             if wrong:
                 return self._stop(wrong.text, now)
         outcome = self._end(sample, now)
@@ -123,7 +123,7 @@ class Protocol:
             felt, travel = self._felt(sample), sample.position_um[pin - 1] - self.touch_um
         else:
             return None
-        return deaf(travel, felt, micro(self.settings.touch_N) // 2, pin)
+        return check_sensitivity(travel, felt, to_thousandths(self.settings.touch_N) // 2, pin)
 
     def _late(self, now: float) -> tuple[Action, ...]:
         """Every phase has its time."""
@@ -162,10 +162,10 @@ class Protocol:
     # -- moves
 
     def _drive(self, target_um: int, speed_mm_s: float, halt_mN: int = 0) -> tuple[Action, ...]:
-        return (Move(self.settings.pin, target_um, micro(speed_mm_s), halt_mN),)
+        return (Move(self.settings.pin, target_um, to_thousandths(speed_mm_s), halt_mN),)
 
     def _home(self, pins: tuple[int, ...]) -> tuple[Action, ...]:
-        return tuple(Move(pin, 0, micro(self.settings.retract_speed_mm_s)) for pin in pins)
+        return tuple(Move(pin, 0, to_thousandths(self.settings.retract_speed_mm_s)) for pin in pins)
 
     def _enter(self) -> tuple[Action, ...]:
         """What a phase begins with."""
@@ -176,19 +176,20 @@ class Protocol:
                 return self._home(tuple(range(1, len(self.guard.limits.force_mN) + 1)))
             case Phase.CLAMP:
                 self._rounds += 1
-                speed = micro(settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5))
-                return tuple(Move(pin, stroke_um, speed, micro(settings.clamp_N)) for pin in settings.clamps)
+                speed = to_thousandths(settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5))
+                halt = to_thousandths(settings.clamp_N)
+                return tuple(Move(pin, stroke_um, speed, halt) for pin in settings.clamps)
             case Phase.APPROACH:
                 self._touching = None
-                halt = self._zero() + micro(settings.touch_N)
+                halt = self._zero() + to_thousandths(settings.touch_N)
                 return self._drive(stroke_um, settings.approach_speed_mm_s, max(halt, 1))
             case Phase.BACK | Phase.RETURN:
                 fence = Fence(settings.pin, self._deepest())
                 return (fence, *self._drive(self.start_um, settings.retract_speed_mm_s))
             case Phase.SEARCH:
                 self._key, self.depth_um = True, 0
-                deepest = min(self.touch_um + micro(settings.search_depth_mm), stroke_um)
-                halt = self._zero() + micro(settings.search_force_N)
+                deepest = min(self.touch_um + to_thousandths(settings.search_depth_mm), stroke_um)
+                halt = self._zero() + to_thousandths(settings.search_force_N)
                 return self._drive(deepest, settings.search_speed_mm_s, halt)
             case Phase.LOAD:
                 self.cycle += 1
@@ -210,7 +211,7 @@ class Protocol:
         return sum(self._tare) // len(self._tare) if self._tare else 0
 
     def _deepest(self) -> int:
-        return min(self.touch_um + micro(self.settings.depth_limit_mm), self.device.stroke_um)
+        return min(self.touch_um + to_thousandths(self.settings.depth_limit_mm), self.device.stroke_um)
 
     def _felt(self, sample: Sample) -> int:
         return sample.force_mN[self.settings.pin - 1] - self._zero()
@@ -241,7 +242,7 @@ class Protocol:
             case Phase.SEARCH:
                 self.depth_um = max(self.depth_um, sample.position_um[settings.pin - 1])
                 if self._rests(sample, now, (settings.pin,)):
-                    enough = self.depth_um - self.touch_um >= micro(settings.min_depth_mm)
+                    enough = self.depth_um - self.touch_um >= to_thousandths(settings.min_depth_mm)
                     return Outcome.DEPTH_FOUND if enough else Outcome.TOO_SHALLOW
             case Phase.PAUSE if passed_s >= settings.pause_s:
                 return Outcome.RESTED
@@ -268,7 +269,7 @@ class Protocol:
         self._tare.append(sample.force_mN[self.settings.pin - 1])
         if now - self._entered < self.settings.settle_s:
             return None
-        least = micro(self.settings.clamp_N - self.settings.clamp_tolerance_N)
+        least = to_thousandths(self.settings.clamp_N - self.settings.clamp_tolerance_N)
         force, pin = min((sample.force_mN[pin - 1], pin) for pin in self.settings.clamps)
         if force >= least:
             return Outcome.HELD
@@ -283,14 +284,14 @@ class Protocol:
             self._touching = sample.position_um[pin - 1]
         if not self._rests(sample, now, (pin,)):
             return None
-        if self._felt(sample) >= micro(self.settings.touch_N) // 2 and self._touching is not None:
+        if self._felt(sample) >= to_thousandths(self.settings.touch_N) // 2 and self._touching is not None:
             self.touch_um = self._touching
-            self.start_um = max(self.touch_um - micro(self.settings.start_gap_mm), 0)
+            self.start_um = max(self.touch_um - to_thousandths(self.settings.start_gap_mm), 0)
             self.guard.set_depth(pin, self._deepest())
             return Outcome.TOUCHED
         if touches:
             return None  # the limb gave way: the limits of deafness and time decide
-        if self._felt(sample) >= micro(self.settings.touch_N) // 2:
+        if self._felt(sample) >= to_thousandths(self.settings.touch_N) // 2:
             return self._fail(f"pin {pin} feels a force where its capacitance sees no skin")
         return self._fail(f"pin {pin} met nothing up to the end of its stroke")
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Indices
 from ..errors import TraceError
 from ..traces import Regularised, Trace, find_touch_down, regularise
 from .events import PERIOD_US
@@ -53,7 +53,7 @@ class RecordedRamp:
     trace: Trace
 
 
-def ramps(recording: Recording) -> list[RecordedRamp]:
+def find_ramps(recording: Recording) -> list[RecordedRamp]:
     """The complete ramps of a record: in, held or not, out, and a moment of rest around."""
     pin = int(recording.head["settings"]["pin"]) - 1
     marks = [event for event in recording.events if event["event"] == "phase" and event["phase"] != "hold"]
@@ -66,7 +66,7 @@ def ramps(recording: Recording) -> list[RecordedRamp]:
         # The rest around it belongs to a ramp; the way there and the way home do not.
         start_um = int(load.get("start_um", 0))
         position = recording.position_um[rows, pin]
-        inside = _between_far(position, start_um)
+        inside = _find_near_rows(position, start_um)
         time = recording.device_us[rows][inside]
         trace = Trace(
             (time - time[0]) / 1e6,
@@ -77,7 +77,7 @@ def ramps(recording: Recording) -> list[RecordedRamp]:
     return found
 
 
-def _between_far(position: NDArray[np.int64], start_um: int) -> slice:
+def _find_near_rows(position: Indices, start_um: int) -> slice:
     """Rows from the last that is far before the deepest to the first that is far after it."""
     deepest = int(position.argmax())
     far = np.flatnonzero(position < start_um - 50)
@@ -85,26 +85,26 @@ def _between_far(position: NDArray[np.int64], start_um: int) -> slice:
     return slice(int(before[-1]) + 1 if before.size else 0, int(after[0]) if after.size else len(position))
 
 
-def judge(recording: Recording) -> Verdict:
+def check_record(recording: Recording) -> Verdict:
     """The verdict on a session that came to its end."""
     precondition = int(recording.head["settings"]["precondition"])
-    counted = [ramp for ramp in ramps(recording) if ramp.cycle > precondition]
+    counted = [ramp for ramp in find_ramps(recording) if ramp.cycle > precondition]
     checks = [
-        _complete(recording, counted),
-        *_curves(counted, float(recording.head["settings"]["ramp_speed_mm_s"])),
-        _drift(recording),
-        _saturation(recording),
+        _check_ramps(recording, counted),
+        *_check_curves(counted, float(recording.head["settings"]["ramp_speed_mm_s"])),
+        _check_drift(recording),
+        _check_saturation(recording),
     ]
-    return Verdict((*checks, _losses(recording)))
+    return Verdict((*checks, _check_losses(recording)))
 
 
-def _complete(recording: Recording, counted: list[RecordedRamp]) -> Check:
+def _check_ramps(recording: Recording, counted: list[RecordedRamp]) -> Check:
     wanted = int(recording.head["settings"]["repeats"])
     found = f"{len(counted)} of {wanted} ramps"
     return Check("ramps", len(counted) == wanted, found, "record the site again")
 
 
-def _curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
+def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
     smooth: list[Regularised] = []
     checks = []
     for ramp in counted:
@@ -115,11 +115,11 @@ def _curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
             checks.append(Check("touch-down", False, f"none is found: {error.what}", "record the site again"))
             continue
         smooth.append(curve)
-        checks += [_speed(curve, speed_mm_s), _touch(touch.displacement_mm, touch.uncertainty_mm)]
-    return [*checks, _repeatability(smooth)]
+        checks += [_check_speed(curve, speed_mm_s), _check_touch(touch.displacement_mm, touch.uncertainty_mm)]
+    return [*checks, _check_repeatability(smooth)]
 
 
-def _speed(curve: Regularised, stated_mm_s: float) -> Check:
+def _check_speed(curve: Regularised, stated_mm_s: float) -> Check:
     low, high = stated_mm_s * (1.0 - SPEED_OFF), stated_mm_s * (1.0 + SPEED_OFF)
     speeds = (curve.speed_load_mm_s, curve.speed_unload_mm_s)
     found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:.3g} to {high:.3g})"
@@ -127,13 +127,13 @@ def _speed(curve: Regularised, stated_mm_s: float) -> Check:
     return Check("speed", all(low <= speed <= high for speed in speeds), found, remedy)
 
 
-def _touch(place_mm: float, uncertainty_mm: float) -> Check:
+def _check_touch(place_mm: float, uncertainty_mm: float) -> Check:
     found = f"{place_mm:.2f} +- {uncertainty_mm:.2f} mm from the start (at most {TOUCH_MM:g})"
     remedy = "give the ramps a larger acquire.start_gap_mm, or clean the force sensor"
     return Check("touch-down", uncertainty_mm <= TOUCH_MM, found, remedy)
 
 
-def _repeatability(curves: list[Regularised]) -> Check:
+def _check_repeatability(curves: list[Regularised]) -> Check:
     if len(curves) < 2:
         return Check("repeatability", None, "one ramp: nothing to compare")
     depth = min(curve.depth_mm for curve in curves)
@@ -146,7 +146,7 @@ def _repeatability(curves: list[Regularised]) -> Check:
     return Check("repeatability", spread <= REPEATABLE_PERCENT, found, "precondition more, or pause longer")
 
 
-def _drift(recording: Recording) -> Check:
+def _check_drift(recording: Recording) -> Check:
     """The test pin's force off the skin, before and after."""
     pin = int(recording.head["settings"]["pin"]) - 1
     spans = recording.phases()
@@ -164,7 +164,7 @@ def _drift(recording: Recording) -> Check:
     return Check("drift", abs(drift) <= DRIFT_N, found, "let the device warm up, zero its sensors")
 
 
-def _saturation(recording: Recording) -> Check:
+def _check_saturation(recording: Recording) -> Check:
     full = int(recording.head["device"]["range_mN"])
     count = int((np.abs(recording.force_mN) >= full).any(axis=1).sum())
     return Check(
@@ -172,7 +172,7 @@ def _saturation(recording: Recording) -> Check:
     )
 
 
-def _losses(recording: Recording) -> Check:
+def _check_losses(recording: Recording) -> Check:
     steps = np.diff(recording.device_us)
     lost = int(np.maximum(np.rint(steps / PERIOD_US) - 1, 0).sum()) if steps.size else 0
     share = 100 * lost / max(len(recording.device_us) + lost, 1)

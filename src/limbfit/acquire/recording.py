@@ -28,8 +28,8 @@ from queue import SimpleQueue
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Indices
 from ..errors import RunError, TraceError
 from .events import PINS, Sample
 
@@ -49,8 +49,6 @@ COLUMNS = (
         for pin in range(1, PINS + 1)
     ),
 )
-
-Integers = NDArray[np.int64]
 
 
 class Recorder:
@@ -128,14 +126,14 @@ class Recording:
 
     head: dict[str, Any]
     events: tuple[dict[str, Any], ...]
-    host_us: Integers
-    device_us: Integers
-    number: Integers
-    flags: Integers
-    moving: Integers
-    position_um: Integers
-    force_mN: Integers
-    capacitance_fF: Integers
+    host_us: Indices
+    device_us: Indices
+    number: Indices
+    flags: Indices
+    moving: Indices
+    position_um: Indices
+    force_mN: Indices
+    capacitance_fF: Indices
     lost_bytes: int
 
     def phases(self) -> list[tuple[str, int, int]]:
@@ -160,10 +158,10 @@ def read_recording(file: str | Path) -> Recording:
     if path.stat().st_size > MAX_BYTES:
         raise TraceError(f"larger than {MAX_BYTES:g} bytes", file=path)
     data = path.read_bytes()
-    blocks = _first_block(data, path)
-    whole = _whole(data, blocks)
-    head, events, rows = _sorted_lines(blocks.content + whole.content, path)
-    return _recording(head, events, rows, len(data) - whole.end, path)
+    blocks = _read_first_block(data, path)
+    whole = _read_whole_blocks(data, blocks)
+    head, events, rows = _sort_lines(blocks.content + whole.content, path)
+    return _make_recording(head, events, rows, len(data) - whole.end, path)
 
 
 def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tuple[Recording, int]:
@@ -187,19 +185,19 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
     if not path.is_file():
         raise TraceError("no such record", file=path)
     with path.open("rb") as stream:
-        first = _first_block(stream.read(_HEAD_BYTES), path)
-        before = _block_before(stream, offset, path) if offset else first
+        first = _read_first_block(stream.read(_HEAD_BYTES), path)
+        before = _read_block_before(stream, offset, path) if offset else first
         stream.seek(before.end)
         data = stream.read(FOLLOWED_BYTES)
-    found = _whole(data, replace(before, content=b"", end=0))
+    found = _read_whole_blocks(data, replace(before, content=b"", end=0))
     if found.is_damaged or (not found.content and len(data) == FOLLOWED_BYTES):
         remedy = "limbfit recording says what can be read of it"
         place = f"byte {before.end + found.end}"
         raise TraceError("this part is damaged", file=path, place=place, remedy=remedy)
     content = found.content if offset else first.content + found.content
-    _, events, rows = _sorted_lines(content, path)
-    head, _, _ = _sorted_lines(first.content, path)
-    recording = _recording(head, events, rows[every - 1 :: every], len(data) - found.end, path)
+    _, events, rows = _sort_lines(content, path)
+    head, _, _ = _sort_lines(first.content, path)
+    recording = _make_recording(head, events, rows[every - 1 :: every], len(data) - found.end, path)
     return recording, before.end + found.end
 
 
@@ -217,17 +215,17 @@ class _Blocks:
 _CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 
 
-def _first_block(data: bytes, path: Path) -> _Blocks:
+def _read_first_block(data: bytes, path: Path) -> _Blocks:
     """The block that holds the head."""
     if not data.startswith(FIRST.encode()):
         raise TraceError("not a record of limbfit acquire", file=path, place="line 1")
-    first = _whole(data, _Blocks(b"", 0, 0, 0), most=1)
+    first = _read_whole_blocks(data, _Blocks(b"", 0, 0, 0), most=1)
     if not first.content:
         raise TraceError("its first block is damaged", file=path, remedy="nothing can be read from it")
     return first
 
 
-def _block_before(stream: BinaryIO, offset: int, path: Path) -> _Blocks:
+def _read_block_before(stream: BinaryIO, offset: int, path: Path) -> _Blocks:
     """What the closing line of the block that ends at an offset says."""
     stream.seek(max(offset - _CLOSING_BYTES, 0))
     line = stream.read(min(offset, _CLOSING_BYTES))
@@ -237,7 +235,7 @@ def _block_before(stream: BinaryIO, offset: int, path: Path) -> _Blocks:
     return _Blocks(b"", offset, int(closing[3], 16), int(closing[1]) + 1)
 
 
-def _whole(data: bytes, before: _Blocks, most: int = sys.maxsize) -> _Blocks:
+def _read_whole_blocks(data: bytes, before: _Blocks, most: int = sys.maxsize) -> _Blocks:
     """The blocks after ``before``, which ends at its ``end`` in ``data``, up to one that is not whole."""
     parts: list[bytes] = []
     at, crc, is_damaged = before.end, before.crc, False
@@ -253,10 +251,10 @@ def _whole(data: bytes, before: _Blocks, most: int = sys.maxsize) -> _Blocks:
     return _Blocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
 
 
-def _recording(
+def _make_recording(
     head: dict[str, Any], events: tuple[dict[str, Any], ...], rows: list[str], lost: int, path: Path
 ) -> Recording:
-    table = _table(rows, path)
+    table = _read_table(rows, path)
     first = len(_NAMES)
     position, force, capacitance = np.split(table[:, first:], 3, axis=1)
     host_us, device_us, number, flags, moving = table[:, :first].T
@@ -265,7 +263,7 @@ def _recording(
     )
 
 
-def _sorted_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dict[str, Any], ...], list[str]]:
+def _sort_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dict[str, Any], ...], list[str]]:
     """Head, events and rows."""
     head: dict[str, Any] = {}
     events, rows = [], []
@@ -286,7 +284,7 @@ def _sorted_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dic
     return head, tuple(events), rows
 
 
-def _table(rows: list[str], path: Path) -> Integers:
+def _read_table(rows: list[str], path: Path) -> Indices:
     if not rows:
         return np.zeros((0, len(COLUMNS)), dtype=np.int64)
     try:

@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from .events import PINS, Flags, Sample
-from .settings import Settings, micro
+from .settings import Settings, to_thousandths
 
 FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and so many samples, is dead
 FROZEN_SAMPLES = 8
@@ -46,14 +46,14 @@ class Violation:
     text: str
 
 
-def session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: int) -> SafetyLimits:
+def make_session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: int) -> SafetyLimits:
     """The limits of a session before the skin has been met; see `Guard.set_depth`."""
-    force = [micro(settings.clamp_limit_N)] * PINS
-    force[settings.pin - 1] = micro(settings.force_limit_N)
+    force = [to_thousandths(settings.clamp_limit_N)] * PINS
+    force[settings.pin - 1] = to_thousandths(settings.force_limit_N)
     return SafetyLimits(
         force_mN=tuple(force),
         position_um=(stroke_um,) * PINS,
-        speed_um_s=micro(settings.speed_limit_mm_s),
+        speed_um_s=to_thousandths(settings.speed_limit_mm_s),
         range_mN=range_mN,
         alike=max(round(FROZEN_S * rate_hz), FROZEN_SAMPLES),
     )
@@ -154,7 +154,7 @@ class ClampWatch:
         return None
 
 
-def device_violation(flags: int) -> Violation | None:
+def check_device_flags(flags: int) -> Violation | None:
     """What the device says of itself."""
     if flags & Flags.BUTTON:
         return Violation("button", 0, "the device's emergency stop was pressed")
@@ -165,7 +165,7 @@ def device_violation(flags: int) -> Violation | None:
     return None
 
 
-def deaf(travel_um: int, felt_mN: int, least_mN: int, pin: int) -> Violation | None:
+def check_sensitivity(travel_um: int, felt_mN: int, least_mN: int, pin: int) -> Violation | None:
     """A force sensor that feels nothing of a push that the capacitance saw begin."""
     if travel_um > DEAF_UM and felt_mN < least_mN:
         text = f"pin {pin} touches ({travel_um / 1000:.1f} mm ago) but feels no force: see its force sensor"

@@ -20,11 +20,11 @@ from typing import Any
 from ..errors import RunError
 from .device import Device
 from .events import PERIOD_US, Abort, Action, Begin, Event, Hold, LinkLost, Move, Sample, Stop, Tick
-from .messages import Beat, Bye, Declined, Identity, NoteCommand, OutOfReach, SetLimits, Tripped
+from .messages import Bye, Declined, Heartbeat, Identity, LimitTripped, NoteCommand, OutOfReach, SetLimits
 from .phases import Phase
 from .protocol import DeviceFacts, Protocol
 from .recording import Recorder
-from .settings import Settings, micro
+from .settings import Settings, to_thousandths
 
 LIVE_EVERY = 20  # samples between two that are told: 25 a second
 PACED_SILENCE_S = 20.0  # wall time, where the device's clock waits for limbfit's
@@ -55,7 +55,7 @@ def _why(code: str) -> str:
 
 
 @dataclass(frozen=True)
-class PhaseTold:
+class PhaseUpdate:
     """The session is in another phase; ``reason`` where it was stopped, ``cycle`` of the ramps."""
 
     phase: str
@@ -65,7 +65,7 @@ class PhaseTold:
 
 
 @dataclass(frozen=True)
-class LiveTold:
+class LiveUpdate:
     """The test pin as it is: depth from the touch (or position, before), force, capacitance."""
 
     phase: str
@@ -76,8 +76,8 @@ class LiveTold:
     clamp_N: float
 
 
-Told = PhaseTold | LiveTold
-Listener = Callable[[Told], None]
+Update = PhaseUpdate | LiveUpdate
+Listener = Callable[[Update], None]
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,8 @@ class Session:
     def begin(self, now: float) -> None:
         """Give the device its limits and start."""
         settings, identity = self.settings, self.device.identity
-        force, clamp = micro(settings.force_limit_N), micro(settings.clamp_limit_N)
-        speed, watchdog = micro(settings.speed_limit_mm_s), max(round(settings.watchdog_ms), 1)
+        force, clamp = to_thousandths(settings.force_limit_N), to_thousandths(settings.clamp_limit_N)
+        speed, watchdog = to_thousandths(settings.speed_limit_mm_s), max(round(settings.watchdog_ms), 1)
         limits = SetLimits(settings.pin, force, clamp, identity.stroke_um, speed, watchdog)
         self._fresh = now + FIRST_S
         with self._wire(now):
@@ -146,7 +146,7 @@ class Session:
             self.device.send(NoteCommand("SITE", self._site), now)
         self.handle(Begin(), now)
 
-    def reports(self, reports: list[Sample | Declined | Tripped | OutOfReach], now: float) -> None:
+    def reports(self, reports: list[Sample | Declined | LimitTripped | OutOfReach], now: float) -> None:
         """What the device said."""
         newest = None
         for report in reports:
@@ -159,7 +159,7 @@ class Session:
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
                         self.handle(Abort(f"the device declined a command: {code}{_why(code)}"), now)
-                case Tripped(code=code, pin=pin):
+                case LimitTripped(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
                     self.handle(Abort(f"the device stopped by itself: {code}{where}{_why(code)}"), now)
@@ -168,7 +168,7 @@ class Session:
                     self._record("unreachable", now, pins=list(self.unreachable))
         if newest is not None:
             with self._wire(now):
-                self.device.send(Beat(newest.number), now)
+                self.device.send(Heartbeat(newest.number), now)
 
     def handle(self, event: Event, now: float) -> None:
         """An event to the protocol, its actions to the device."""
@@ -186,7 +186,7 @@ class Session:
                 self.handle(Abort(f"no fresh sample for {silent * 1000:.0f} ms"), now)
         self.handle(Tick(), now)
         with self._wire(now):
-            if reason := self.device.again(now):
+            if reason := self.device.resend(now):
                 self.handle(Abort(reason), now)
 
     def lost(self, reason: str, now: float) -> None:
@@ -217,10 +217,10 @@ class Session:
         if self.listener is not None and counts.samples % LIVE_EVERY == 0:
             self.listener(self._live(sample, now))
 
-    def _live(self, sample: Sample, now: float) -> LiveTold:
+    def _live(self, sample: Sample, now: float) -> LiveUpdate:
         k = self.settings.pin - 1
         clamps = [sample.force_mN[pin - 1] for pin in self.settings.clamps]
-        return LiveTold(
+        return LiveUpdate(
             phase=str(self.protocol.phase),
             time_s=now,
             displacement_mm=(sample.position_um[k] - self.protocol.touch_um) / 1000,
@@ -242,7 +242,7 @@ class Session:
             with self._wire(now):
                 self.device.send(NoteCommand("PHASE", phase), now)
         if self.listener is not None:
-            self.listener(PhaseTold(phase, now, protocol.reason, protocol.cycle))
+            self.listener(PhaseUpdate(phase, now, protocol.reason, protocol.cycle))
 
     def _record(self, name: str, now: float, **facts: Any) -> None:
         if self.recorder is not None:

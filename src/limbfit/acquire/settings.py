@@ -54,6 +54,6 @@ class Settings:
         return self.precondition + self.repeats
 
 
-def micro(value: float) -> int:
+def to_thousandths(value: float) -> int:
     """mm as um, N as mN, s as ms: a thousandth."""
     return round(1000 * value)

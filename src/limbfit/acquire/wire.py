@@ -21,11 +21,7 @@ MAX_NUMBER = 2**31 - 1
 _LINE = re.compile(rb"([0-9]{1,10}) ([\x20-\x29\x2b-\x7e]+)\*([0-9A-F]{8})\Z")
 
 
-def checksum(content: bytes, salt: int = 0) -> int:
-    return crc32(content, salt)
-
-
-def salt_of(host_nonce: str, device_nonce: str) -> int:
+def derive_salt(host_nonce: str, device_nonce: str) -> int:
     """The salt of a session, from the nonces of both ends."""
     return crc32(f"{host_nonce}:{device_nonce}".encode("ascii"))
 
@@ -66,7 +62,7 @@ class Encoder:
         number = self.next
         self.next += 1
         content = f"{number} {body}".encode("ascii")
-        return number, b"%s*%08X\n" % (content, checksum(content, self.salt))
+        return number, b"%s*%08X\n" % (content, crc32(content, self.salt))
 
 
 @dataclass
@@ -121,7 +117,7 @@ class Decoder:
             self.refused.malformed += 1
             return None
         number, body, crc = match.groups()
-        if checksum(b"%s %s" % (number, body), self.salt) != int(crc, 16):
+        if crc32(b"%s %s" % (number, body), self.salt) != int(crc, 16):
             self.refused.checksum += 1
             return None
         count = int(number)

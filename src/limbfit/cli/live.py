@@ -19,7 +19,7 @@ from rich.live import Live as RichLive
 from rich.panel import Panel
 from rich.text import Text
 
-from ..acquire import Event, Keyboard, LiveTold, PhaseTold, Told
+from ..acquire import Event, Keyboard, LiveUpdate, PhaseUpdate, Update
 from ..study.acquisition import AcquireTable
 from .console import STDERR
 
@@ -45,8 +45,8 @@ class PlainLines:
     def __exit__(self, *what: object) -> None:
         """Nothing to take down."""
 
-    def listen(self, told: Told) -> None:
-        if isinstance(told, PhaseTold):
+    def listen(self, told: Update) -> None:
+        if isinstance(told, PhaseUpdate):
             self._began = told.time_s if self._began is None else self._began
             cycle = f" (ramp {told.cycle})" if told.phase in ("load", "hold", "unload") else ""
             reason = f": {told.reason}" if told.reason else ""
@@ -59,8 +59,8 @@ class Live:
 
     def __init__(self, site: str, settings: AcquireTable) -> None:
         self.site, self.settings = site, settings
-        self._phase = PhaseTold("idle", 0.0)
-        self._samples: deque[LiveTold] = deque(maxlen=KEPT)
+        self._phase = PhaseUpdate("idle", 0.0)
+        self._samples: deque[LiveUpdate] = deque(maxlen=KEPT)
         self._shown = RichLive(console=STDERR, refresh_per_second=8, get_renderable=self._draw)
 
     def __enter__(self) -> Live:
@@ -70,8 +70,8 @@ class Live:
     def __exit__(self, *what: object) -> None:
         self._shown.stop()
 
-    def listen(self, told: Told) -> None:
-        if isinstance(told, PhaseTold):
+    def listen(self, told: Update) -> None:
+        if isinstance(told, PhaseUpdate):
             self._phase = told
         else:
             self._samples.append(told)

@@ -25,7 +25,7 @@ from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.curves import run_traces
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.observed_figures import draw_skin_figure
+from limbfit.report.drawing.figures import draw_skin_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study

@@ -21,7 +21,7 @@ from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.laboratory import Laboratory, linearised
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.report.drawing.observed_figures import draw_layer_figure
+from limbfit.report.drawing.figures import draw_layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study
 from limbfit.traces import Layers, read_layers, thinnings

@@ -15,21 +15,21 @@ import numpy as np
 from ..events import PINS, RATE_HZ, Fence, Flags, Hold, Move, Sample, Stop
 from ..messages import (
     Accepted,
-    Beat,
     Bye,
     Command,
     Declined,
+    Heartbeat,
     Hello,
     Identity,
+    LimitTripped,
     NoteCommand,
     OutOfReach,
     SetLimits,
-    Tripped,
+    format_sample,
     parse_command,
-    sample_body,
 )
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
-from ..wire import HOST_LINE, VERSION, Decoder, Encoder, salt_of
+from ..wire import HOST_LINE, VERSION, Decoder, Encoder, derive_salt
 from .faults import Fault, FaultClock
 from .limb import VirtualLimb
 from .pins import STROKE_MM, Motors, Sensors
@@ -134,7 +134,7 @@ class VirtualFitSocket:
             self._decoder.refused.unknown += 1
             return b""
         match command:
-            case Beat():
+            case Heartbeat():
                 self._beat(command.number)
                 return b""
             case Bye():
@@ -164,7 +164,7 @@ class VirtualFitSocket:
             "2000-01-01",
         )
         line = Encoder(first=0).encode(identity.body)[1]
-        salt = salt_of(hello.nonce, identity.nonce)
+        salt = derive_salt(hello.nonce, identity.nonce)
         self._encoder = Encoder(salt)
         self._decoder.restart(salt)
         return line
@@ -245,7 +245,7 @@ class VirtualFitSocket:
             self._stop("left")
         self.is_armed = False
 
-    def hangs_up(self) -> None:
+    def hang_up(self) -> None:
         """The host says nothing any more, by a clock that is not the device's."""
         if self.is_armed and not self.stopped:
             self._stop("watchdog")
@@ -266,7 +266,7 @@ class VirtualFitSocket:
         out = self._watch(sample, powered)
         out += self._look_home()
         if self.is_armed and self.time_us // STEP_US % EVERY == 0 and self._encoder is not None:
-            number, line = self._encoder.encode(sample_body(sample))
+            number, line = self._encoder.encode(format_sample(sample))
             self._sent.append((number, self.time_us))
             out += line
         return self._through_faults(out)
@@ -314,7 +314,7 @@ class VirtualFitSocket:
         if not code:
             return b""
         self._stop(code)
-        return self._say(Tripped(code, pin).body)
+        return self._say(LimitTripped(code, pin).body)
 
     def _stop(self, code: str) -> None:
         if not self.stopped:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..events import PINS
 from .surrogate import PIECES, TAUS_S, Surrogate
-
-Array = NDArray[np.float64]
 
 GAP_MM = (12.0, 22.0)  # from a pin's home to the skin
 STIFFER = (1.0, 2.0)  # places under the clamping pins, times the mean site

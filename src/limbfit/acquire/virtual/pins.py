@@ -7,9 +7,8 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..events import PINS
-
-Array = NDArray[np.float64]
 
 STROKE_MM = 60.0
 ACCELERATION = 1000.0  # mm/s2, when driven

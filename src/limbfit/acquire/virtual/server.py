@@ -227,7 +227,7 @@ class _Server:
         """Hosts that hang, sessions that are over, stops to be told."""
         device, silent = self.device, time.monotonic() - self.heard
         if self.paced and device.is_armed and silent > HANG_S:
-            device.hangs_up()
+            device.hang_up()
         if device.stopped != self.stopped:
             self.stopped = device.stopped
             self.tell(f"stop: {self.stopped}" if self.stopped else "ready")

@@ -12,12 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from ...arrays import Array
 from ...errors import TraceError
-
-Array = NDArray[np.float64]
 
 TAUS_S = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
 PIECES = 16
@@ -43,8 +41,8 @@ class Surrogate:
 
     def force(self, time_s: Array, displacement_mm: Array) -> Array:
         """Forces (n,) N of a history (n,) that starts at rest, stepped as finely as it is given."""
-        levels = _pieces(displacement_mm, self.depth_mm) @ np.diff(self.values, axis=1).T
-        return np.maximum(levels[:, 0] + _remembered(time_s, levels[:, 1:]).sum(axis=1), 0.0)
+        levels = _split_depth(displacement_mm, self.depth_mm) @ np.diff(self.values, axis=1).T
+        return np.maximum(levels[:, 0] + _apply_memory(time_s, levels[:, 1:]).sum(axis=1), 0.0)
 
 
 def fit_surrogate(time_s: Array, displacement_mm: Array, force_N: Array) -> Surrogate:
@@ -64,8 +62,8 @@ def fit_surrogate(time_s: Array, displacement_mm: Array, force_N: Array) -> Surr
         raise TraceError("the simulated curve has no indentation in it")
     fine = np.union1d(np.linspace(time_s[0], time_s[-1], _GRID), time_s)
     at = np.searchsorted(fine, time_s)
-    pieces = _pieces(np.interp(fine, time_s, displacement_mm), depth)
-    columns = [pieces] + [_remembered_one(fine, pieces, tau) for tau in TAUS_S]
+    pieces = _split_depth(np.interp(fine, time_s, displacement_mm), depth)
+    columns = [pieces] + [_integrate_memory(fine, pieces, tau) for tau in TAUS_S]
     matrix = np.concatenate([column[at] for column in columns], axis=1)
     touching = force_N > _IN_CONTACT * peak
     rough = np.diff(np.eye(PIECES), axis=0)
@@ -80,19 +78,19 @@ def fit_surrogate(time_s: Array, displacement_mm: Array, force_N: Array) -> Surr
     return Surrogate(depth, np.pad(values, ((0, 0), (1, 0))), float(100 * miss))
 
 
-def _pieces(displacement: Array, depth: float) -> Array:
+def _split_depth(displacement: Array, depth: float) -> Array:
     """(n, PIECES): how much of each piece of the depth has been gone; the last goes on."""
     gone = np.maximum(displacement, 0.0)[:, None] * (PIECES / depth) - np.arange(PIECES)
     return np.concatenate([np.clip(gone[:, :-1], 0.0, 1.0), np.maximum(gone[:, -1:], 0.0)], axis=1)
 
 
-def _remembered(time: Array, levels: Array) -> Array:
+def _apply_memory(time: Array, levels: Array) -> Array:
     """Each column of levels as remembered with its own time constant."""
-    parts = [_remembered_one(time, levels[:, k : k + 1], tau)[:, 0] for k, tau in enumerate(TAUS_S)]
+    parts = [_integrate_memory(time, levels[:, k : k + 1], tau)[:, 0] for k, tau in enumerate(TAUS_S)]
     return np.stack(parts, axis=1)
 
 
-def _remembered_one(time: Array, levels: Array, tau: float) -> Array:
+def _integrate_memory(time: Array, levels: Array, tau: float) -> Array:
     """int exp(-(t - s)/tau) dlevel(s), levels straight between times; exact."""
     kept = np.zeros_like(levels)
     steps = np.diff(time)

@@ -18,16 +18,16 @@ from ...acquire import (
     Event,
     LineDevice,
     Listener,
-    Nobody,
+    NoOperator,
     RecordedRamp,
     Recorder,
     Session,
     Settings,
-    Told,
+    Update,
+    check_record,
     connect,
-    judge,
+    find_ramps,
     prioritise,
-    ramps,
     read_recording,
     run_session,
 )
@@ -101,7 +101,7 @@ def acquire_site(
         device.close()
         raise
     events = operator if operator is not None else stops if stops is not None else SimpleQueue()
-    told = _both(Nobody(events), listener) if operator is None else listener
+    told = _both(NoOperator(events), listener) if operator is None else listener
     try:
         session = Session(settings, device, site=site.name, recorder=recorder, listener=told)
         ending = run_session(session, events)
@@ -162,7 +162,7 @@ def judge_recording(file: Path) -> dict[str, Any]:
     """
     recording = read_recording(file)
     try:
-        verdict, count = judge(recording).to_dict(), len(ramps(recording))
+        verdict, count = check_record(recording).to_dict(), len(find_ramps(recording))
     except (KeyError, TypeError, ValueError):
         raise TraceError("its head or its events lack what a verdict needs", file=file) from None
     seconds = float(np.ptp(recording.device_us)) / 1e6 if recording.device_us.size else 0.0
@@ -268,7 +268,7 @@ def _head(
 
 
 def _both(first: Listener, second: Listener | None) -> Listener:
-    def tell(told: Told) -> None:
+    def tell(told: Update) -> None:
         first(told)
         if second is not None:
             second(told)
@@ -282,8 +282,8 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
     if not completed:
         return {"verdict": None, "files": files}
     recording = read_recording(folder / RECORD)
-    verdict = judge(recording).to_dict()
-    found = ramps(recording)
+    verdict = check_record(recording).to_dict()
+    found = find_ramps(recording)
     with disk_errors(study.folder):
         for ramp in found:
             _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)

@@ -1,4 +1,4 @@
-"""Curves of the report: forces (the paper's figure 7), convergence, errors, intervals."""
+"""Curves of the report: forces (the paper's figure 7) and what was seen beside them, convergence, errors."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from ..formats import fixed, symbol, unit_of, with_value
 from ..page import Figure
 from ..store import Curves, Json, Results, find_compared_quantity
+from . import plots
 from .colours import (
     FITTED,
     HELD_OUT,
@@ -24,17 +25,6 @@ from .colours import (
     choose_tissue_style,
     choose_truth_style,
 )
-from .plots import (
-    add_legend_above,
-    format_log_axis,
-    label_outer_axes,
-    make_figure,
-    make_panels,
-    plot_band,
-    set_log_scale,
-    set_rows,
-    styled,
-)
 
 MAX_POINTS, MAX_TITLE, MAX_LEGEND_ROW = 2500, 44, 7
 
@@ -45,7 +35,7 @@ def thin_curves(curves: Curves) -> Curves:
     return {name: values[::stride] for name, values in curves.items()}
 
 
-@styled
+@plots.styled
 def draw_force_figure(
     store: Results, rows: Iterable[Json], against: str, name: str, columns: int
 ) -> Figure | None:
@@ -53,21 +43,21 @@ def draw_force_figure(
     pairs = [(row, curves) for row, curves in store.with_curves("predict", rows) if against in curves]
     if not pairs:
         return None
-    drawing, axes = make_panels(len(pairs), columns, 2.6 if columns < 3 else 2.1)
+    drawing, axes = plots.make_panels(len(pairs), columns, 2.6 if columns < 3 else 2.1)
     words = "time" if against == "time_s" else "displacement"
-    label_outer_axes(axes, columns, "Time (s)" if against == "time_s" else "Displacement (mm)", "Force (N)")
+    plots.label_outer(axes, columns, "Time (s)" if against == "time_s" else "Displacement (mm)", "Force (N)")
     for ax, (row, curves) in zip(axes, pairs, strict=True):
         _draw_forces(ax, thin_curves(curves), against, store.materials)
         ax.set_title(_make_site_title(row, columns))
         if (quantity := find_compared_quantity(curves)) != ("force", "N"):
             ax.set_ylabel(f"{quantity[0].capitalize()} ({quantity[1]})")
-    add_legend_above(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
+    plots.add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
     sites = ", ".join(f"{row['record']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words}; site and error: {sites}"
     kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
     paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
     caption = f"{paper}easured and simulated force against {words} at the {kind} sites, with the error."
-    return make_figure(drawing, name, alt, caption)
+    return plots.make_figure(drawing, name, alt, caption)
 
 
 def _make_site_title(row: Json, columns: int) -> str:
@@ -83,7 +73,7 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
     kinds = ("low", "high", "measured", "one_material", "simulated")
     low, high, measured, one, simulated = (curves.get(f"{quantity}_{kind}_{unit}") for kind in kinds)
     if low is not None and high is not None and against == "time_s":
-        plot_band(ax, x, low, high)
+        plots.plot_band(ax, x, low, high)
     if measured is not None:
         ax.plot(x, measured, color=MEASURED, lw=2.6, alpha=0.55, label="measured")
     if one is not None:
@@ -93,39 +83,39 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
     ax.margins(x=0.01)
 
 
-@styled
+@plots.styled
 def draw_simulated_figure(store: Results) -> Figure | None:
     """Force of each indentation that was simulated by itself, against time and displacement."""
     pairs = store.with_curves("simulate", store.simulated)
     if not pairs:
         return None
-    drawing, axes = make_panels(2, 2, 2.6)
+    drawing, axes = plots.make_panels(2, 2, 2.6)
     for i, (row, curves) in enumerate(pairs):
         color, ls = (SIMULATED, ONE_MATERIAL, TRUTH, INK)[i % 4], ("-", "--", ":", "-.")[i % 4]
         axes[0].plot(curves["time_s"], curves["force_N"], color=color, ls=ls, label=row["site"])
         axes[1].plot(curves["displacement_mm"], curves["force_N"], color=color, ls=ls)
     for ax, label in zip(axes, ("Time (s)", "Displacement (mm)"), strict=True):
         ax.set(xlabel=label, ylabel="Force (N)")
-    add_legend_above(drawing, axes[0])
+    plots.add_legend(drawing, axes[0])
     names = ", ".join(row["site"] for row, _ in pairs)
     alt = f"Simulated force against time and displacement, sites {names}"
-    return make_figure(drawing, "simulated", alt, "Force of the simulated indentations.")
+    return plots.make_figure(drawing, "simulated", alt, "Force of the simulated indentations.")
 
 
-@styled
+@plots.styled
 def draw_convergence_figure(store: Results) -> Figure | None:
     """The error and the parameters over the accepted iterates, stage after stage."""
     stages = [stage for stage in store.stages if stage.get("iterations")]
     if not stages:
         return None
-    drawing, axes = make_panels(1 + len(store.law.keys), 5, 2.3)
+    drawing, axes = plots.make_panels(1 + len(store.law.keys), 5, 2.3)
     offset = 0
     for stage in stages:
         _draw_stage(axes, store, stage, offset)
         offset += len(stage["iterations"])
     _finish_convergence(axes, store)
     count = sum(len(ax.get_legend_handles_labels()[0]) for ax in axes[:2])
-    add_legend_above(drawing, *axes[:2], columns=math.ceil(count / math.ceil(count / MAX_LEGEND_ROW)))
+    plots.add_legend(drawing, *axes[:2], columns=math.ceil(count / math.ceil(count / MAX_LEGEND_ROW)))
     last = fixed(stages[-1]["iterations"][-1].get("error_percent"), 2)
     alt = f"Error and parameters against iteration; the error ends at {last} %"
     caption = (
@@ -133,7 +123,7 @@ def draw_convergence_figure(store: Results) -> Figure | None:
         "each site) and the parameters, "
         "over the accepted iterates. The vertical line is where the second stage begins."
     )
-    return make_figure(drawing, "convergence", alt, caption)
+    return plots.make_figure(drawing, "convergence", alt, caption)
 
 
 def _draw_stage(axes: Sequence[Axes], store: Results, stage: Json, offset: int) -> None:
@@ -158,7 +148,7 @@ def _draw_stage(axes: Sequence[Axes], store: Results, stage: Json, offset: int) 
 def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
     axes[0].set_title("Error (%)")
     axes[0].set_yscale("log")
-    format_log_axis(axes[0].yaxis, minor=True)
+    plots.format_log_axis(axes[0].yaxis, minor=True)
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
         ax.set_title(f"{symbol(name)} ({unit_of(name)})")
         for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
@@ -169,45 +159,45 @@ def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
-@styled
+@plots.styled
 def draw_error_figure(store: Results) -> Figure | None:
     """The error of every site as a bar, fitted and held-out told apart by colour and hatching."""
     rows = [row for row in store.predicted if isinstance(row.get("error_percent"), int | float)]
     if not rows:
         return None
-    drawing, (ax,) = make_panels(1, 1, 0.7 + 0.24 * len(rows))
+    drawing, (ax,) = plots.make_panels(1, 1, 0.7 + 0.24 * len(rows))
     for at, row in enumerate(rows):
         color, hatch = (FITTED, None) if row.get("fitted") else (HELD_OUT, "///")
         ax.barh(at, row["error_percent"], color=color, alpha=0.75, hatch=hatch, height=0.62)
         ax.text(row["error_percent"], at, f" {fixed(row['error_percent'])}", va="center", fontsize=8)
-    set_rows(ax, [f"{row['record']} ({'fitted' if row.get('fitted') else 'held out'})" for row in rows])
+    plots.set_rows(ax, [f"{row['record']} ({'fitted' if row.get('fitted') else 'held out'})" for row in rows])
     ax.set_xlabel("Mean absolute error over largest force (%)")
     sites = ", ".join(f"{row['record']} {fixed(row['error_percent'])} %" for row in rows)
     caption = "Force error of each site. Plain bars: sites that were fitted; hatched: held out."
-    return make_figure(drawing, "errors", f"Error of each site: {sites}", caption)
+    return plots.make_figure(drawing, "errors", f"Error of each site: {sites}", caption)
 
 
-@styled
+@plots.styled
 def draw_interval_figure(store: Results) -> Figure | None:
     """Start, one-material value, interval and truth of every parameter, as a ratio to the identified one."""
     last = store.stages[-1].get("parameters", {}) if store.stages else {}
     names = [(t, n) for t in store.tissues for n in store.law.keys if last.get(t, {}).get(n)]
     if not names:
         return None
-    drawing, (ax,) = make_panels(1, 1, 0.7 + 0.3 * len(names))
+    drawing, (ax,) = plots.make_panels(1, 1, 0.7 + 0.3 * len(names))
     for at, (tissue, name) in enumerate(names):
         _draw_ratios(ax, store, at, tissue, name)
-    set_rows(ax, [f"{t} {with_value(n, last[t][n])}" for t, n in names])
-    set_log_scale(ax, minor=True)
+    plots.set_rows(ax, [f"{t} {with_value(n, last[t][n])}" for t, n in names])
+    plots.set_log_scale(ax, minor=True)
     ax.set_xlabel("Ratio to the identified value (–)")
     ax.axvline(1, color=MUTED, lw=0.8)
-    add_legend_above(drawing, ax)
+    plots.add_legend(drawing, ax)
     caption = (
         "The identified parameters with their 95 % intervals, on a logarithmic scale so that all can be "
         "compared. A long bar is a parameter that the data leave open."
     )
     alt = "Intervals of the parameters as ratios to the identified values; the numbers are in table 1"
-    return make_figure(drawing, "intervals", alt, caption)
+    return plots.make_figure(drawing, "intervals", alt, caption)
 
 
 def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> None:
@@ -228,3 +218,98 @@ def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> N
         if mark := tissues.get(tissue, {}).get(name):
             label = "" if at else name_of_mark
             ax.plot(mark / value, at, marker, color=color, ms=7, mew=1.8, mfc=face, label=label)
+
+
+def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
+    """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
+    caption = (
+        "Compression of the tissues on the indenter's axis at the {} sites, as ultrasound saw it and as "
+        "predicted; errors are means over the record, in percent of the largest compression."
+    )
+    words, quantity = "compression", ("compression", "mm")
+    return _draw_time_figure(store, fitted, "ultrasound", "layers", quantity, words, caption)
+
+
+def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
+    """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
+    caption = (
+        "Speed of shear waves under the indenter at the {} sites, read and predicted: that of small, sudden "
+        "shear on the strain that the indenter makes; errors are means in percent of the largest speed."
+    )
+    words, quantity = "speed of shear waves", ("speed", "m_s")
+    return _draw_time_figure(store, fitted, "shear waves", "waves", quantity, words, caption)
+
+
+@plots.styled
+def _draw_time_figure(
+    store: Results, fitted: bool, kind: str, stem: str, quantity: tuple[str, str], words: str, caption: str
+) -> Figure | None:
+    """What was seen of a kind against time; ``quantity`` and its unit are in the heads of the curves."""
+    rows, (what, unit) = _read_curves(store, fitted, kind), quantity
+    if not rows:
+        return None
+    drawing, axes = plots.make_panels(len(rows), 3, 2.1)
+    plots.label_outer(axes, 3, "Time (s)", f"{what.capitalize()} ({unit.replace('_', '/')})")
+    for ax, (row, layer, whole) in zip(axes, rows, strict=True):
+        curves = thin_curves(whole)
+        x = curves["time_s"]
+        ax.plot(x, curves[f"{what}_measured_{unit}"], ".", ms=4, color=MEASURED, label="measured")
+        if f"{what}_simulated_{unit}" in curves:
+            ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
+        if f"{what}_low_{unit}" in curves:
+            plots.plot_band(ax, x, curves[f"{what}_low_{unit}"], curves[f"{what}_high_{unit}"])
+        ax.set_title(f"{row['record']}, {layer['what']}: {fixed(layer['error_percent'])} %")
+    plots.add_legend(drawing, axes[0])
+    use = "fitted" if fitted else "held-out"
+    records = ", ".join(f"{row['record']} {layer['what']}" for row, layer, _ in rows)
+    alt = f"Measured and predicted {words}: {records}"
+    return plots.make_figure(drawing, f"{stem}-{use}", alt, caption.format(use))
+
+
+@plots.styled
+def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
+    """Predicted against measured displacement of the skin at the fitted or held-out sites; None where the
+    skin was not seen."""
+    rows = [one for one in _read_curves(store, fitted, "surface") if "displacement_simulated_mm" in one[2]]
+    if not rows:
+        return None
+    drawing, axes = plots.make_panels(len(rows), 3, 2.6)
+    plots.label_outer(axes, 3, "Measured (mm)", "Predicted (mm)")
+    for ax, (row, seen, curves) in zip(axes, rows, strict=True):
+        _draw_pairs(ax, curves, seen["components"])
+        ax.set_title(f"{row['record']}: {fixed(seen['error_percent'])} %")
+    plots.add_legend(drawing, axes[0])
+    use = "fitted" if fitted else "held-out"
+    records = ", ".join(str(row["record"]) for row, _, _ in rows)
+    caption = (
+        f"Displacement of the skin around the indenter at the {use} sites: predicted against "
+        "measured, for every point, component and span of time that is compared, with its 95 % interval. On "
+        "the line both agree; errors are means in percent of the largest displacement."
+    )
+    alt = f"Measured and predicted displacement of skin: {records}"
+    return plots.make_figure(drawing, f"surface-{use}", alt, caption)
+
+
+def _draw_pairs(ax: Axes, curves: Curves, components: list[str]) -> None:
+    x, y = curves["displacement_measured_mm"], curves["displacement_simulated_mm"]
+    ends = [min(x.min(), y.min()), max(x.max(), y.max())]
+    ax.plot(ends, ends, color=MEASURED, lw=0.8)
+    if "displacement_low_mm" in curves:
+        low, high = curves["displacement_low_mm"], curves["displacement_high_mm"]
+        ax.vlines(x, low, high, color=SIMULATED, alpha=0.15, lw=0.8)
+    for number, word in enumerate(components):
+        chosen = curves["component"] == number
+        style = choose_tissue_style(number) | {"ls": "", "ms": 2.5}
+        if chosen.any():
+            ax.plot(x[chosen], y[chosen], **style, label=word)
+
+
+def _read_curves(store: Results, fitted: bool, kind: str) -> list[tuple[Json, Json, Curves]]:
+    """Rows of records, what was seen beside each in one way, and its stored curves."""
+    return [
+        (row, one, curves)
+        for row in store.predicted
+        if bool(row.get("fitted")) == fitted
+        for one in row.get("observed") or ()
+        if one["kind"] == kind and (curves := store.curves("predict", one["name"])) is not None
+    ]

@@ -157,7 +157,7 @@ def make_colour_bar(limits: tuple[float, float], title: str, colours: str = FIEL
 
 # ---- pictures as PNG ------------------------------------------------------------------------------------
 
-_DPI, _PANEL_IN = 110, 4.6  # height of a row of make_panels
+_DPI, _PANEL_IN = 110, 4.6  # height of a row of panels
 _AXIS_MM = 14.0
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
 _SIDES = (("L", "R"), ("P", "A"), ("S", "I"))  # towards which an axis of patient space points, and from which

@@ -51,7 +51,7 @@ styled = matplotlib.rc_context(_STYLE)  # decorates whatever draws
 
 
 def make_panels(count: int, columns: int, height_in: float) -> tuple[Drawing, list[Axes]]:
-    """A drawing of ``count`` make_panels in rows of ``columns``."""
+    """A drawing of ``count`` panels in rows of ``columns``."""
     columns = min(columns, count)
     rows = math.ceil(count / columns)
     width = PANEL_WIDTH_IN if columns > 1 else PANEL_WIDTH_IN / 1.6
@@ -62,15 +62,15 @@ def make_panels(count: int, columns: int, height_in: float) -> tuple[Drawing, li
     return drawing, axes
 
 
-def add_legend_above(drawing: Drawing, *axes: Axes, columns: int | None = None) -> None:
-    """The legend of some make_panels over all of them."""
+def add_legend(drawing: Drawing, *axes: Axes, columns: int | None = None) -> None:
+    """The legend of some panels over all of them."""
     handles = [handle for ax in axes for handle in ax.get_legend_handles_labels()[0]]
     labels = [str(handle.get_label()) for handle in handles]
     drawing.legend(handles, labels, loc="outside upper left", ncols=columns or len(labels), labelcolor=INK)
 
 
-def label_outer_axes(axes: Sequence[Axes], columns: int, x: str, y: str) -> None:
-    """Name the axes at the outer make_panels of rows of ``columns``: x at the bottom, y at the left."""
+def label_outer(axes: Sequence[Axes], columns: int, x: str, y: str) -> None:
+    """Name the axes at the outer panels of rows of ``columns``: x at the bottom, y at the left."""
     for i, ax in enumerate(axes):
         if i + columns >= len(axes):
             ax.set_xlabel(x)

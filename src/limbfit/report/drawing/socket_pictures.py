@@ -26,7 +26,7 @@ from .pictures import (
     unit,
     without_display_warning,
 )
-from .plots import add_legend_above, make_figure, make_panels, styled
+from .plots import add_legend, make_figure, make_panels, styled
 
 FIELDS = (("pressure_kPa", "pressure (kPa)"), ("shear_kPa", "shear (kPa)"))
 OUTER = "face_set:skin"
@@ -162,7 +162,7 @@ def draw_settling_figure(content: Json) -> Figure:
         for end in [content["donning"]["time_s"], *(load["time_s"] for load in content["loads"])]:
             ax.axvline(end, color=MUTED, lw=0.6)
         ax.margins(x=0.01)
-    add_legend_above(drawing, axes[2])
+    add_legend(drawing, axes[2])
     alt = "Force on the socket, its move and the pressure over time, from donning to the last load"
     caption = "The socket over time; lines: the end of donning and of each load, held."
     return make_figure(drawing, "socket-time", alt, caption)

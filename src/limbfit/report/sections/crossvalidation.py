@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..drawing.colours import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED
-from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import NOTHING, fixed
 from ..page import Figure, Prose, Section, Table, make_section
 from ..store import Json, Results
@@ -71,7 +71,7 @@ def _draw_figure(content: Json) -> Figure:
     ax.set_xlabel("Site")
     ax.set_ylabel("Error when not fitted (%)")
     ax.grid(visible=False, axis="x")
-    add_legend_above(drawing, axes[0])
+    add_legend(drawing, axes[0])
     caption = (
         "Left: mean error at the sites that a choice does not fit, over the choices. Right: the error of "
         "each site over the choices that leave it out (dot: middle; bar: nine in ten), and by the study's "

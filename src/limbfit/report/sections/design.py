@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..drawing.colours import INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD
-from ..drawing.plots import add_legend_above, make_figure, make_panels, set_log_scale, set_rows, styled
+from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, set_rows, styled
 from ..formats import fixed, label, number
 from ..page import Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
@@ -94,7 +94,7 @@ def draw_expected_figure(name: str, designs: Sequence[Json], of: str) -> Figure:
     set_log_scale(ax, minor=True)
     ax.axvline(2, color=MUTED, lw=0.8, ls="--")
     ax.set_xlabel("Expected factor of the 95 % interval (–)")
-    add_legend_above(drawing, ax, columns=2)
+    add_legend(drawing, ax, columns=2)
     caption = (
         f"The factor by which each parameter would remain uncertain after {of}. "
         f"Right of the dashed line: more than twofold; {MAX_FACTOR:g} and more are drawn at {MAX_FACTOR:g}."

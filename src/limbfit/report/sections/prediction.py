@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ..drawing import figures
-from ..drawing.observed_figures import draw_layer_figure, draw_skin_figure, draw_wave_figure
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, fixed
 from ..page import Note, Row, Section, Table, make_section
@@ -20,9 +19,9 @@ def make_fit_section(store: Results) -> Section:
         "fit",
         "Fitted sites",
         figures.draw_force_figure(store, rows, "time_s", "forces-fitted", 2),
-        draw_layer_figure(store, fitted=True),
-        draw_wave_figure(store, fitted=True),
-        draw_skin_figure(store, fitted=True),
+        figures.draw_layer_figure(store, fitted=True),
+        figures.draw_wave_figure(store, fitted=True),
+        figures.draw_skin_figure(store, fitted=True),
         draw_field_figure(store, store.fitted[:4], "predict", "field"),
         otherwise="No simulated forces of fitted sites are stored yet.",
     )
@@ -39,9 +38,9 @@ def make_prediction_section(store: Results) -> Section:
         figures.draw_error_figure(store),
         figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
-        draw_layer_figure(store, fitted=False),
-        draw_wave_figure(store, fitted=False),
-        draw_skin_figure(store, fitted=False),
+        figures.draw_layer_figure(store, fitted=False),
+        figures.draw_wave_figure(store, fitted=False),
+        figures.draw_skin_figure(store, fitted=False),
         make_observed_table(store),
         Note(unseen) if store.predicted and not rows else None,
         otherwise="No predictions are stored yet.",

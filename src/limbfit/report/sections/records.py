@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
 from ..drawing.interactive import record_curves
-from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import fixed
 from ..page import Figure, Section, Table, make_section
 from ..store import Curves, Json, Results
@@ -43,7 +43,7 @@ def draw_record_figure(store: Results, site: str) -> Figure | None:
     _draw_record(axes, thin_curves(raw), regular, touch_down)
     for ax in axes[:2]:
         _mark_phases(ax, facts.get("phases") or [])
-    add_legend_above(drawing, axes[0])
+    add_legend(drawing, axes[0])
     peak, depth = fixed(facts.get("peak_force_N"), 2), fixed(facts.get("depth_mm"), 2)
     words = facts.get("phases_in_words")
     phases = f"the indenter's phases are {words} (holds are shaded); " if words else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 
 from ..drawing.colours import HELD_OUT, SIMULATED, choose_tissue_style
-from ..drawing.plots import add_legend_above, make_figure, make_panels, set_log_scale, styled
+from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, styled
 from ..formats import fixed, limits, number, with_unit
 from ..page import Cell, Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
@@ -121,7 +121,7 @@ def _draw_figure(store: Results, content: Json) -> Figure:
     for ax in axes:
         ax.set_ylim(len(regions) - 0.5, -0.5)
         ax.grid(visible=False, axis="y")
-    add_legend_above(drawing, *axes[:2])
+    add_legend(drawing, *axes[:2])
     caption = (
         "Regions: mean error with each region's own model and with the whole limb's, and each parameter with "
         "its 95 % interval. Vertical lines: the whole limb's parameters."

@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from ..drawing.colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, choose_tissue_style
-from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import fixed, friction, number
 from ..page import Block, Bullets, Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
@@ -95,7 +95,7 @@ def _draw_stiffness_figure(store: Results, content: Json) -> Figure:
         _draw_curves(ax, store, "sensitivity-c", site, content)
     _draw_derivatives(axes[-1], content, tissues)
     axes[0].set_ylabel("Force (N)")
-    add_legend_above(drawing, axes[0], columns=5)
+    add_legend(drawing, axes[0], columns=5)
     caption = (
         "Left: force at the chosen sites with c of one tissue halved and doubled, at equal m. Right: change "
         "of the largest force for one percent more c of a tissue, at every recorded site, from the exact "
@@ -197,7 +197,7 @@ def _draw_kappa_figure(content: Json) -> Figure:
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         ax.set_xlabel("κ over c (–)")
         ax.axvline(content["kappa_ratio"], color=MUTED, lw=0.8, ls="--")
-    add_legend_above(drawing, axes[0])
+    add_legend(drawing, axes[0])
     caption = (
         "Largest force and ratio of volumes against κ over c; dashed: the study's. Right: all elements near "
         "the indenter (shaded), the middle 98 % of their volume (lines), and the band of 1 % (grey)."
@@ -294,7 +294,7 @@ def _draw_mesh_figure(store: Results, content: Json) -> Figure:
     axes[-1].set_xlabel("Edge near the indenter (mm)")
     axes[-1].set_xlim(left=-0.2)
     axes[-1].legend(fontsize=8)
-    add_legend_above(drawing, axes[0])
+    add_legend(drawing, axes[0])
     caption = (
         "Force against time on each mesh, and the largest force against the edge; crosses: extrapolated."
     )
@@ -311,7 +311,7 @@ def _compare_models(
     for ax, site in zip(axes, content["sites"], strict=True):
         _draw_curves(ax, store, name, site, content)
         ax.set_ylabel("Force (N)")
-    add_legend_above(drawing, axes[0])
+    add_legend(drawing, axes[0])
     alt = f"{title}: force against time"
     figure = make_figure(drawing, name, alt, "Force against time at each site.")
     table = _make_run_table(name, f"{title}: forces and effort.", content, (*_CHANGES, *more))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..drawing.colours import MEASURED, SIMULATED, TRUTH
 from ..drawing.figures import draw_simulated_figure
 from ..drawing.pictures import draw_field_figure
-from ..drawing.plots import add_legend_above, make_figure, make_panels, styled
+from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import count
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
@@ -82,7 +82,7 @@ def draw_compared_figure(store: Results) -> Figure | None:
         ax.plot(at, curves["limbfit_N"], color=SIMULATED, label="limbfit")
         ax.plot(at, curves["limbfit_matched_N"], "--", color=TRUTH, label="with FEBio's contact penalty")
         ax.set(title=f"Site {row['site']}", xlabel="Time (s)", ylabel="Force (N)")
-    add_legend_above(drawing, axes[0])
+    add_legend(drawing, axes[0])
     alt = f"Force by FEBio and by limbfit against time, sites {', '.join(row['site'] for row, _ in found)}"
     return make_figure(drawing, "compared", alt, "Force of the same indentation by FEBio and by limbfit.")
 
