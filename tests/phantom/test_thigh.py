@@ -14,6 +14,7 @@ from limbfit import run_study
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import InputError, StudyError
 from limbfit.phantom import Limb, make_limb, make_phantom, true_sites
+from limbfit.phantom.forces import choose_discretisation
 from limbfit.phantom.labels import FILE, write_true_labels
 from limbfit.phantom.mri import image_of, make_grid
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
@@ -125,3 +126,9 @@ def test_a_thigh_is_identified_from_its_folder_to_its_report(tmp_path: Path) -> 
     assert not re.search(
         r"\b(tibia|fibula|patella|knee)\b", report, re.IGNORECASE
     )  # people's may be transtibial
+
+
+def test_true_forces_are_those_of_the_whole_thigh() -> None:
+    """What is cut free 100 mm from a site is held by the bones of a shank; of a thigh nothing is cut off."""
+    assert choose_discretisation("coarse", "transtibial").within_mm == 100.0
+    assert choose_discretisation("coarse", "transfemoral").within_mm is None

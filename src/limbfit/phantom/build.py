@@ -27,7 +27,7 @@ from scipy.interpolate import interp1d
 from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import DISCRETISATIONS, ForceJob, TrueForce, TruthMeshJob, site_force, site_mesh
+from .forces import ForceJob, TrueForce, TruthMeshJob, choose_discretisation, site_force, site_mesh
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
@@ -196,7 +196,7 @@ def _write_traces(
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, anatomy)
-    made = DISCRETISATIONS[detail]
+    made = choose_discretisation(detail, limb.kind)
     settings = replace(made.mesh, layers=limb.layers)
     places = [(site.name, _triple(site.position), _triple(site.axis)) for site in indented]
     wanted = [TruthMeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
@@ -281,6 +281,7 @@ def _site_facts(site: TrueSite) -> dict[str, Any]:
 def _truth(
     limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, parameters: Parameters
 ) -> dict[str, Any]:
+    made = choose_discretisation(detail, limb.kind)
     return {
         "seed": seed,
         "detail": detail,
@@ -295,8 +296,8 @@ def _truth(
         },
         "markers": [_site_facts(site) for site in everywhere],
         "mesh": {
-            **asdict(DISCRETISATIONS[detail].mesh),
+            **asdict(made.mesh),
             "layers": [asdict(layer) for layer in limb.layers],
-            "within_mm": DISCRETISATIONS[detail].within_mm,
+            "within_mm": made.within_mm,
         },
     }
