@@ -30,7 +30,7 @@ from ...study.socket import SocketAreaTable, SocketLoadTable
 BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
 BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
 # Edges of a limb's mesh under a socket whose face is no larger than this; larger ones have as many edges.
-EDGE_MM, FACE_MM2 = 10.0, 6e4
+EDGE_MM, FACE_MM2 = 10.0, 8e4
 
 
 def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
