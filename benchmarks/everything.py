@@ -56,6 +56,8 @@ RED = ("late", "failed")
 OUTCOMES = ("ok", "refused", *RED, "over", "missing")
 SEEDS = range(5)
 OTHERS = ("thigh-surfaces", "limb-1", "limb-9", "openlimb", "calf", "labels", "surfaces")
+FIRST = f"phantom-{SEEDS[0]}"
+MADE_OF_IT = ("labels", "surfaces")  # of that phantom
 LIMBS = (*(f"phantom-{seed}" for seed in SEEDS), "thigh", *OTHERS)
 FORMATS = ("feb", "febio-optimize", "inp", "calculix")
 ASKED = (
@@ -231,7 +233,7 @@ class Matrix:
         if limb == "thigh":
             shutil.rmtree(folder, ignore_errors=True)
             return *LIMBFIT, "phantom", str(folder), "--limb", "transfemoral"
-        words = "--phantom", str(self.study("phantom-0")), "--shared", str(self.shared)
+        words = "--phantom", str(self.study(FIRST)), "--shared", str(self.shared)
         return sys.executable, str(HERE / "everything_limbs.py"), limb, str(folder), *words
 
     def _copy(self, limb: str) -> Path:
@@ -248,8 +250,9 @@ def fill(matrix: Matrix, limbs: Sequence[str], asked: Sequence[str], redo: Seque
         wanted = [one for one in (PAIRS if limb == PHANTOM else ASKED) if not asked or one in asked]
         due = [one for one in wanted if matrix.is_due((limb, one), [*redo, "missing"])]
         if due and limb != PHANTOM:
-            if matrix.is_due((limb, MAKE), redo):
-                print(line_of(matrix.run(limb, MAKE)), flush=True)
+            for one in (FIRST, limb) if limb in MADE_OF_IT else (limb,):
+                if matrix.is_due((one, MAKE), redo):
+                    print(line_of(matrix.run(one, MAKE)), flush=True)
             if matrix.cells[limb, MAKE].outcome != "ok":
                 for one in due:
                     matrix._store(Cell(limb, one, "missing"))
