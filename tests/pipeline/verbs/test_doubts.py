@@ -59,7 +59,10 @@ def test_clean_records_are_not_flagged(five):
 )
 def test_a_record_in_another_unit_is_told(five, factors, word):
     rewrite(five, "3", *factors)
-    found = [flag for flag in flags(five) if flag["kind"] != "start"]  # read as mm, cm begin on the skin
+    told = flags(five)
+    starts = [flag["sites"] for flag in told if flag["kind"] == "start"]
+    assert starts == ([["3"]] if word == "cm" else [])  # read as mm, it begins on the skin
+    found = [flag for flag in told if flag["kind"] != "start"]
     assert [flag["sites"] for flag in found] == [["3"]]
     assert word in found[0]["cause"]
 
