@@ -7,7 +7,7 @@ import pytest
 from limbfit.cli.socket import show_socket
 from limbfit.report.page import Table
 from limbfit.report.sections.socket import make_interval_table, make_published_blocks, make_published_table
-from limbfit.socket.published import FINDINGS, WHOLE, published
+from limbfit.socket.published import FINDINGS, WHOLE, select_published_findings
 
 SHARES = {"skin.c_kPa": 80.0, "muscle.tau_s": 12.4}
 REGION = {
@@ -77,7 +77,7 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
 
 @pytest.mark.parametrize("finding", FINDINGS, ids=lambda finding: finding.source)
 def test_every_finding_is_told_of_its_regions_with_its_source(finding):
-    rows = published([*finding.regions, "another"])
+    rows = select_published_findings([*finding.regions, "another"])
     assert finding.source in {row["source"] for row in rows}
     table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
     assert any(finding.found in {cell.text for cell in row.cells} for row in table.rows)
@@ -86,7 +86,7 @@ def test_every_finding_is_told_of_its_regions_with_its_source(finding):
 
 def test_what_others_found_stands_beside_the_regions_own_pressures():
     """By region; what was found over the whole limb beside the whole limb's."""
-    rows = published(["tibial crest"])
+    rows = select_published_findings(["tibial crest"])
     table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
     own = {tuple(cell.text for cell in row.cells[:3]) for row in table.rows}
     assert own == {("tibial crest", "30.0", "60.0"), (WHOLE, "12.0", "60.0")}

@@ -22,7 +22,7 @@ from limbfit.donning import Load, SocketFit, don, pack, socket_problem, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
 from limbfit.pipeline.shared.kept import Begun, Kept
-from limbfit.socket import Recipe, rectified
+from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -35,7 +35,9 @@ def donned(tmp_path_factory):
     anatomy, folder = limb(), tmp_path_factory.mktemp("parts")
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
     trim = Trim([(anatomy.cut_point - 26.0 * anatomy.cut_normal, anatomy.cut_normal)])
-    socket = rectified(anatomy.skin, frame, Recipe(trim=trim, reduction_percent=3.0, distal_clearance_mm=3.0))
+    socket = rectify_limb(
+        anatomy.skin, frame, Recipe(trim=trim, reduction_percent=3.0, distal_clearance_mm=3.0)
+    )
     settings = MeshSettings(edge_near_mm=14.0, edge_far_mm=24.0, growth=0.6, layers=(LayerSpec("skin", 3.0),))
     mesh, _ = mesh_limb(anatomy, settings, 10.0)
     loads = [

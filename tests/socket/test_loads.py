@@ -9,7 +9,7 @@ import pytest
 from socket_limbs import round_limb
 
 from limbfit.errors import SurfaceError
-from limbfit.socket.landmarks import directions, knee_centre
+from limbfit.socket.landmarks import find_directions, find_knee_centre
 from limbfit.socket.loads import STANDARD_LOADS
 from limbfit.study.socket import Preset
 
@@ -20,7 +20,7 @@ def test_a_study_names_the_loads_that_there_are() -> None:
 
 @pytest.mark.parametrize("name", STANDARD_LOADS)
 def test_the_moment_is_that_of_the_force_on_its_line(name: str) -> None:
-    load, known = STANDARD_LOADS[name], directions(round_limb())
+    load, known = STANDARD_LOADS[name], find_directions(round_limb())
     force, moment = load.force(800.0, known), load.moment(800.0, known)
     assert force @ known.proximal == pytest.approx(800.0 * load.proximal)
     on_line = load.ahead_mm * known.anterior + load.inside_mm * known.medial
@@ -31,12 +31,12 @@ def test_the_moment_is_that_of_the_force_on_its_line(name: str) -> None:
 
 
 def test_directions_of_a_limb_with_its_fibula_on_the_right() -> None:
-    known = directions(round_limb())
+    known = find_directions(round_limb())
     np.testing.assert_allclose(known.anterior, [0.0, -1.0, 0.0], atol=1e-12)
     assert known.lateral is not None
     np.testing.assert_allclose(known.lateral, [-1.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(directions(round_limb(), "left").medial, [-1.0, 0.0, 0.0], atol=1e-12)
-    knee = knee_centre(round_limb())
+    np.testing.assert_allclose(find_directions(round_limb(), "left").medial, [-1.0, 0.0, 0.0], atol=1e-12)
+    knee = find_knee_centre(round_limb())
     assert knee is not None
     np.testing.assert_allclose(knee, [0.0, -10.0, 119.0], atol=1.5)
 
@@ -44,7 +44,7 @@ def test_directions_of_a_limb_with_its_fibula_on_the_right() -> None:
 def test_without_bones_medial_must_be_stated() -> None:
     limb = round_limb()
     bare = type(limb)(limb.skin, {}, limb.cut_point, limb.cut_normal)
-    assert knee_centre(bare) is None
+    assert find_knee_centre(bare) is None
     with pytest.raises(SurfaceError, match=r"socket\.side"):
-        STANDARD_LOADS["heel strike"].force(800.0, directions(bare))
-    assert STANDARD_LOADS["single stance"].force(800.0, directions(bare))[2] == 800.0
+        STANDARD_LOADS["heel strike"].force(800.0, find_directions(bare))
+    assert STANDARD_LOADS["single stance"].force(800.0, find_directions(bare))[2] == 800.0

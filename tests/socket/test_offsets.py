@@ -13,12 +13,12 @@ from test_wall import thickness as measured_by_trimesh
 from limbfit.anatomy.frame import limb_frame
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
-from limbfit.socket import Recipe, Zone, rectified
-from limbfit.socket.offsets import Offsets, offsets
-from limbfit.socket.rays import profile
-from limbfit.socket.rectify import reduced_to
+from limbfit.socket import Recipe, Zone, rectify_limb
+from limbfit.socket.offsets import Offsets, compute_offsets
+from limbfit.socket.rays import compute_profile
+from limbfit.socket.rectify import reduce_to_volume
 from limbfit.socket.trim import Trim
-from limbfit.socket.wall import thickness, wall
+from limbfit.socket.wall import build_wall, measure_thickness
 
 LIMB = round_limb()
 FRAME = limb_frame(LIMB.cut_point, LIMB.cut_normal)
@@ -36,13 +36,13 @@ def moved(by: np.ndarray) -> Surface:
 
 
 def pressed(by: np.ndarray) -> Offsets:
-    return offsets(profile(LIMB.skin, FRAME), LIMB.skin, moved(by), FRAME)
+    return compute_offsets(compute_profile(LIMB.skin, FRAME), LIMB.skin, moved(by), FRAME)
 
 
 def test_a_shaft_that_is_3_mm_thinner_gives_a_face_that_is() -> None:
     z = LIMB.skin.points[:, 2]
     thin = -3.0 * np.clip((z - 40.0) / 20.0, 0.0, 1.0)  # not on the rounded end
-    face = rectified(LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(thin)))
+    face = rectify_limb(LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(thin)))
     for height in (75.0, 90.0, 105.0):
         radius = 40.0 + 12.0 * (height - 40.0) / 110.0 - 3.0
         around = face.circumference([0.0, 0.0, height], CUT_NORMAL)
@@ -53,7 +53,9 @@ def test_a_shaft_that_is_3_mm_thinner_gives_a_face_that_is() -> None:
 def test_a_dent_is_where_it_was_pressed_and_nowhere_else() -> None:
     points = LIMB.skin.points
     apart = np.linalg.norm(points - [0.0, -45.0, 80.0], axis=1)
-    face = rectified(LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(-4.0 * np.exp(-((apart / 15.0) ** 2)))))
+    face = rectify_limb(
+        LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(-4.0 * np.exp(-((apart / 15.0) ** 2))))
+    )
     depth = face.offset(LIMB.skin)
     deepest = face.points[depth.argmax()]
     assert depth.max() == pytest.approx(4.0 / (1.0 + 4 * 5.0**2 / 2 / 15.0**2), rel=0.15)  # less by smoothing
@@ -63,20 +65,20 @@ def test_a_dent_is_where_it_was_pressed_and_nowhere_else() -> None:
 
 
 def test_nothing_moves_where_nothing_was_pressed() -> None:
-    still = rectified(LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(np.zeros(len(LIMB.skin.points)))))
-    np.testing.assert_allclose(still.points, rectified(LIMB.skin, FRAME, PLAIN).points, atol=1e-9)
+    still = rectify_limb(LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(np.zeros(len(LIMB.skin.points)))))
+    np.testing.assert_allclose(still.points, rectify_limb(LIMB.skin, FRAME, PLAIN).points, atol=1e-9)
 
 
 def test_a_surface_beside_the_limb_is_refused() -> None:
     aside = Surface(LIMB.skin.points + np.array([120.0, 0.0, 0.0]), LIMB.skin.faces)
     with pytest.raises(SurfaceError, match="does not surround") as caught:
-        offsets(profile(LIMB.skin, FRAME), LIMB.skin, aside, FRAME)
+        compute_offsets(compute_profile(LIMB.skin, FRAME), LIMB.skin, aside, FRAME)
     assert caught.value.remedy
 
 
 def test_a_zone_is_as_deep_all_over_and_fades() -> None:
     strip = np.column_stack([np.zeros(9), np.full(9, -42.0), np.linspace(60.0, 92.0, 9)])
-    face = rectified(LIMB.skin, FRAME, replace(PLAIN, areas=[Zone("crest", strip, 18.0, -3.0)]))
+    face = rectify_limb(LIMB.skin, FRAME, replace(PLAIN, areas=[Zone("crest", strip, 18.0, -3.0)]))
     depth = face.offset(LIMB.skin)
     tree = np.linalg.norm(face.points[:, None] - strip[None], axis=2).min(axis=1)
     assert depth[tree < 5.5].max() < -2.0  # relief: outside the limb
@@ -89,21 +91,21 @@ def test_zones_that_cannot_be_are_refused() -> None:
         Zone("crest", np.zeros((1, 3)), 10.0, 8.0)
     above = Zone("knee", np.array([[0.0, -50.0, 140.0]]), 18.0, 2.0)
     with pytest.raises(SurfaceError, match="'knee' lies off the socket's face"):
-        rectified(LIMB.skin, FRAME, replace(PLAIN, areas=[above]))
+        rectify_limb(LIMB.skin, FRAME, replace(PLAIN, areas=[above]))
 
 
 def test_the_control_has_the_volume_that_is_asked_for() -> None:
     recipe = replace(PLAIN, distal="clearance", flare_mm=6.0, reduction_percent=3.0)
-    wanted = rectified(LIMB.skin, FRAME, replace(recipe, reduction_percent=5.0))
-    found, reduction = reduced_to(wanted.volume_mm3, LIMB.skin, FRAME, recipe)
+    wanted = rectify_limb(LIMB.skin, FRAME, replace(recipe, reduction_percent=5.0))
+    found, reduction = reduce_to_volume(wanted.volume_mm3, LIMB.skin, FRAME, recipe)
     assert found.volume_mm3 == pytest.approx(wanted.volume_mm3, rel=1e-3)
     assert reduction == pytest.approx(5.0, abs=0.1)
 
 
 def test_the_thickness_that_is_told_is_that_of_another_tool() -> None:
-    face = rectified(LIMB.skin, FRAME, replace(PLAIN, flare_mm=4.0))
-    body = wall(face, CUT_NORMAL, 3.5)
+    face = rectify_limb(LIMB.skin, FRAME, replace(PLAIN, flare_mm=4.0))
+    body = build_wall(face, CUT_NORMAL, 3.5)
     other = measured_by_trimesh(trimesh.Trimesh(body.points, body.faces, process=False), face)
-    mine = thickness(body, face)
+    mine = measure_thickness(body, face)
     np.testing.assert_allclose(mine, other, atol=2e-3)
     assert np.median(mine) == pytest.approx(3.5, rel=0.02)

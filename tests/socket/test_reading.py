@@ -15,10 +15,10 @@ from limbfit.anatomy.frame import limb_frame
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
-from limbfit.socket import Recipe, Socket, read_socket, rectified
-from limbfit.socket.shape import closed_by_fans
+from limbfit.socket import Recipe, Socket, read_socket, rectify_limb
+from limbfit.socket.shape import close_by_fans
 from limbfit.socket.trim import Trim
-from limbfit.socket.wall import wall
+from limbfit.socket.wall import build_wall
 
 TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])
 
@@ -32,7 +32,7 @@ def read(file: Path, unit: str = "mm", space: str | None = None) -> Socket:
 @cache
 def drawn() -> Socket:
     limb = round_limb()
-    return rectified(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0))
+    return rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0))
 
 
 def face() -> Surface:
@@ -122,7 +122,7 @@ def test_of_a_wall_the_inner_side_is_taken(tmp_path: Path, turned: bool) -> None
 
 def test_the_wall_that_limbfit_makes_for_printing_is_read_back(tmp_path: Path) -> None:
     """Its inner face, and of the rolled brim what looks inward: less than the wall is thick."""
-    write_surface(tmp_path / "socket.stl", wall(drawn(), CUT_NORMAL, 4.0))
+    write_surface(tmp_path / "socket.stl", build_wall(drawn(), CUT_NORMAL, 4.0))
     socket = read(tmp_path / "socket.stl")
     own = igl.point_mesh_squared_distance(socket.points, face().points, face().faces)[0]
     back = igl.point_mesh_squared_distance(face().points, socket.points, socket.faces)[0]
@@ -156,7 +156,7 @@ def upside_down() -> Surface:
 BAD: dict[str, Callable[[], Surface]] = {
     "socket.unit": lambda: Surface(face().points * 1e-3, face().faces),
     "from end to end, the limb": lambda: Surface(face().points * 25.4, face().faces),
-    "no opening": lambda: closed_by_fans(face().flipped),
+    "no opening": lambda: close_by_fans(face().flipped),
     "a hole of": with_hole,
     "does not surround the limb": lambda: moved(150.0, 20.0, 0.0),
     "is 309 mm off": lambda: moved(0.0, 0.0, 400.0),

@@ -13,8 +13,8 @@ from limbfit.anatomy.frame import Frame, limb_frame
 from limbfit.anatomy.surfaces.surfaces import Anatomy, signed_distance
 from limbfit.anatomy.surfaces.triangles import Surface, self_intersections
 from limbfit.errors import SurfaceError
-from limbfit.socket import Area, Recipe, Socket, circumference, rectified
-from limbfit.socket.landmarks import knee_centre
+from limbfit.socket import Area, Recipe, Socket, measure_circumference, rectify_limb
+from limbfit.socket.landmarks import find_knee_centre
 from limbfit.socket.trim import Trim
 
 PLAIN = Recipe(Trim([(np.array([0.0, 0.0, 115.0]), CUT_NORMAL)]), flare_mm=0.0, distal="bearing")
@@ -26,13 +26,13 @@ def frame_of(anatomy: Anatomy) -> Frame:
 
 def made(recipe: Recipe = PLAIN, anatomy: Anatomy | None = None) -> Socket:
     anatomy = anatomy or round_limb()
-    return rectified(anatomy.skin, frame_of(anatomy), recipe)
+    return rectify_limb(anatomy.skin, frame_of(anatomy), recipe)
 
 
 def ratio(socket: Socket, anatomy: Anatomy, height: float) -> float:
     """Socket's over limb's circumference at a height over the proximal cut."""
     point = anatomy.cut_point + height * anatomy.cut_normal
-    return socket.circumference(point, anatomy.cut_normal) / circumference(
+    return socket.circumference(point, anatomy.cut_normal) / measure_circumference(
         anatomy.skin, point, anatomy.cut_normal
     )
 
@@ -117,7 +117,7 @@ def test_a_position_on_the_skin_means_the_liner_outside_it() -> None:
     liner = Surface(limb.skin.points * [1.15, 1.15, 1.0], limb.skin.faces)  # some 6 mm off the skin
     at = np.array([0.0, -44.4, 80.0])
     recipe = replace(PLAIN, reduction_percent=0.0, areas=[Area("front", at, 25.0, 5.0)])
-    depth = rectified(liner, frame_of(limb), recipe).offset(liner)
+    depth = rectify_limb(liner, frame_of(limb), recipe).offset(liner)
     assert depth.max() == pytest.approx(5.0, rel=0.04)
 
 
@@ -173,7 +173,7 @@ def test_where_the_limb_lies_does_not_matter() -> None:
     shift = np.array([120.0, -340.0, 55.0])
     skin = Surface(limb.skin.points @ turn.T + shift, limb.skin.faces)
     recipe = replace(PLAIN, trim=Trim([(turn @ [0.0, 0.0, 115.0] + shift, turn @ CUT_NORMAL)]))
-    moved = rectified(skin, limb_frame(turn @ limb.cut_point + shift, turn @ CUT_NORMAL), recipe)
+    moved = rectify_limb(skin, limb_frame(turn @ limb.cut_point + shift, turn @ CUT_NORMAL), recipe)
     assert moved.volume_mm3 == pytest.approx(made().volume_mm3, rel=1e-4)
     assert moved.closed.volume > 0
 
@@ -222,7 +222,7 @@ def test_a_folded_limb_is_refused() -> None:
     )
     folded = revolved(profile, 90)
     with pytest.raises(SurfaceError, match="folded by"):
-        rectified(folded, limb_frame(np.array([0.0, 0.0, TOP]), CUT_NORMAL), PLAIN)
+        rectify_limb(folded, limb_frame(np.array([0.0, 0.0, TOP]), CUT_NORMAL), PLAIN)
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_a_folded_limb_is_refused() -> None:
 @pytest.mark.skipif(not FILES["mean"].is_file(), reason="shared/data is not here")
 def test_real_limbs(name: str) -> None:
     limb = real_limb(name)
-    knee = knee_centre(limb)
+    knee = find_knee_centre(limb)
     assert knee is not None
     top, tip = float(limb.height(knee)), float(limb.height(limb.skin.points).min())
     trim = Trim([(limb.cut_point + (top - 10.0) * limb.cut_normal, limb.cut_normal)])

@@ -12,7 +12,7 @@ import pytest
 from limbfit.anatomy.frame import limb_frame
 from limbfit.anatomy.surfaces.surfaces import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface, compacted
-from limbfit.socket import Recipe, rectified
+from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 from small_limb import limb, revolved, small_limb
 
@@ -41,7 +41,7 @@ def drawn() -> Surface:
     anatomy = limb()
     trim = Trim([(anatomy.cut_point - [0.0, 0.0, 26.0], anatomy.cut_normal)])
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    return rectified(anatomy.skin, frame, Recipe(trim, flare_mm=0.0, distal_clearance_mm=3.0)).surface
+    return rectify_limb(anatomy.skin, frame, Recipe(trim, flare_mm=0.0, distal_clearance_mm=3.0)).surface
 
 
 def scaled(*by: float) -> Callable[[Surface], Surface]:

@@ -8,19 +8,19 @@ from socket_limbs import FILES, real_limb, round_limb
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.errors import SurfaceError
-from limbfit.socket.landmarks import bone, directions, knee_centre
-from limbfit.socket.regions import SkinRegion, default_regions, stated_region
+from limbfit.socket.landmarks import find_bone, find_directions, find_knee_centre
+from limbfit.socket.regions import SkinRegion, build_default_regions, build_stated_region
 
 SIDES = ("anterior", "posterior", "medial", "lateral")
 LEVELS = ("proximal", "middle", "distal")
 
 
 def regions(limb: Anatomy) -> dict[str, SkinRegion]:
-    return default_regions(limb, directions(limb))
+    return build_default_regions(limb, find_directions(limb))
 
 
 def check_sides(limb: Anatomy) -> None:
-    found, known = regions(limb), directions(limb)
+    found, known = regions(limb), find_directions(limb)
     towards = {
         "anterior": known.anterior,
         "posterior": -known.anterior,
@@ -29,7 +29,7 @@ def check_sides(limb: Anatomy) -> None:
     }
     sides = [found[f"{side} {level}"] for side in SIDES for level in LEVELS]
     assert np.sum([region.faces for region in sides], axis=0).max() == 1  # none overlap
-    knee = knee_centre(limb)
+    knee = find_knee_centre(limb)
     assert knee is not None
     below = limb.height(limb.skin.triangles.mean(axis=1)) < limb.height(knee) - 1.0
     covered = np.any([region.faces for region in sides], axis=0)
@@ -53,9 +53,9 @@ def test_sides_and_levels_of_a_round_limb() -> None:
 def test_regions_of_real_limbs(name: str) -> None:
     limb = real_limb(name)
     check_sides(limb)
-    found, known = regions(limb), directions(limb)
+    found, known = regions(limb), find_directions(limb)
     assert set(found) >= {"tibial crest", "distal tibia", "distal fibula", "fibular head", "patellar tendon"}
-    tibia, fibula, patella = (bone(limb, n) for n in ("tibia", "fibula", "patella"))
+    tibia, fibula, patella = (find_bone(limb, n) for n in ("tibia", "fibula", "patella"))
     assert tibia is not None
     assert fibula is not None
     assert patella is not None
@@ -84,11 +84,11 @@ def test_without_bones_sides_are_left_and_right() -> None:
 
 def test_a_stated_region_is_a_disc_on_one_side() -> None:
     limb = round_limb()
-    region = stated_region(limb, "shin", np.array([0.0, -46.0, 70.0]), 15.0)
+    region = build_stated_region(limb, "shin", np.array([0.0, -46.0, 70.0]), 15.0)
     middle = limb.skin.triangles.mean(axis=1)
     assert np.linalg.norm(middle[region.faces] - region.position, axis=1).max() <= 15.0
     assert limb.skin.face_areas[region.faces].sum() == pytest.approx(np.pi * 15.0**2, rel=0.1)
     with pytest.raises(SurfaceError, match="off the skin"):
-        stated_region(limb, "shin", np.array([0.0, -96.0, 70.0]), 15.0)
-    small = stated_region(limb, "dot", np.array([0.0, -46.0, 70.0]), 0.1)
+        build_stated_region(limb, "shin", np.array([0.0, -96.0, 70.0]), 15.0)
+    small = build_stated_region(limb, "dot", np.array([0.0, -46.0, 70.0]), 0.1)
     assert small.faces.sum() == 1

@@ -16,7 +16,7 @@ from limbfit.errors import StudyError
 from limbfit.pipeline.shared.socket_shape import load_of, regions_of, socket_of
 from limbfit.pipeline.verbs.check import check_study
 from limbfit.socket import Socket
-from limbfit.socket.landmarks import knee_centre
+from limbfit.socket.landmarks import find_knee_centre
 from limbfit.study import Study, load_study
 
 AREA = '[[socket.areas]]\nname = "a"\nradius_mm = 20\ndepth_mm = 4\n'
@@ -53,7 +53,7 @@ def test_a_study_without_the_table_has_a_socket(tmp_path: Path) -> None:
     force, moment, point = load_of(study, study.socket.loads[0], round_limb(), drawn(study))
     np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
-    np.testing.assert_allclose(point, knee_centre(round_limb()))
+    np.testing.assert_allclose(point, find_knee_centre(round_limb()))
 
 
 def test_the_table_says_the_shape(tmp_path: Path) -> None:

@@ -11,15 +11,15 @@ from socket_limbs import CUT_NORMAL, round_limb
 from limbfit.anatomy.frame import limb_frame
 from limbfit.anatomy.surfaces.surfaces import signed_distance
 from limbfit.errors import SurfaceError
-from limbfit.socket import Recipe, rectified
-from limbfit.socket.landmarks import directions
-from limbfit.socket.regions import default_regions
-from limbfit.socket.targets import PRESETS, TISSUE_DEPTH, Target, zone
+from limbfit.socket import Recipe, rectify_limb
+from limbfit.socket.landmarks import find_directions
+from limbfit.socket.regions import build_default_regions
+from limbfit.socket.targets import PRESETS, TISSUE_DEPTH, Target, build_zone
 from limbfit.socket.trim import Trim
 
 LIMB = round_limb()
-REGIONS = default_regions(LIMB, directions(LIMB))
-FACE = rectified(
+REGIONS = build_default_regions(LIMB, find_directions(LIMB))
+FACE = rectify_limb(
     LIMB.skin,
     limb_frame(LIMB.cut_point, LIMB.cut_normal),
     Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]), 0.0, distal="bearing", edge_mm=5.0),
@@ -69,5 +69,5 @@ def test_a_stated_region_wins_also_under_a_liner() -> None:
 
 def test_an_unknown_region_names_the_others() -> None:
     with pytest.raises(SurfaceError, match="no region is named 'heel'") as caught:
-        zone("heel", LIMB, REGIONS, 1.0)
+        build_zone("heel", LIMB, REGIONS, 1.0)
     assert "tibial crest" in str(caught.value.remedy)

@@ -14,17 +14,17 @@ from limbfit.anatomy.frame import limb_frame
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
-from limbfit.socket import Area, Recipe, Socket, rectified
-from limbfit.socket.landmarks import knee_centre
+from limbfit.socket import Area, Recipe, Socket, rectify_limb
+from limbfit.socket.landmarks import find_knee_centre
 from limbfit.socket.trim import Trim
-from limbfit.socket.wall import wall
+from limbfit.socket.wall import build_wall
 
 RECIPE = Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]))
 
 
 def drawn(recipe: Recipe = RECIPE) -> Socket:
     limb = round_limb()
-    return rectified(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), recipe)
+    return rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), recipe)
 
 
 def read_back(body: Surface, folder: Path) -> trimesh.Trimesh:
@@ -43,7 +43,7 @@ def thickness(body: trimesh.Trimesh, socket: Socket) -> np.ndarray:
 
 
 def check_wall(socket: Socket, axis: np.ndarray, folder: Path, thick: float) -> trimesh.Trimesh:
-    body = read_back(wall(socket, axis, thick), folder)
+    body = read_back(build_wall(socket, axis, thick), folder)
     assert body.is_watertight
     assert body.is_winding_consistent
     assert body.volume > 0
@@ -73,14 +73,14 @@ def test_a_wall_with_brim_and_adapter(tmp_path: Path) -> None:
 
 def test_the_inner_side_is_the_face(tmp_path: Path) -> None:
     socket = drawn()
-    body = read_back(wall(socket, CUT_NORMAL, 4.0), tmp_path)
+    body = read_back(build_wall(socket, CUT_NORMAL, 4.0), tmp_path)
     _, apart, _ = trimesh.proximity.closest_point(body, socket.points)
     assert apart.max() < 0.01
 
 
 def test_without_an_adapter(tmp_path: Path) -> None:
     socket = drawn(replace(RECIPE, flare_mm=0.0))
-    body = read_back(wall(socket, CUT_NORMAL, 3.0, adapter_diameter_mm=0.0), tmp_path)
+    body = read_back(build_wall(socket, CUT_NORMAL, 3.0, adapter_diameter_mm=0.0), tmp_path)
     assert body.is_watertight
     measured = thickness(body, socket)
     assert np.percentile(measured, [1, 99]) == pytest.approx(3.0, rel=0.02)
@@ -89,12 +89,12 @@ def test_without_an_adapter(tmp_path: Path) -> None:
 def test_walls_that_cannot_be_made_are_refused() -> None:
     narrow = drawn(replace(RECIPE, areas=[Area("narrow", np.array([0.0, -44.0, 80.0]), 11.0, 6.0)]))
     with pytest.raises(SurfaceError, match="would fold") as caught:
-        wall(narrow, CUT_NORMAL, 15.0)
+        build_wall(narrow, CUT_NORMAL, 15.0)
     assert caught.value.remedy
     with pytest.raises(SurfaceError, match="as wide as the socket"):
-        wall(drawn(), CUT_NORMAL, adapter_diameter_mm=200.0)
+        build_wall(drawn(), CUT_NORMAL, adapter_diameter_mm=200.0)
     with pytest.raises(SurfaceError, match="open distal end"):
-        wall(replace(drawn(), open_distal=True), CUT_NORMAL)
+        build_wall(replace(drawn(), open_distal=True), CUT_NORMAL)
 
 
 @pytest.mark.slow
@@ -102,8 +102,8 @@ def test_walls_that_cannot_be_made_are_refused() -> None:
 @pytest.mark.skipif(not FILES["mean"].is_file(), reason="shared/data is not here")
 def test_real_limbs(tmp_path: Path, name: str) -> None:
     limb = real_limb(name)
-    knee = knee_centre(limb)
+    knee = find_knee_centre(limb)
     assert knee is not None
     trim = Trim([(knee - 15.0 * limb.cut_normal, limb.cut_normal)])
-    socket = rectified(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(trim))
+    socket = rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(trim))
     check_wall(socket, limb.cut_normal, tmp_path, 4.0)

@@ -10,9 +10,9 @@ import numpy as np
 from ..anatomy.frame import limb_frame
 from ..anatomy.surfaces.surfacefiles import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
-from ..socket import Area, Recipe, Socket, read_socket, rectified
-from ..socket.landmarks import Directions, directions, knee_centre
-from ..socket.regions import default_regions
+from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
+from ..socket.landmarks import Directions, find_directions, find_knee_centre
+from ..socket.regions import build_default_regions
 from ..socket.trim import Trim
 from .fields import Array
 from .geometry import Limb
@@ -56,12 +56,12 @@ def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> 
     SurfaceError
         Where the limb has no place for it.
     """
-    known = directions(anatomy, "right")
-    regions = default_regions(anatomy, known)
+    known = find_directions(anatomy, "right")
+    regions = build_default_regions(anatomy, known)
     areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS[kind]]
-    knee, frame = knee_centre(anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    knee, frame = find_knee_centre(anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
     trim = _below_cut(anatomy) if knee is None else _around_tendon(anatomy, known, knee)
-    return rectified(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
+    return rectify_limb(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
 
 
 def _below_cut(anatomy: Anatomy) -> Trim:

@@ -18,7 +18,7 @@ OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some
 BESIDE_MM = 5.0  # a place so far beside the face is not on it
 
 
-def faded(apart: Array, reach: float) -> Array:
+def compute_area_weight(apart: Array, reach: float) -> Array:
     """``(1 - r^2/R^2)^3`` of distances r (n,) within a reach R, 0 beyond: no kink in slope or curvature."""
     return np.asarray(np.maximum(1.0 - (apart / reach) ** 2, 0.0) ** 3)
 
@@ -50,7 +50,7 @@ class Area:
     def depth(self, points: Array) -> Array:
         """(n,) mm at points (n, 3)."""
         apart = np.linalg.norm(points - np.asarray(self.position, dtype=float), axis=1)
-        return self.depth_mm * faded(apart, self.radius_mm)
+        return self.depth_mm * compute_area_weight(apart, self.radius_mm)
 
     def on(self, face: Surface) -> Area:
         """With its middle on the drawn face (LPS), which a liner keeps off the skin.
@@ -61,7 +61,7 @@ class Area:
             Where the area lies off the face.
         """
         position = np.asarray(self.position, dtype=float)
-        foot, beside, off = _feet(position[None], face)
+        foot, beside, off = _project_to_face(position[None], face)
         if beside[0] > max(BESIDE_MM, 0.25 * self.radius_mm) or off[0] > OFF_FACE_MM:
             raise SurfaceError(
                 f"area {self.name!r} lies {np.linalg.norm(position - foot[0]):.0f} mm off the socket's face",
@@ -108,7 +108,7 @@ class Zone:
 
     def share(self, points: Array) -> Array:
         """(n,) of its depth at points (n, 3): 1 on the region, 0 beyond its reach."""
-        return faded(self._tree.query(points)[0], self.reach_mm)
+        return compute_area_weight(self._tree.query(points)[0], self.reach_mm)
 
     def on(self, face: Surface) -> Zone:
         """With its points on the drawn face (LPS); those beyond the brim are left out.
@@ -118,7 +118,7 @@ class Zone:
         SurfaceError
             Where the whole region lies off the face.
         """
-        feet, beside, off = _feet(self.points, face)
+        feet, beside, off = _project_to_face(self.points, face)
         under = (beside <= BESIDE_MM) & (off <= OFF_FACE_MM)
         if not under.any():
             raise SurfaceError(
@@ -141,7 +141,7 @@ def _check_sides(name: str, width: str, depth_mm: float, reach_mm: float) -> Non
         )
 
 
-def _feet(points: Array, face: Surface) -> tuple[Array, Array, Array]:
+def _project_to_face(points: Array, face: Surface) -> tuple[Array, Array, Array]:
     """Nearest points (n, 3) of a face, and how far (n,) points lie beside it and off it, mm."""
     _, near, feet = igl.point_mesh_squared_distance(points, face.points, face.faces)
     normals, apart = face.face_normals[near], points - feet

@@ -11,7 +11,7 @@ from ..anatomy.frame import Frame
 from ..anatomy.surfaces.surfaces import signed_distance
 from ..anatomy.surfaces.triangles import Surface
 from ..errors import SurfaceError
-from .shape import closed_by_fans
+from .shape import close_by_fans
 
 INTO_BONE_MM = 0.5  # by which a bone may reach through the face: roughness
 
@@ -41,7 +41,7 @@ def refuse_bones(
         With the bone, how far it reaches through, and the remedy.
     """
     face = Surface(frame.to_limb(points), faces)
-    closed = closed_by_fans(face.flipped)
+    closed = close_by_fans(face.flipped)
     lowest = float(face.points[brim, 2].min())
     for name, bone in bones.items():
         local = frame.to_limb(bone.points)

@@ -21,7 +21,7 @@ AIM_MM = 0.8  # what is aimed at where it is measured
 ROUNDS = 12
 
 
-def cleared(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
+def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
     """The points of a face (limb frame) where the face is clear of the limb by ``CLEAR_MM`` or more.
 
     Each stays on its ray and moves outwards only. What is measured are the face's points, middles of edges
@@ -34,11 +34,11 @@ def cleared(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame
     """
     local = Surface(frame.to_limb(outer.points), outer.faces)
     angle, station, radius = limb.rays.coordinates(points)
-    neighbours = _neighbours(faces, len(points))
+    neighbours = _build_neighbours(faces, len(points))
     radius = np.maximum(radius, limb.at(angle, station) + AIM_MM)
     for _ in range(ROUNDS):
         moved = limb.rays.points(angle, station, radius)
-        need = _needed(moved, faces, local)
+        need = _compute_moves(moved, faces, local)
         if need.max() <= AIM_MM - CLEAR_MM:
             return moved
         # A point's neighbours go with it, so that the face stays smooth.
@@ -50,13 +50,13 @@ def cleared(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame
     )
 
 
-def _neighbours(faces: Ints, count: int) -> csr_array:
+def _build_neighbours(faces: Ints, count: int) -> csr_array:
     edges = half_edges(faces)
     both = np.vstack([edges, edges[:, ::-1]])
     return csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
 
 
-def _needed(points: Array, faces: Ints, limb: Surface) -> Array:
+def _compute_moves(points: Array, faces: Ints, limb: Surface) -> Array:
     """(n,) by how much each point should move out so that all that is measured near it is clear, mm."""
     need = np.maximum(AIM_MM - signed_distance(limb, points), 0.0)
     for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):

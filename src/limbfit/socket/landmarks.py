@@ -12,7 +12,7 @@ from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
-from .shape import measure_section, section
+from .shape import cut_section, measure_section
 
 PLATEAU_MM = 8.0  # of the tibia's top: its mean is the knee centre
 
@@ -42,7 +42,7 @@ class Directions:
         return -self.lateral
 
 
-def directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -> Directions:
+def find_directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -> Directions:
     """The directions of a limb: proximal by its cut, anterior by patient space, lateral by fibula or side.
 
     Parameters
@@ -65,7 +65,7 @@ def directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -
     anterior /= np.linalg.norm(anterior)
     across = np.cross(proximal, anterior)  # to the patient's left
     if side is None:
-        tibia, fibula = bone(anatomy, "tibia"), bone(anatomy, "fibula")
+        tibia, fibula = find_bone(anatomy, "tibia"), find_bone(anatomy, "fibula")
         if tibia is None or fibula is None:
             return Directions(proximal, anterior, None)
         apart = float((fibula.points.mean(axis=0) - tibia.points.mean(axis=0)) @ across)
@@ -73,14 +73,14 @@ def directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -
     return Directions(proximal, anterior, across if side == "left" else -across)
 
 
-def bone(anatomy: Anatomy, name: str) -> Surface | None:
+def find_bone(anatomy: Anatomy, name: str) -> Surface | None:
     """The bone of that name, however it is spelled: ``Tibia left`` is a tibia."""
     return next((b for key, b in anatomy.bones.items() if name in key.lower()), None)
 
 
-def knee_centre(anatomy: Anatomy) -> Array | None:
+def find_knee_centre(anatomy: Anatomy) -> Array | None:
     """(3,) LPS mm, the middle of the tibia's top; None where no bone is named tibia."""
-    tibia = bone(anatomy, "tibia")
+    tibia = find_bone(anatomy, "tibia")
     if tibia is None:
         return None
     height = anatomy.height(tibia.points)
@@ -94,11 +94,11 @@ def load_point(anatomy: Anatomy, brim: Array) -> Array:
     It is the knee centre; where that is not known, the centre of the limb's section at the height of the
     brim, whose points are ``brim`` (k, 3).
     """
-    knee = knee_centre(anatomy)
+    knee = find_knee_centre(anatomy)
     if knee is not None:
         return knee
     frame, skin = limb_frame(anatomy.cut_point, anatomy.cut_normal), anatomy.skin
     z = min(float(frame.to_limb(brim)[:, 2].mean()), -1.0)  # below the cut, which closes the skin
     local = Surface(frame.to_limb(skin.points), skin.faces)
-    x, y, _ = measure_section(section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))
+    x, y, _ = measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))
     return frame.to_patient(np.array([x, y, z]))

@@ -10,7 +10,7 @@ from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
-from .rays import LimbProfile, radii, smooth
+from .rays import LimbProfile, compute_radii, smooth
 
 SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
 
@@ -35,7 +35,7 @@ class Offsets:
         return np.asarray(size[:, None] * self.limb.rays.direction(angle, station))
 
 
-def offsets(limb: LimbProfile, before: Surface, after: Surface, frame: Frame) -> Offsets:
+def compute_offsets(limb: LimbProfile, before: Surface, after: Surface, frame: Frame) -> Offsets:
     """By how much a limb's outer surface (LPS mm) moves along each ray of the limb.
 
     Both surfaces have the same triangles, open at the proximal cut, so that their facets cancel.
@@ -46,7 +46,7 @@ def offsets(limb: LimbProfile, before: Surface, after: Surface, frame: Frame) ->
         Where a surface does not surround the limb's middle line.
     """
     first, second = (
-        radii(Surface(frame.to_limb(one.points), one.faces), limb.rays, limb.stations, limb.angles)[0]
+        compute_radii(Surface(frame.to_limb(one.points), one.faces), limb.rays, limb.stations, limb.angles)[0]
         for one in (before, after)
     )
     radial = second - first

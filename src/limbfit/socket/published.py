@@ -91,7 +91,7 @@ FINDINGS = (
 )
 
 
-def published(regions: Collection[str]) -> list[Mapping[str, Any]]:
+def select_published_findings(regions: Collection[str]) -> list[Mapping[str, Any]]:
     """The findings over any of the ``regions``, or over the whole limb, as they are stored."""
     rows: list[Mapping[str, Any]] = []
     for finding in FINDINGS:

@@ -22,7 +22,7 @@ from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
-from .shape import measure_section, section
+from .shape import cut_section, measure_section
 
 ANGLES = 180
 STEP_MM = 1.5  # between stations
@@ -122,7 +122,7 @@ class LimbProfile:
         return value
 
 
-def profile(outer: Surface, frame: Frame) -> LimbProfile:
+def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
     """The radii of a limb's closed outer surface (LPS mm) in its frame.
 
     Raises
@@ -131,28 +131,28 @@ def profile(outer: Surface, frame: Frame) -> LimbProfile:
         Where the surface does not surround its own middle line.
     """
     local = Surface(frame.to_limb(outer.points), outer.faces)
-    rays = _rays(local)
+    rays = _build_rays(local)
     top = -BELOW_CUT_MM - rays.centre_z
     below = np.linspace(rays.lowest, 0.0, max(8, round(-rays.lowest / STEP_MM)), endpoint=False)
     stations = np.concatenate([below, np.linspace(0.0, top, max(8, round(top / STEP_MM)))])
     angles = -np.pi + 2 * np.pi * np.arange(ANGLES) / ANGLES
-    radius, folds = radii(local, rays, stations, angles)
+    radius, folds = compute_radii(local, rays, stations, angles)
     if np.isnan(radius).any():
         k = int(np.isnan(radius).any(axis=1).argmax())
         place = frame.to_patient(rays.middle(stations[k]))
         raise SurfaceError(
-            f"a ray from the limb's middle line at ({_words(place)}) mm leaves the limb without meeting it",
+            f"a ray from the limb's middle line at ({_format_point(place)}) mm never meets the limb",
             remedy="close the surface, or move the proximal cut nearer to the knee",
         )
     radius = smooth(radius, stations, float(np.median(radius)), SMOOTH_MM)
     return LimbProfile(rays, stations, angles, radius, folds)
 
 
-def _words(point: Array) -> str:
+def _format_point(point: Array) -> str:
     return ", ".join(f"{x:.0f}" for x in point)
 
 
-def _rays(local: Surface) -> Rays:
+def _build_rays(local: Surface) -> Rays:
     bottom = float(local.points[:, 2].min())
     if bottom > -30.0:
         raise SurfaceError(
@@ -160,7 +160,7 @@ def _rays(local: Surface) -> Rays:
             remedy="move the proximal cut up",
         )
     levels = np.linspace(bottom, -BELOW_CUT_MM, LEVELS + 2)[1:]
-    measured = np.array([measure_section(section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0))) for z in levels])
+    measured = np.array([measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0))) for z in levels])
     mean_radius = np.sqrt(measured[:, 2] / np.pi)
     # The end is as high as the limb is wide there; a long one keeps half of the limb for its shank.
     rounded = np.flatnonzero(levels - bottom >= np.minimum(mean_radius, 0.5 * (-bottom)))[0]
@@ -169,7 +169,7 @@ def _rays(local: Surface) -> Rays:
     return Rays(line, centre_z, float(mean_radius[rounded]), -centre_z)
 
 
-def hits_of(surface: Surface, starts: Array, ways: Array) -> list[Array]:
+def find_ray_hits(surface: Surface, starts: Array, ways: Array) -> list[Array]:
     """Distances, ascending, at which rays from points (n, 3) along unit vectors (n, 3) meet a surface."""
     locator = vtkStaticCellLocator()
     locator.SetDataSet(surface.to_pyvista())
@@ -184,7 +184,7 @@ def hits_of(surface: Surface, starts: Array, ways: Array) -> list[Array]:
     return found
 
 
-def radii(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
+def compute_radii(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
     """Where each ray leaves a surface (limb frame) for good, and how far in it left it before.
 
     Returns
@@ -194,7 +194,7 @@ def radii(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[A
     """
     ways = rays.direction(angles[None, :], stations[:, None])
     starts = np.broadcast_to(rays.middle(stations)[:, None], ways.shape)
-    hits = hits_of(local, starts.reshape(-1, 3), ways.reshape(-1, 3))
+    hits = find_ray_hits(local, starts.reshape(-1, 3), ways.reshape(-1, 3))
     radius = np.array([met[-1] if len(met) else np.nan for met in hits])
     folds = np.array([met[-1] - met[0] if len(met) else 0.0 for met in hits])
     return radius.reshape(ways.shape[:2]), folds.reshape(ways.shape[:2])

@@ -23,8 +23,8 @@ from ..anatomy.surfaces.triangles import (
 from ..arrays import Array
 from ..errors import SurfaceError
 from .bones import refuse_bones
-from .clearance import cleared
-from .rays import Rays, hits_of, profile
+from .clearance import apply_clearance
+from .rays import Rays, compute_profile, find_ray_hits
 from .shape import Socket
 
 Ints = NDArray[np.int64]
@@ -73,8 +73,8 @@ def read_socket(
 
 def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Surface]) -> Socket:
     _check_size(surface, outer)
-    limb = profile(outer, frame)
-    piece, notes = _one_piece(surface)
+    limb = compute_profile(outer, frame)
+    piece, notes = _keep_largest_piece(surface)
     whole = orient_faces(piece)
     if turned := count_turned(piece, whole):
         against = min(turned, len(whole.faces) - turned)
@@ -86,10 +86,10 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
         if face.volume < 0.0:
             face = face.flipped
             notes.append("its triangles looked into its wall and were turned")
-        face, thick = _inner_face(face, limb.rays)
+        face, thick = _select_inner_face(face, limb.rays)
         notes.append(f"the inner face of a wall of about {thick:.1f} mm is taken")
-    brim, open_distal = _brim(face, limb.rays)
-    side = _side(face, limb.rays)
+    brim, open_distal = _find_brim(face, limb.rays)
+    side = _compute_facing(face, limb.rays)
     if side > 0.0:
         face = face.flipped
         brim = brim[::-1]
@@ -108,7 +108,7 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
         bones,
         remedy="check its unit and its place on the limb; a socket is larger than the bones in it",
     )
-    clear = frame.to_patient(cleared(face.points, face.faces, limb, outer, frame))
+    clear = frame.to_patient(apply_clearance(face.points, face.faces, limb, outer, frame))
     return Socket(frame.to_patient(face.points), face.faces, clear, brim, open_distal, tuple(notes))
 
 
@@ -122,7 +122,7 @@ def _check_size(surface: Surface, outer: Surface) -> None:
         )
 
 
-def _one_piece(surface: Surface) -> tuple[Surface, list[str]]:
+def _keep_largest_piece(surface: Surface) -> tuple[Surface, list[str]]:
     parts = bodies(surface)
     loose = [part for part in parts[1:] if len(part.faces) < LOOSE_SHARE * len(surface.faces)]
     if len(parts) - len(loose) > 1:
@@ -147,7 +147,7 @@ def _check_place(face: Surface, rays: Rays, top: float) -> None:
         )
 
 
-def _side(face: Surface, rays: Rays) -> float:
+def _compute_facing(face: Surface, rays: Rays) -> float:
     """Mean cosine between the faces' normals and the rays through them, by area."""
     angle, station, _ = rays.coordinates(face.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", face.face_normals, rays.direction(angle, station))
@@ -160,19 +160,19 @@ def _side(face: Surface, rays: Rays) -> float:
     return mean
 
 
-def _winding(loop: Array, rays: Rays) -> int:
+def _count_windings(loop: Array, rays: Rays) -> int:
     """How often a closed line (k, 3) goes around the middle line."""
     angle = rays.coordinates(loop)[0]
     steps = np.mod(np.diff(angle, append=angle[0]) + np.pi, 2 * np.pi) - np.pi
     return round(float(steps.sum()) / (2 * np.pi))
 
 
-def _brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
+def _find_brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
     """The proximal edge, and whether the distal end is open too."""
     loops = open_loops(face)
-    around = [loop for loop in loops if _winding(face.points[loop], rays)]
+    around = [loop for loop in loops if _count_windings(face.points[loop], rays)]
     if len(around) < len(loops):
-        hole = next(loop for loop in loops if not _winding(face.points[loop], rays))
+        hole = next(loop for loop in loops if not _count_windings(face.points[loop], rays))
         raise SurfaceError(
             f"the socket has a hole of {len(hole)} edges in its side",
             remedy="close it; only brim and end may be open",
@@ -190,11 +190,11 @@ def _brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
     return around[int(np.argmax(heights))], len(around) == 2
 
 
-def _inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
+def _select_inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
     """The faces of a closed wall that the middle line sees, and the wall's median thickness, mm."""
     middles = wall.triangles.mean(axis=1)
     angle, station, radius = rays.coordinates(middles)
-    hits = hits_of(wall, rays.middle(station), rays.direction(angle, station))
+    hits = find_ray_hits(wall, rays.middle(station), rays.direction(angle, station))
     first = np.array([met[0] if len(met) else np.inf for met in hits])
     facing = np.einsum("ij,ij->i", wall.face_normals, rays.direction(angle, station)) < 0.0
     seen = facing & (np.abs(first - radius) < 1e-2)
@@ -204,7 +204,7 @@ def _inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
         )
     thick = float(np.median([met[1] - met[0] for met, s in zip(hits, seen) if s and len(met) > 1]))
     inner = bodies(compacted(Surface(wall.points, wall.faces[seen])))[0]
-    inner = _without_ears(inner)
+    inner = _remove_ears(inner)
     if len(inner.faces) < 0.9 * seen.sum():
         raise SurfaceError(
             "which of the socket's faces are its inner side cannot be told",
@@ -213,7 +213,7 @@ def _inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
     return inner, thick
 
 
-def _without_ears(surface: Surface) -> Surface:
+def _remove_ears(surface: Surface) -> Surface:
     """Without faces that hang on by one edge or a corner, so that its edge is one clean line."""
     faces = surface.faces
     while True:

@@ -14,12 +14,12 @@ from ..anatomy.surfaces.triangles import Surface, self_intersections
 from ..arrays import Array
 from ..errors import SurfaceError
 from .areas import Area, Zone
-from .clearance import cleared
+from .clearance import apply_clearance
 from .offsets import Offsets
-from .rays import FOLD_MM, LimbProfile, profile
-from .rings import spaced, stitched
+from .rays import FOLD_MM, LimbProfile, compute_profile
+from .rings import join_all_rings, resample_ring
 from .shape import Socket
-from .trim import Trim, Trimmed, trimmed
+from .trim import Trim, TrimmedLimb, trim_limb
 
 Ints = NDArray[np.int64]
 
@@ -57,7 +57,7 @@ class Recipe:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class SocketSurface:
     """Triangles on the limb, and how far each point lies below the brim along the limb, mm."""
 
     points: Array
@@ -67,7 +67,7 @@ class Drawn:
     brim: Ints
 
 
-def rectified(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
+def rectify_limb(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
     """The inner face of a socket for a limb.
 
     Parameters
@@ -82,19 +82,19 @@ def rectified(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
         Where the limb is folded or its end is no end, the brim leaves the limb, an area misses it, or the
         face would fold: each with the remedy.
     """
-    limb = profile(outer, frame)
-    lines = trimmed(limb, frame, recipe.trim)
+    limb = compute_profile(outer, frame)
+    lines = trim_limb(limb, frame, recipe.trim)
     _refuse_folds(limb, lines, frame)
-    drawn = _drawn(lines, recipe)
+    drawn = _draw_surface(lines, recipe)
     face = Surface(frame.to_patient(drawn.points), drawn.faces)
     recipe = replace(recipe, areas=[area.on(face) for area in recipe.areas])
-    points = frame.to_patient(_shaped(drawn, limb, frame, recipe))
+    points = frame.to_patient(_rectify_points(drawn, limb, frame, recipe))
     _refuse_crossing(Surface(points, drawn.faces), recipe)
-    clear = frame.to_patient(cleared(frame.to_limb(points), drawn.faces, limb, outer, frame))
+    clear = frame.to_patient(apply_clearance(frame.to_limb(points), drawn.faces, limb, outer, frame))
     return Socket(points, drawn.faces, clear, drawn.brim)
 
 
-def reduced_to(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) -> tuple[Socket, float]:
+def reduce_to_volume(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) -> tuple[Socket, float]:
     """The face without areas whose uniform reduction leaves a volume, and that reduction in percent.
 
     The volume is met within ``VOLUME_SHARE``.
@@ -102,13 +102,13 @@ def reduced_to(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) 
     Raises
     ------
     SurfaceError
-        As `rectified`.
+        As `rectify_limb`.
     """
     plain = replace(recipe, areas=(), offsets=None)
     reductions = [plain.reduction_percent]
     roots: list[float] = []  # of volumes: nearly linear in the reduction
     for _ in range(MATCHING_ROUNDS):
-        face = rectified(outer, frame, replace(plain, reduction_percent=reductions[-1]))
+        face = rectify_limb(outer, frame, replace(plain, reduction_percent=reductions[-1]))
         roots.append(face.volume_mm3**0.5)
         short = volume_mm3**0.5 - roots[-1]
         if abs(short) < 0.5 * VOLUME_SHARE * roots[-1]:
@@ -121,7 +121,7 @@ def reduced_to(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) 
     return face, reductions[len(roots) - 1]
 
 
-def _refuse_folds(limb: LimbProfile, lines: Trimmed, frame: Frame) -> None:
+def _refuse_folds(limb: LimbProfile, lines: TrimmedLimb, frame: Frame) -> None:
     inside = limb.stations[:, None] <= lines.brim_station[None, :]
     folds = np.where(inside, limb.folds, 0.0)
     if folds.max() > FOLD_MM:
@@ -135,7 +135,7 @@ def _refuse_folds(limb: LimbProfile, lines: Trimmed, frame: Frame) -> None:
         )
 
 
-def _drawn(lines: Trimmed, recipe: Recipe) -> Drawn:
+def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
     """Rings of even triangles between the distal pole and the brim; the last rows are the flare's."""
     flare = np.radians(FLARE_DEGREES) * recipe.flare_mm
     lengths = lines.length
@@ -151,19 +151,19 @@ def _drawn(lines: Trimmed, recipe: Recipe) -> Drawn:
         dense = lines.along(way)
         around = float(np.linalg.norm(dense - np.roll(dense, 1, axis=0), axis=1).sum())
         count = max(FEWEST_AROUND, round(around / recipe.edge_mm))
-        points, where = spaced(dense, count, 0.5 * (number % 2))
+        points, where = resample_ring(dense, count, 0.5 * (number % 2))
         rings.append(points)
         at.append(where)
         remaining = np.column_stack([dense[:, :2], lengths - way])
-        below.append(_carried(dense, remaining[:, 2:], where)[:, 0])
-        up.append(_carried(dense, lines.tangent(way), where))
-    faces = stitched(at)
+        below.append(_interpolate_along_ring(dense, remaining[:, 2:], where)[:, 0])
+        up.append(_interpolate_along_ring(dense, lines.tangent(way), where))
+    faces = join_all_rings(at)
     count = sum(len(ring) for ring in rings)
     brim = np.arange(count - len(rings[-1]), count)
-    return Drawn(np.vstack(rings), faces, np.concatenate(below), np.vstack(up), brim)
+    return SocketSurface(np.vstack(rings), faces, np.concatenate(below), np.vstack(up), brim)
 
 
-def _carried(dense: Array, values: Array, shares: Array) -> Array:
+def _interpolate_along_ring(dense: Array, values: Array, shares: Array) -> Array:
     """Values (n, d) at the points of a dense ring, at shares of its length."""
     closed = np.vstack([dense, dense[:1]])
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
@@ -172,7 +172,7 @@ def _carried(dense: Array, values: Array, shares: Array) -> Array:
     return np.column_stack([np.interp(shares, length, column) for column in around.T])
 
 
-def _shaped(drawn: Drawn, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
+def _rectify_points(drawn: SocketSurface, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
     """The drawn points (limb frame), rectified; distances add up along the limb's own normals."""
     points = drawn.points
     normals = -Surface(points, drawn.faces).vertex_normals
@@ -185,11 +185,11 @@ def _shaped(drawn: Drawn, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Ar
     for area in recipe.areas:
         moves -= area.depth(in_patient)[:, None] * normals
     if recipe.distal == "clearance":
-        moves[:, 2] -= recipe.distal_clearance_mm * _distal(points[:, 2], limb, recipe)
-    return points + moves + _flared(drawn, normals, recipe.flare_mm)
+        moves[:, 2] -= recipe.distal_clearance_mm * _compute_distal_share(points[:, 2], limb, recipe)
+    return points + moves + _compute_flare(drawn, normals, recipe.flare_mm)
 
 
-def _distal(z: Array, limb: LimbProfile, recipe: Recipe) -> Array:
+def _compute_distal_share(z: Array, limb: LimbProfile, recipe: Recipe) -> Array:
     """(n,) share of the distal clearance at heights: 1 at the pole, 0 from the end's height on, smooth."""
     height = DISTAL_SHARE * limb.rays.end_radius
     if recipe.distal_clearance_mm > STEEPEST * height / 1.875:
@@ -201,7 +201,7 @@ def _distal(z: Array, limb: LimbProfile, recipe: Recipe) -> Array:
     return 1.0 - t**3 * (10.0 - 15.0 * t + 6.0 * t**2)  # slope and curvature are zero at both ends
 
 
-def _flared(drawn: Drawn, normals: Array, radius: float) -> Array:
+def _compute_flare(drawn: SocketSurface, normals: Array, radius: float) -> Array:
     """Moves (n, 3) that bend what is near the brim along an arc outwards; lengths along it stay."""
     if radius == 0.0:
         return np.zeros_like(normals)

@@ -13,7 +13,7 @@ from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
-from .landmarks import Directions, bone, knee_centre
+from .landmarks import Directions, find_bone, find_knee_centre
 
 Mask = NDArray[np.bool_]
 
@@ -35,7 +35,9 @@ class SkinRegion:
     faces: Mask
 
 
-def default_regions(anatomy: Anatomy, known: Directions, below: float | None = None) -> dict[str, SkinRegion]:
+def build_default_regions(
+    anatomy: Anatomy, known: Directions, below: float | None = None
+) -> dict[str, SkinRegion]:
     """The regions of a limb by name, where nothing is stated.
 
     Four sides in three levels between ``below`` and the distal end; over the bones that have these names, the
@@ -47,9 +49,9 @@ def default_regions(anatomy: Anatomy, known: Directions, below: float | None = N
     below : height over the proximal cut (negative, mm) at which the highest level starts, such as the brim's;
         by default that of the knee centre, or 30 mm below the cut.
     """
-    knee = knee_centre(anatomy)
+    knee = find_knee_centre(anatomy)
     top = below if below is not None else float(anatomy.height(knee)) if knee is not None else -30.0
-    masks = _levels(anatomy, known, top) | _over_bones(anatomy, known)
+    masks = _select_levels(anatomy, known, top) | _select_skin_over_bones(anatomy, known)
     skin, middles = anatomy.skin, anatomy.skin.triangles.mean(axis=1)
     regions = {}
     for name, mask in masks.items():
@@ -60,7 +62,7 @@ def default_regions(anatomy: Anatomy, known: Directions, below: float | None = N
     return regions
 
 
-def stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> SkinRegion:
+def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> SkinRegion:
     """The round region of a name: faces of the skin within a radius that look the way of the middle.
 
     Raises
@@ -75,16 +77,16 @@ def stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float
             f"region {name!r} lies {np.sqrt(squared[0]):.0f} mm off the skin",
             remedy="give a position on the skin (LPS, mm)",
         )
-    return SkinRegion(name, foot[0], _disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
+    return SkinRegion(name, foot[0], _select_disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
 
 
-def _disc(skin: Surface, middle: Array, radius_mm: float, outward: Array) -> Mask:
+def _select_disc(skin: Surface, middle: Array, radius_mm: float, outward: Array) -> Mask:
     near = np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1) <= radius_mm
     near[np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1).argmin()] = True
     return near & (skin.face_normals @ outward > FACING)
 
 
-def _levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str, Mask]:
+def _select_levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str, Mask]:
     middles = anatomy.skin.triangles.mean(axis=1)
     height = anatomy.height(middles)
     bottom = float(height.min())
@@ -113,21 +115,21 @@ def _levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str, Mask]:
     }
 
 
-def _over_bones(anatomy: Anatomy, known: Directions) -> dict[str, Mask]:
+def _select_skin_over_bones(anatomy: Anatomy, known: Directions) -> dict[str, Mask]:
     found: dict[str, Mask] = {}
-    tibia, fibula, patella = (bone(anatomy, name) for name in ("tibia", "fibula", "patella"))
+    tibia, fibula, patella = (find_bone(anatomy, name) for name in ("tibia", "fibula", "patella"))
     if tibia is not None:
-        found["tibial crest"] = _crest(anatomy, known, tibia)
-        found["distal tibia"] = _over_end(anatomy, tibia, distal=True)
+        found["tibial crest"] = _select_crest(anatomy, known, tibia)
+        found["distal tibia"] = _select_skin_over_end(anatomy, tibia, distal=True)
         if patella is not None:
-            found["patellar tendon"] = _tendon(anatomy, known, patella, tibia)
+            found["patellar tendon"] = _select_tendon(anatomy, known, patella, tibia)
     if fibula is not None:
-        found["fibular head"] = _over_end(anatomy, fibula, distal=False)
-        found["distal fibula"] = _over_end(anatomy, fibula, distal=True)
+        found["fibular head"] = _select_skin_over_end(anatomy, fibula, distal=False)
+        found["distal fibula"] = _select_skin_over_end(anatomy, fibula, distal=True)
     return found
 
 
-def _thinnest(skin: Surface, ends: Array, allowed: Mask) -> tuple[Array, Array]:
+def _find_thinnest_tissue(skin: Surface, ends: Array, allowed: Mask) -> tuple[Array, Array]:
     """The point (3,) of the skin with the least tissue over bone points (n, 3), and its normal."""
     faces = np.flatnonzero(allowed)
     middles = skin.triangles[faces].mean(axis=1)
@@ -136,16 +138,16 @@ def _thinnest(skin: Surface, ends: Array, allowed: Mask) -> tuple[Array, Array]:
     return skin.triangles[best].mean(axis=0), skin.face_normals[best]
 
 
-def _over_end(anatomy: Anatomy, surface: Surface, *, distal: bool) -> Mask:
+def _select_skin_over_end(anatomy: Anatomy, surface: Surface, *, distal: bool) -> Mask:
     """Round about the place with the least tissue over an end of a bone."""
     skin, height = anatomy.skin, anatomy.height(surface.points)
     near = height < height.min() + BONE_END_MM if distal else height > height.max() - BONE_END_MM
     below_cut = anatomy.height(skin.triangles.mean(axis=1)) < -1.0
-    middle, outward = _thinnest(skin, surface.points[near], below_cut)
-    return _disc(skin, middle, PROMINENCE_MM, outward)
+    middle, outward = _find_thinnest_tissue(skin, surface.points[near], below_cut)
+    return _select_disc(skin, middle, PROMINENCE_MM, outward)
 
 
-def _crest(anatomy: Anatomy, known: Directions, tibia: Surface) -> Mask:
+def _select_crest(anatomy: Anatomy, known: Directions, tibia: Surface) -> Mask:
     """Faces near the line along which the tissue ahead of the tibia's shaft is thinnest."""
     middles = anatomy.skin.triangles.mean(axis=1)
     height, ends = anatomy.height(middles), anatomy.height(tibia.points)
@@ -169,7 +171,7 @@ def _crest(anatomy: Anatomy, known: Directions, tibia: Surface) -> Mask:
     return shaft & (apart <= CREST_MM)
 
 
-def _tendon(anatomy: Anatomy, known: Directions, patella: Surface, tibia: Surface) -> Mask:
+def _select_tendon(anatomy: Anatomy, known: Directions, patella: Surface, tibia: Surface) -> Mask:
     """Faces ahead of the gap between the patella's lower pole and the tibia's upper fifth."""
     middles = anatomy.skin.triangles.mean(axis=1)
     pole = patella.points[anatomy.height(patella.points).argmin()]

@@ -13,7 +13,7 @@ from ..arrays import Array
 Ints = NDArray[np.int64]
 
 
-def spaced(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
+def resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
     """``count`` points evenly spaced along a dense closed ring (n, 3), from the share ``turn`` of a step on.
 
     Returns
@@ -27,7 +27,7 @@ def spaced(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
     return CubicSpline(length / length[-1], closed, bc_type="periodic")(shares), shares
 
 
-def band(lower: Array, upper: Array, first: int, second: int) -> Ints:
+def join_rings(lower: Array, upper: Array, first: int, second: int) -> Ints:
     """Triangles between two rings whose points lie at shares ``lower`` (a,) and ``upper`` (b,) of them.
 
     The points of the rings are numbered from ``first`` and ``second`` on. Seen from inside, where shares grow
@@ -48,10 +48,12 @@ def band(lower: Array, upper: Array, first: int, second: int) -> Ints:
     return np.array(faces, dtype=np.int64)
 
 
-def stitched(shares: Sequence[Array]) -> Ints:
+def join_all_rings(shares: Sequence[Array]) -> Ints:
     """Triangles between rings, the first of which is a point, numbered one ring after the other."""
     starts = np.cumsum([0, *(len(ring) for ring in shares)])
     around = np.arange(len(shares[1]))
     pole = np.column_stack([np.zeros_like(around), 1 + around, 1 + np.roll(around, -1)])
-    bands = [band(shares[k], shares[k + 1], starts[k], starts[k + 1]) for k in range(1, len(shares) - 1)]
+    bands = [
+        join_rings(shares[k], shares[k + 1], starts[k], starts[k + 1]) for k in range(1, len(shares) - 1)
+    ]
     return np.vstack([pole, *bands])

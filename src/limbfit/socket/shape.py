@@ -45,7 +45,7 @@ class Socket:
     @cached_property
     def closed(self) -> Surface:
         """The space inside as a closed surface, outward; each opening is closed by a fan."""
-        return closed_by_fans(self.surface.flipped)
+        return close_by_fans(self.surface.flipped)
 
     @property
     def volume_mm3(self) -> float:
@@ -54,14 +54,14 @@ class Socket:
 
     def circumference(self, point: ArrayLike, normal: ArrayLike) -> float:
         """Length of the face's section by a plane, mm."""
-        return circumference(self.surface, point, normal)
+        return measure_circumference(self.surface, point, normal)
 
     def offset(self, limb: Surface) -> Array:
         """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
         return -signed_distance(limb, self.points)
 
 
-def closed_by_fans(surface: Surface) -> Surface:
+def close_by_fans(surface: Surface) -> Surface:
     """An open surface with each of its openings closed by a fan around the opening's middle."""
     points, faces = [surface.points], [surface.faces]
     for count, loop in enumerate(open_loops(surface)):
@@ -71,7 +71,7 @@ def closed_by_fans(surface: Surface) -> Surface:
     return Surface(np.vstack(points), np.vstack(faces))
 
 
-def section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
+def cut_section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
     """(k, 2, 3) segments in which a plane cuts a surface, all with the surface's outside on one side."""
     normal = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
     height = (surface.points - np.asarray(point, dtype=float)) @ normal
@@ -100,7 +100,7 @@ def measure_section(segments: Array) -> Array:
     return np.append((twice[:, None] * (a + b)).sum(axis=0) / (6 * area), abs(area))
 
 
-def circumference(surface: Surface, point: ArrayLike, normal: ArrayLike) -> float:
+def measure_circumference(surface: Surface, point: ArrayLike, normal: ArrayLike) -> float:
     """Length of a surface's section by a plane, mm: what a thread along the surface measures."""
-    segments = section(surface, point, normal)
+    segments = cut_section(surface, point, normal)
     return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())

@@ -75,7 +75,7 @@ class Target:
         skin = anatomy.skin
         below = igl.point_mesh_squared_distance(points, skin.points, skin.faces)[2]  # a liner
         if self.kind == TISSUE_DEPTH:
-            found = self.pressure_kPa * _deep(below, anatomy)
+            found = self.pressure_kPa * _compute_depth_share(below, anatomy)
             values: dict[str, float] = {}
         else:
             preset = PRESETS[self.kind]
@@ -84,12 +84,12 @@ class Target:
             values = {name: value for name, value in values.items() if name in regions}
         rest = {name: value for name, value in values.items() if name not in self.regions}
         for name, value in (*rest.items(), *self.regions.items()):  # where they overlap, what is stated wins
-            share = zone(name, anatomy, regions, 0.0).share(below)
+            share = build_zone(name, anatomy, regions, 0.0).share(below)
             found = (1.0 - share) * found + share * value
-        return found * _under(points, socket)
+        return found * _compute_brim_share(points, socket)
 
 
-def zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_mm: float) -> Zone:
+def build_zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_mm: float) -> Zone:
     """A region of the limb as what is pressed into a face by a depth, or relieved.
 
     Raises
@@ -103,7 +103,7 @@ def zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_m
     return Zone(name, points, REACH_MM, depth_mm)
 
 
-def _deep(points: Array, anatomy: Anatomy) -> Array:
+def _compute_depth_share(points: Array, anatomy: Anatomy) -> Array:
     """Depth (n,) of points of the skin over the nearest bone, as a share of ``DEEP_MM``, at most 1."""
     if not anatomy.bones:
         raise SurfaceError(
@@ -116,7 +116,7 @@ def _deep(points: Array, anatomy: Anatomy) -> Array:
     return np.asarray(np.clip(np.sqrt(np.min(squared, axis=0)) / DEEP_MM, 0.0, 1.0))
 
 
-def _under(points: Array, socket: Socket) -> Array:
+def _compute_brim_share(points: Array, socket: Socket) -> Array:
     """Share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
     nearest = igl.point_mesh_squared_distance(points, socket.points, socket.faces)[1]
     covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)

@@ -37,7 +37,7 @@ class Trim:
 
 
 @dataclass(frozen=True, eq=False)
-class Trimmed:
+class TrimmedLimb:
     """The limb's meridians (limb frame) from the distal pole to the brim.
 
     Attributes
@@ -84,7 +84,7 @@ class _Line:
         return PchipInterpolator(turns, np.tile(self.heights, 3))
 
 
-def trimmed(limb: LimbProfile, frame: Frame, trim: Trim) -> Trimmed:
+def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
     """The meridians of a limb up to its trimline.
 
     Raises
@@ -101,7 +101,7 @@ def trimmed(limb: LimbProfile, frame: Frame, trim: Trim) -> Trimmed:
         np.cumsum(np.linalg.norm(np.diff(points, axis=1), axis=2), axis=1),
         axis=1,
     )
-    over = np.max(_over(points, angles, limb, frame, trim), axis=0)
+    over = np.max(_measure_above_trimline(points, angles, limb, frame, trim), axis=0)
     after = np.argmax(over > 0.0, axis=1)
     rows = np.arange(len(angles))
     missed = ~(over > 0.0).any(axis=1)
@@ -122,22 +122,27 @@ def trimmed(limb: LimbProfile, frame: Frame, trim: Trim) -> Trimmed:
             + ("; the normals of its planes point proximally" * bool(trim.planes)),
         )
     station = stations[after - 1] + share * (stations[after] - stations[after - 1])
-    return Trimmed(points, ways, length, station)
+    return TrimmedLimb(points, ways, length, station)
 
 
-def brim_of(limb: LimbProfile, frame: Frame, trim: Trim, count: int) -> Array:
-    """Points (count, 3) of the limb where the brim runs, evenly around it, LPS mm; errors as of `trimmed`."""
-    found = trimmed(limb, frame, trim)
+def find_brim(limb: LimbProfile, frame: Frame, trim: Trim, count: int) -> Array:
+    """Points (count, 3) of the limb where the brim runs, evenly around it, LPS mm.
+
+    Errors are those of `trim_limb`.
+    """
+    found = trim_limb(limb, frame, trim)
     return frame.to_patient(found.along(found.length)[np.arange(count) * len(limb.angles) // count])
 
 
-def on_limb(limb: LimbProfile, frame: Frame, points: Array) -> Array:
+def wrap_trimline(limb: LimbProfile, frame: Frame, points: Array) -> Array:
     """The points (k, 3) of the limb on the rays through others, LPS mm, such as those of a trimline."""
     angle, station, _ = limb.rays.coordinates(frame.to_limb(points))
     return frame.to_patient(limb.rays.points(angle, station, limb.at(angle, station)))
 
 
-def _over(points: Array, angles: Array, limb: LimbProfile, frame: Frame, trim: Trim) -> list[Array]:
+def _measure_above_trimline(
+    points: Array, angles: Array, limb: LimbProfile, frame: Frame, trim: Trim
+) -> list[Array]:
     """How far points (angles, k, 3) lie over each part of the trimline, mm."""
     found = []
     for point, normal in trim.planes:
@@ -148,12 +153,12 @@ def _over(points: Array, angles: Array, limb: LimbProfile, frame: Frame, trim: T
             )
         found.append((points - frame.to_limb(point)) @ (direction / np.linalg.norm(direction)))
     if trim.line is not None:
-        line = _line(frame.to_limb(trim.line), limb)
+        line = _build_line(frame.to_limb(trim.line), limb)
         found.append(points[..., 2] - line.height(angles)[:, None])
     return found
 
 
-def _line(points: Array, limb: LimbProfile) -> _Line:
+def _build_line(points: Array, limb: LimbProfile) -> _Line:
     angle, station, radius = limb.rays.coordinates(points)
     off = np.abs(radius - limb.at(angle, station))
     if off.max() > OFF_LIMB_MM:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..anatomy.surfaces.triangles import Surface, self_intersections
 from ..arrays import Array
 from ..errors import SurfaceError
-from .rays import hits_of
+from .rays import find_ray_hits
 from .shape import Socket
 
 Ints = NDArray[np.int64]
@@ -24,7 +24,7 @@ SLIVER_MM = 0.005  # what is shorter where adapter and wall meet would collapse 
 BEHIND_MM = 10 * SLIVER_MM  # the face, which may have moved by that much: where measuring its wall begins
 
 
-def wall(
+def build_wall(
     socket: Socket,
     axis: Array,
     thickness_mm: float = 4.0,
@@ -51,34 +51,34 @@ def wall(
     """
     if socket.open_distal:
         raise SurfaceError("a socket with an open distal end has no wall", remedy="close its end")
-    shell = _manifold(_shell(socket, thickness_mm), "wall")
+    shell = _to_manifold(_build_shell(socket, thickness_mm), "wall")
     if adapter_diameter_mm == 0.0:
-        return _surface(shell)
+        return _to_surface(shell)
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    block = _block(socket, axis, adapter_diameter_mm, max(adapter_mm, thickness_mm))
-    cavity = _manifold(socket.closed, "cavity")
-    return _surface((shell + (_manifold(block, "adapter") - cavity)).set_tolerance(SLIVER_MM))
+    block = _build_adapter(socket, axis, adapter_diameter_mm, max(adapter_mm, thickness_mm))
+    cavity = _to_manifold(socket.closed, "cavity")
+    return _to_surface((shell + (_to_manifold(block, "adapter") - cavity)).set_tolerance(SLIVER_MM))
 
 
-def thickness(body: Surface, socket: Socket) -> Array:
+def measure_thickness(body: Surface, socket: Socket) -> Array:
     """How thick the wall is behind each triangle (m,) of a socket's face, along its normal, mm.
 
     Parameters
     ----------
-    body : of `wall`, LPS mm.
+    body : of `build_wall`, LPS mm.
     """
     outwards = -socket.surface.face_normals
     starts = socket.surface.triangles.mean(axis=1) + BEHIND_MM * outwards
-    return np.array([met[0] for met in hits_of(body, starts, outwards)]) + BEHIND_MM
+    return np.array([met[0] for met in find_ray_hits(body, starts, outwards)]) + BEHIND_MM
 
 
-def _shell(socket: Socket, thickness: float) -> Surface:
+def _build_shell(socket: Socket, thickness: float) -> Surface:
     """Both sides and the half circle that joins them along the brim."""
     inner, outwards = socket.points, -socket.surface.vertex_normals
     outer = inner + thickness * outwards
     squared = igl.point_mesh_squared_distance(outer, inner, socket.faces)[0]
     least = float(np.sqrt(squared.min()))
-    body = _joined(socket, outer, outwards, thickness)
+    body = _build_sides(socket, outer, outwards, thickness)
     if least < THINNEST * thickness or len(self_intersections(body)):
         raise SurfaceError(
             f"a wall of {thickness:g} mm would fold outside the socket's narrow places ({least:.1f} mm)",
@@ -87,7 +87,7 @@ def _shell(socket: Socket, thickness: float) -> Surface:
     return body
 
 
-def _joined(socket: Socket, outer: Array, outwards: Array, thickness: float) -> Surface:
+def _build_sides(socket: Socket, outer: Array, outwards: Array, thickness: float) -> Surface:
     brim, count = socket.brim, len(socket.points)
     points, out = socket.points[brim], outwards[brim]
     along = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
@@ -110,7 +110,7 @@ def _joined(socket: Socket, outer: Array, outwards: Array, thickness: float) -> 
     return Surface(np.vstack([socket.points, outer, *added]), faces)
 
 
-def _block(socket: Socket, axis: Array, diameter: float, below: float) -> Surface:
+def _build_adapter(socket: Socket, axis: Array, diameter: float, below: float) -> Surface:
     """The adapter's cylinder under the middle of the distal end, up into the wall around it."""
     height = socket.points @ axis
     bottom, length = float(height.min()), float(np.ptp(height))
@@ -147,7 +147,7 @@ def _block(socket: Socket, axis: Array, diameter: float, below: float) -> Surfac
     return Surface(points, faces)
 
 
-def _manifold(surface: Surface, name: str) -> manifold3d.Manifold:
+def _to_manifold(surface: Surface, name: str) -> manifold3d.Manifold:
     mesh = manifold3d.Mesh64(surface.points, surface.faces.astype(np.uint64))
     body = manifold3d.Manifold(mesh)
     if body.status() != manifold3d.Error.NoError:
@@ -158,6 +158,6 @@ def _manifold(surface: Surface, name: str) -> manifold3d.Manifold:
     return body
 
 
-def _surface(body: manifold3d.Manifold) -> Surface:
+def _to_surface(body: manifold3d.Manifold) -> Surface:
     mesh = body.to_mesh64()
     return Surface(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64))

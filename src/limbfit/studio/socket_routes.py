@@ -18,8 +18,8 @@ from ..mesh import read_vtu
 from ..pipeline.shared.artefacts import digest
 from ..pipeline.shared.socket_shape import blaming, regions_of, socket_of, trim_of
 from ..socket import Socket
-from ..socket.rays import LimbProfile, profile
-from ..socket.trim import Trim, brim_of, on_limb, trimmed
+from ..socket.rays import LimbProfile, compute_profile
+from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
 from ..web.arrays import pack
 from ..web.shapes import patient_frame, volume_of
@@ -186,8 +186,8 @@ def _handles(folder: StudyFolder, study: Study) -> list[list[float]]:
     try:
         limb = _profile(folder, surfaces_mark(folder, study))
         if table.trimline and not table.trim_planes:
-            return [[*map(float, row)] for row in on_limb(limb, frame, np.array(table.trimline))]
-        return [[*map(float, row)] for row in brim_of(limb, frame, trim_of(study, anatomy), HANDLES)]
+            return [[*map(float, row)] for row in wrap_trimline(limb, frame, np.array(table.trimline))]
+        return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLES)]
     except SurfaceError:
         return []  # `problem` says why there is no face
 
@@ -198,7 +198,7 @@ def _profile(folder: StudyFolder, mark: str) -> LimbProfile:
     anatomy = anatomy_of(folder, folder.load())
     if anatomy is None:
         raise InputError(NONE_YET)
-    return profile(anatomy.skin, limb_frame(anatomy.cut_point, anatomy.cut_normal))
+    return compute_profile(anatomy.skin, limb_frame(anatomy.cut_point, anatomy.cut_normal))
 
 
 def face_block(folder: StudyFolder) -> bytes:
@@ -287,8 +287,8 @@ def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
     frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with blaming(study, "socket.trimline"):
         limb = _profile(folder, surfaces_mark(folder, study))
-        points = on_limb(limb, frame, np.array(line.points))
-        trimmed(limb, frame, Trim(line=points))
+        points = wrap_trimline(limb, frame, np.array(line.points))
+        trim_limb(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())
     return shape_of(folder)
 

@@ -15,8 +15,8 @@ from ...donning import Donned
 from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
-from ...socket.landmarks import bone
-from ...socket.published import published
+from ...socket.landmarks import find_bone
+from ...socket.published import select_published_findings
 from ...study import Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
@@ -81,7 +81,9 @@ def run_socket(
         "socket": _shape(limb, socket),
         "mesh": facts,
         # All that was found is of transtibial limbs.
-        "published": published(limb.faces(mesh, socket)) if bone(limb.anatomy, "tibia") else [],
+        "published": select_published_findings(limb.faces(mesh, socket))
+        if find_bone(limb.anatomy, "tibia")
+        else [],
         "samples": None,
     }
     if covariance is not None and samples:

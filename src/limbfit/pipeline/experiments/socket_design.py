@@ -25,12 +25,12 @@ from ...fe import Step
 from ...fe.materials import Material
 from ...indentation import Parameters, fibre_field
 from ...mesh import Mesh, write_vtu
-from ...socket import Recipe, Socket, rectified
-from ...socket.offsets import offsets
-from ...socket.rays import profile
-from ...socket.rectify import reduced_to
-from ...socket.targets import Target, zone
-from ...socket.wall import thickness
+from ...socket import Recipe, Socket, rectify_limb
+from ...socket.offsets import compute_offsets
+from ...socket.rays import compute_profile
+from ...socket.rectify import reduce_to_volume
+from ...socket.targets import Target, build_zone
+from ...socket.wall import measure_thickness
 from ...study import Study
 from ..shared.artefacts import digest, write_json, write_table
 from ..shared.context import Context
@@ -78,7 +78,7 @@ def undeformed_socket(
     """
     with blaming(study, PLACE):
         recipe, frame = recipe_of(study, anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
-        plain = rectified(outer, frame, replace(recipe, reduction_percent=0.0))
+        plain = rectify_limb(outer, frame, replace(recipe, reduction_percent=0.0))
         for load in study.socket.loads:
             load_of(study, load, anatomy, plain)
         regions, middles = regions_of(study, anatomy), outer.triangles.mean(axis=1)
@@ -114,7 +114,7 @@ def run_socket_design(
         target = target_of(context.study)
         recipe = bench.designed(target)
         design = bench.made(DESIGN, recipe)
-        control_face, reduction = reduced_to(
+        control_face, reduction = reduce_to_volume(
             design.face.volume_mm3, bench.limb.outer.skin, bench.frame, bench.recipe
         )
         control = _Made(CONTROL, control_face, facts={"reduction_percent": reduction})
@@ -214,17 +214,17 @@ class _Bench:
         given = self._key(self.plain), code_digest(press), pressure.tolist()
         _, fields = self.kept.get(digest("pressed", *given), make)
         self.count += 1
-        limb = profile(self.limb.outer.skin, self.frame)
+        limb = compute_profile(self.limb.outer.skin, self.frame)
         before, after = outer_surface(self.mesh), outer_surface(self.mesh, fields["displacement"])
-        return replace(self.recipe, offsets=offsets(limb, before, after, self.frame))
+        return replace(self.recipe, offsets=compute_offsets(limb, before, after, self.frame))
 
     def made(self, name: str, recipe: Recipe, depths: Mapping[str, float] | None = None) -> _Made:
         """The face of a recipe with depths (mm) over regions; it can be given its wall."""
         zones = [
-            zone(region, self.limb.anatomy, self.limb.regions, depth)
+            build_zone(region, self.limb.anatomy, self.limb.regions, depth)
             for region, depth in (depths or {}).items()
         ]
-        face = rectified(self.limb.outer.skin, self.frame, replace(recipe, areas=zones))
+        face = rectify_limb(self.limb.outer.skin, self.frame, replace(recipe, areas=zones))
         wall_of(self.limb.study, self.limb.anatomy, face)
         return _Made(name, face, {"depths_mm": dict(depths or {})})
 
@@ -347,7 +347,7 @@ def _peak(simulation: Mapping[str, Any]) -> float:
 
 
 def _wall_facts(bench: _Bench, body: Surface, one: _Made) -> dict[str, Any]:
-    measured = thickness(body, one.face)
+    measured = measure_thickness(body, one.face)
     return {
         "of": one.name,
         "stated_mm": bench.limb.study.socket.design.wall_mm,

@@ -36,7 +36,7 @@ from ...fe.materials import Material
 from ...indentation import Direction, Parameters, fibre_field, materials
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
-from ...socket.landmarks import directions, load_point
+from ...socket.landmarks import find_directions, load_point
 from ...socket.regions import SkinRegion
 from ...study import Study
 from ..shared.artefacts import digest, file_digest, read_json
@@ -120,7 +120,7 @@ class SocketLimb:
 
     def fit(self, socket: Socket) -> SocketFit:
         """How a socket comes on this limb, and its loads."""
-        table, known = self.study.socket, directions(self.anatomy, self.study.socket.side)
+        table, known = self.study.socket, find_directions(self.anatomy, self.study.socket.side)
         loads = []
         for load in table.loads:
             force, moment, point = load_of(self.study, load, self.anatomy, socket)

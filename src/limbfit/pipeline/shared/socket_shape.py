@@ -16,14 +16,14 @@ from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
 from ...errors import StudyError, SurfaceError
 from ...laws import FIBRED
-from ...socket import Area, Recipe, Socket, read_socket, rectified
+from ...socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ...socket.bones import refuse_bones
-from ...socket.landmarks import bone, directions, knee_centre, load_point
+from ...socket.landmarks import find_bone, find_directions, find_knee_centre, load_point
 from ...socket.loads import STANDARD_LOADS
-from ...socket.regions import SkinRegion, default_regions, stated_region
+from ...socket.regions import SkinRegion, build_default_regions, build_stated_region
 from ...socket.targets import Target
 from ...socket.trim import Trim
-from ...socket.wall import wall
+from ...socket.wall import build_wall
 from ...study import Study
 from ...study.socket import SocketAreaTable, SocketLoadTable
 
@@ -55,7 +55,7 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
             )
         regions = regions_of(study, anatomy)
         areas = [_area(study, area, regions) for area in table.areas]
-        socket = rectified(outer, frame, replace(recipe_of(study, anatomy), areas=areas))
+        socket = rectify_limb(outer, frame, replace(recipe_of(study, anatomy), areas=areas))
         refuse_bones(
             socket.points,
             socket.faces,
@@ -98,24 +98,24 @@ def trim_of(study: Study, anatomy: Anatomy) -> Trim:
     line = np.array(table.trimline) if table.trimline else None
     if planes or line is not None:
         return Trim(planes, line)
-    knee = knee_centre(anatomy)
+    knee = find_knee_centre(anatomy)
     below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if knee is None else BELOW_KNEE_MM)
     return Trim([(anatomy.cut_point + (_top(anatomy) - below) * anatomy.cut_normal, anatomy.cut_normal)])
 
 
 def _top(anatomy: Anatomy) -> float:
     """Height of the tibia's top over the proximal cut, mm; that of the cut where no bone is a tibia."""
-    tibia = bone(anatomy, "tibia")
+    tibia = find_bone(anatomy, "tibia")
     return 0.0 if tibia is None else float(anatomy.height(tibia.points).max())
 
 
 def regions_of(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
     """Named regions of the skin: those of any limb, and the study's own, which win."""
-    known = directions(anatomy, study.socket.side)
-    regions = default_regions(anatomy, known)
+    known = find_directions(anatomy, study.socket.side)
+    regions = build_default_regions(anatomy, known)
     with blaming(study):
         for one in study.socket.regions:
-            regions[one.name] = stated_region(anatomy, one.name, np.array(one.position), one.radius_mm)
+            regions[one.name] = build_stated_region(anatomy, one.name, np.array(one.position), one.radius_mm)
     return regions
 
 
@@ -162,7 +162,7 @@ def load_of(
         return np.array(load.force_N), np.array(load.moment_Nmm), point
     standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
     with blaming(study):
-        known = directions(anatomy, study.socket.side)
+        known = find_directions(anatomy, study.socket.side)
         return standard.force(weight, known), standard.moment(weight, known), point
 
 
@@ -248,7 +248,7 @@ def target_of(study: Study) -> Target:
 def wall_of(study: Study, anatomy: Anatomy, face: Socket) -> Surface:
     """A face with the wall and the adapter of the study."""
     table = study.socket.design
-    return wall(
+    return build_wall(
         face,
         anatomy.cut_normal,
         table.wall_mm,
